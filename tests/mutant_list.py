@@ -277,7 +277,7 @@ MUTANTS = [
     ("training/named_terms.py", 'one_rate=True, springs=False', 'one_rate=True'),
     ("training/named_terms.py", '(*baseline_features(data.angles, zero, zero)[0], *pairs', '(*pairs'),
     ("training/named_terms.py", 'NamedTerms(absolute, (), True, apart=True)', 'NamedTerms(absolute, (), True)'),
-    ("training/problems/shooting.py", 'self.mass * self.speed * relative', 'self.speed * relative'),
+    ("training/problems/shooting.py", 'mass * self.joint_weight[self.n : 2 * self.n]', 'self.joint_weight[self.n : 2 * self.n]'),
     ("training/problems/smoothing.py", 'self.mass * v', 'v'),
     ("training/equation_terms.py", 'decay = -model.damping.rate * self._masses()[i, i]', 'decay = -model.damping.rate'),
     ("mechanics/partials.py", 'if L.numel() < 2:', 'if L.numel() < 99:'),

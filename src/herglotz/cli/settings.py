@@ -146,9 +146,9 @@ OPTIMISER = (
     setting("--batch", "triples of samples in a step of adam or adamw (default: all)", type=count, metavar="B"),
     setting("--robust", "a loss that outliers cannot pull, and spikes left out. auto: where the data show outliers "
             "(default auto)", choices=ROBUST),
-    setting("--find-zeros", "look for zeros of the sensors that differ between recordings, kept where held-out time "
-            "asks for them, or do not (default: where the learned equation misses several recordings by more than the "
-            "noise)", action=argparse.BooleanOptionalAction),
+    setting("--find-zeros", "look for zeros of the sensors that differ between recordings, kept where held-out blocks "
+            "of time ask for them, or do not (default: where the named terms that were found miss several recordings "
+            "by more than the noise)", action=argparse.BooleanOptionalAction),
     setting("--supervision", "what the one-step objective is fitted to: positions, s beside them, or momenta as well, "
             "where they are recorded (default q)", choices=SUPERVISION),
     setting("--restarts", "random initialisations of the one-step fit; the best after 30 iterations is kept (default: "

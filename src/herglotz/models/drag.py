@@ -5,7 +5,8 @@ a joint's own, or the one of two joints from one another, which a damper between
 
     |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
 
-`load 2` is a constant force on coordinate 2: on an angle no potential has it. `|v| v` brakes a body that moves in a
+`load 2` is a constant force on coordinate 2: on an angle no potential has it. `|v1|` is what viscous friction has more
+in one direction than in the other. `|v| v` brakes a body that moves in a
 plane or in space as air does: |v| is the length of the whole velocity. Dry friction changes with the position, or with
 the load that a position puts on a bearing, by
 
@@ -29,7 +30,7 @@ HIGHEST = 9  # power of a speed or a position
 _APART = r"v\d+ - v\d+"
 _TEXT = re.compile(
     rf"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
-    r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)"
+    r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)|\|v(?P<even>\d+)\|"
 )
 _DRY = re.compile(r"(?:(?P<wave>cos|sin)\(q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?) sgn\(v(?P<v>\d+)\)")
 AIR = "|v| v"
@@ -51,6 +52,11 @@ class DragFeature:
     air: bool = False  # |v| v of the whole velocity, on every coordinate
     dry: bool = False
     wave: str = ""
+
+    @property
+    def even(self) -> bool:
+        """Whether it is |v|."""
+        return (self.b, self.c) == (1, 0)
 
     def position(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the factor that depends on q_at, and its slope."""
@@ -82,7 +88,7 @@ def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
         )
     found = match.groupdict()
     speed = found["v"] or found["apart"]
-    on, *of = (int(digits) for digits in re.findall(r"\d+", speed or found["load"]))
+    on, *of = (int(digits) for digits in re.findall(r"\d+", speed or found["load"] or found["even"]))
     at, c = int(found["q"] or on), 0 if speed is None else int(found["c"] or 1)
     a = int(found["a"] or 1) if found["q"] else 0
     refuse({
@@ -92,7 +98,8 @@ def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
         f"drag '{text}': a power of an angle is not periodic; leave q{at} out": a and any(angles[at - 1 : at]),
         f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": speed and not (a <= HIGHEST >= c >= 1),
     })  # fmt: skip
-    return DragFeature(on - 1, at - 1, a, int(found["size"] is not None), c, of[0] - 1 if of else None)
+    b = int(found["size"] is not None or found["even"] is not None)
+    return DragFeature(on - 1, at - 1, a, b, c, of[0] - 1 if of else None)
 
 
 def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) -> DragFeature:
@@ -151,7 +158,7 @@ class Drag(nn.Module):
                 bend = (1.0 - grip * grip) * rate
             else:
                 own = speed.abs() if f.b else torch.ones_like(speed)
-                bend = own * _power(speed, f.c - 1) * (f.b + f.c)
+                bend = speed.sign() if f.even else own * _power(speed, f.c - 1) * (f.b + f.c)
                 grip = own * _power(speed, f.c)
             columns.append((position * grip, slope * grip, position * bend))
         value, by_q, by_v = (torch.stack(x, -1) for x in zip(*columns, strict=True))

@@ -26,6 +26,7 @@ from herglotz.plots.parachute import (
 from herglotz.plots.phase import plot_phase_portrait as plot_phase_portrait
 from herglotz.plots.plan import plot_plan as plot_plan
 from herglotz.plots.selection import plot_selection as plot_selection
+from herglotz.plots.sizes import plot_sizes as plot_sizes
 from herglotz.plots.style import save_figure as save_figure
 from herglotz.plots.training import plot_training as plot_training
 from herglotz.verify.subject import named
@@ -39,6 +40,7 @@ FIGURES = {
     "learned": plot_learned,
     "training": plot_training,
     "plan": plot_plan,
+    "sizes": plot_sizes,
 }
 # Of S^k, which a model with forces does not have: identities that hold to rounding.
 IDENTITIES = {"momentum_vs_dS": plot_momentum_vs_generating_function, "hj_residual": plot_hamilton_jacobi_residual}
@@ -98,14 +100,16 @@ def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
     Returns
     -------
     list of Path
-        In the order of `FIGURES`, without the plan where the run holds none. All are drawn before one is written.
+        In the order of `FIGURES`, without the plan, and the sizes of the models that a search compared, where the run
+        holds none. All are drawn before one is written.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written to.
     """
-    held = {name: plot for name, plot in FIGURES.items() if name != "plan" or "plan" in run.metrics}
+    needed = {"plan": "plan", "sizes": "compared"}
+    held = {name: plot for name, plot in FIGURES.items() if needed.get(name) is None or run.metrics.get(needed[name])}
     return _saved({name: plot(run) for name, plot in held.items()}, folder, form)
 
 

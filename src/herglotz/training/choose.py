@@ -107,7 +107,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
         forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
-        absent=c.absent, every=seen.found.every if named and seen.found is not None else 1,
+        absent=c.absent, turning=seen.turning,
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures, zeros=seen.zeros,
@@ -128,10 +128,11 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
     why = seen.structure or AS_SET
     return {name: why if name in found else AS_SET for name in AS_FOUND} | {
         "level": _level_reason(seen, user_settings),
-        "every": "more samples tell no more than these: residuals are no noise, and their steps are short enough",
+        "every": AS_SET,
+        "turning": "terms of positions on a line, as of a free spring, miss the data by less",
         "substeps": (HALVED if seen.settings.substeps > 1 else KEPT_STEPS) if named else AS_SET,
         **seen.why_arrival,
-        "zeros": seen.apart or "no recording was found to differ from the others",
+        "zeros": seen.why_zeros or "no recording was found to differ from the others",
         "forces": _forces_reason(seen),
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),

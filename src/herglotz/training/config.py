@@ -80,16 +80,17 @@ class FitConfig:
     sticking
         Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
         are fitted, from a start with smooth friction. None: where nothing is said of level, objective and friction, and
-        driven data show dry friction (`herglotz.training.dry_friction`).
+        driven data show dry friction (`herglotz.training.dry_friction`); a search for named terms that finds dry
+        friction tries it, too (`herglotz.training.search`).
     robust
         Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
         squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the
         training data are left out beforehand, unless "off".
     find_zeros
-        The sensors may read something else in each recording where a coordinate is 0: where such zeros could replace
-        named terms they are found, and kept if held-out time asks for them (`herglotz.training.sensor_zeros`). It costs
-        a second search for terms. None: where named terms miss the data by more than the noise. True: also where they
-        do not. False: nowhere.
+        The sensors may read something else in each recording where a coordinate is 0: such zeros are fitted together
+        with the named terms that were found, and kept if the score of held-out blocks is better with them
+        (`herglotz.training.sensor_zeros`). The search for terms is then repeated. None: where named terms miss whole
+        trajectories by more than the noise. True: also where they do not. False: nowhere.
     supervision
         What the one-step objective is fitted to: "q" (positions), "qs" (s beside them) or "qps" (momenta as well),
         where they are recorded at every sample. Their unit is fitted. With s known the full level is reliable.
@@ -124,9 +125,10 @@ class FitConfig:
         Symmetries that L_d is to have, each named by what moves together: `"q1 + q2"`, or `"q1"` alone. Nothing that is
         learned depends on where these coordinates are. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
-        Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "|v| v" of a body
-        in air, "(v1 - v2)" of a damper between two coordinates, "load 1", and of dry friction that changes with the
-        position "cos(q1) sgn(v1)" (forced level). See `herglotz.models.drag`.
+        Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "|v1|" of viscous
+        friction that differs by direction, "|v| v" of a body in air, "(v1 - v2)" of a damper between two coordinates,
+        "load 1", and of dry friction that changes with the position "cos(q1) sgn(v1)" (forced level). See
+        `herglotz.models.drag`.
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.

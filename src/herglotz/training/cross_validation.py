@@ -54,13 +54,30 @@ def held_out_errors(
     white noise, would both be fooled by their neighbours. Starts that are known far better than by σ are never left
     out: a free run begins there.
     """
-    r, J = problem.data_rows(path, theta)
+    r, J = data_rows(problem, path, theta)
     values, vectors = torch.linalg.eigh(dense(A).double())
     known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
     r, G = r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())  # G Gᵀ = J A⁻¹ Jᵀ
     better = problem.better.flatten().to(r)  # counts in r and J, and not in errors in units of q
     errors = left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
     return errors * problem.sigma
+
+
+def data_rows(problem: ShootingProblem, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Data residuals and their Jacobian, (N·n,) and (N·n, unknowns), over σ and in the order of the samples.
+
+    Both carry the square roots of the weights: those of a robust loss, those of known starts, and 0 for
+    samples that are not used.
+    """
+    r = problem.misfit(path) / problem.sigma
+    by = problem.weight * problem.root_weights(problem.weight * r)
+    Z = problem.slopes_at_samples(theta, path) * (by / problem.deviations)[..., None]
+    segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
+    J = Z.new_zeros(len(Z), problem.n, problem.P + problem.grid.segments * problem.d)
+    J[..., : problem.P] = Z[..., : problem.P]
+    for i in range(problem.d):
+        J[torch.arange(len(Z)), :, problem.P + segment * problem.d + i] = Z[..., problem.P + i]
+    return (by * r).flatten(), J.flatten(0, 1)
 
 
 def _left_out(G: Tensor, r: Tensor) -> Tensor:

@@ -21,14 +21,13 @@ from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
-from herglotz.training.dictionary_search import ROUNDING
 from herglotz.training.distributed import is_first
 from herglotz.training.equation import equation_of
 from herglotz.training.equation_notes import notes_of
 from herglotz.training.equation_numbers import Joint
 from herglotz.training.evaluate import evaluate
 from herglotz.training.identifiability import joint_of
-from herglotz.training.look import look
+from herglotz.training.look import look, on_a_line
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
 from herglotz.training.push import pushes
@@ -38,6 +37,8 @@ from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages
 from herglotz.training.tensorboard import log_result, tensorboard_log
 from herglotz.training.uncertainty import laplace
+
+ROUNDING = 3.0  # times the σ of exact data: what moves them by less is rounding
 
 
 @one_thread()
@@ -102,6 +103,8 @@ def fit(
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
+    read = data
+    data = data if plan is None or plan.turning else on_a_line(data)
     data = told_arrival(data, config, None if plan is None else Arrival(plan.hold, plan.delay, plan.lag))
     check_sizes(data.source or "data", data.q, data.names)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
@@ -109,6 +112,8 @@ def fit(
         if checkpoint is not None and is_first():  # only its process holds the lock
             remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
+        if any(read.angles) and not any(run.data.angles):  # as it was found: later recordings are read alike
+            reading = {**reading, "angles": False}
         run = replace(run, reading=reading_told(reading, data.names))
         if log is not None:
             log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
@@ -131,12 +136,14 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
     started = time.perf_counter()
     with stages.bar:
         seen = look(data, config, stages, plan)
-        if plan is None and seen.found is not None and (seen.found.doubt or (config.find_zeros and seen.found.apart)):
+        if plan is None and seen.found is not None and seen.found.doubt:
             seen, plan = held_out_winner(data, config, stages, seen)
         plan = plan or choose(seen, config)
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
+    if seen.found is not None and plan.network == "none":
+        run.metrics["compared"] = list(seen.found.compared)
     joint = _joint(run, plan, ROUNDING * task.exact)
     run.metrics["equation"] = equation_of(run, joint, notes_of(run)).as_dict()
     run.metrics["verdict"] = ". ".join(filter(None, (run.metrics["verdict"], pushes(run, joint))))

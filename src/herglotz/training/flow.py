@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from herglotz.training.kernel import Placed
+from herglotz.models import ContactLagrangian
+from herglotz.training.kernel import Placed, kernel_of
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.sums import Sums
 
 CHUNK = 64 * 2**20  # bytes of rows of J at once
+WORK, JOBS = 1000, 8  # samples that are worth a thread, and parts of all that may run at once
 
 
 class Piece(NamedTuple):
@@ -68,7 +73,9 @@ class CompiledFlow:
         d = 2 * self.n
         F = 0 if sums is None else len(sums.corner)
         chosen = self.placed.chosen[:F]
-        for piece in self._pieces(0 if sums is None else F + d):
+
+        def swept(piece: Piece) -> tuple[Piece, Tensor | None] | None:
+            """The rows of J of a piece; None where a step has no solution."""
             own = slice(piece.first, piece.last)
             first = self.first[own] if piece.starts else torch.full_like(self.first[own], -1)
             derived, sent, made = (None, None), (None, None, None), None
@@ -80,9 +87,24 @@ class CompiledFlow:
                 first, of.y, of.weight, of.freedom, piece.offset, piece.place, ends[own], delta[own], states, *derived,
                 made, *sent,
             )  # fmt: skip
-            if failed >= 0:
-                return None
-            if sums is not None and made is not None:
+            return None if failed >= 0 else (piece, made)
+
+        def together(pieces: Sequence[Piece]) -> list[tuple[Piece, Tensor | None] | None]:
+            """The pieces one after the other, until one fails: parts of a segment follow one another."""
+            found = []
+            for piece in pieces:
+                found.append(swept(piece))
+                if found[-1] is None:
+                    break
+            return found
+
+        for done in self._run(together, list(self._jobs(0 if sums is None else F + d))):
+            for result in done:
+                if result is None:
+                    return None
+                piece, made = result
+                if sums is None or made is None:
+                    continue
                 part = slice(piece.offset, piece.offset + piece.samples)
                 if rows is not None:
                     rows[part] = made.unflatten(0, (-1, self.n))
@@ -91,16 +113,44 @@ class CompiledFlow:
                 sums.by_theta.addmv_(mine.T, r[part].flatten())
         return states
 
-    def _pieces(self, width: int) -> Iterator[Piece]:
-        """Segments whose rows fit into `CHUNK` bytes, and parts of one that is longer; all at once without rows."""
-        S = len(self.place)
-        if not width:
-            yield Piece(0, S, self.begin, self.place, True, 0, 0)
+    @staticmethod
+    def _run(together: Callable, jobs: list[list[Piece]]) -> Iterator[list]:
+        """What comes of every job, in their order; several at once where there are processors and work for them.
+
+        What is kept in memory grows with the processors, and sums do not depend on their number.
+        """
+        workers = min(
+            len(jobs), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        )
+        if workers < 2:
+            yield from map(together, jobs)
             return
-        most, a, offset = max(1, CHUNK // (8 * self.n * width)), 0, 0
+        with ThreadPoolExecutor(workers) as pool:
+            for k in range(0, len(jobs), workers):
+                yield from pool.map(together, jobs[k : k + workers])
+
+    def _jobs(self, width: int) -> Iterator[list[Piece]]:
+        """Runs of segments that do not wait for one another, each with enough samples to be worth a thread."""
+        S, total = len(self.place), sum(self.counts)
+        least, a, offset = max(WORK, total // JOBS), 0, 0
         while a < S:
             b, samples = a + 1, self.counts[a]
-            while b < S and samples + self.counts[b] <= most:
+            while b < S and (samples < least or total - offset - samples < least):
+                samples += self.counts[b]
+                b += 1
+            yield list(self._pieces(a, b, offset, width))
+            offset += samples
+            a = b
+
+    def _pieces(self, a: int, last: int, offset: int, width: int) -> Iterator[Piece]:
+        """Segments whose rows fit into `CHUNK` bytes, and parts of one that is longer; all at once without rows."""
+        if not width:
+            yield Piece(a, last, self.begin[a : last + 1], self.place[a:last], True, 0, 0)
+            return
+        most = max(1, CHUNK // (8 * self.n * width))
+        while a < last:
+            b, samples = a + 1, self.counts[a]
+            while b < last and samples + self.counts[b] <= most:
                 samples += self.counts[b]
                 b += 1
             if samples <= most:
@@ -119,3 +169,19 @@ class CompiledFlow:
             place = self.place[segment : segment + 1] + (at - begin)
             yield Piece(segment, segment + 1, torch.tensor([at, to]), place, starts, samples, offset)
             offset += samples
+
+
+def motion(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:
+    """Free runs from `start` (S, 2n+1) by steps h (S, K) with inputs u (S, K, m), (S, K+1, 2n+1).
+
+    None where the model has no kernel, or a step no solution.
+    """
+    placed, (S, K) = kernel_of(model), h.shape
+    if placed is None or not bool(torch.isfinite(start).all()):
+        return None
+    none, end = torch.zeros(0, dtype=torch.long), torch.full((S,), K)
+    grid = SegmentGrid(h, none, torch.zeros(S, dtype=torch.long), torch.zeros(S, dtype=torch.bool), end, end, h, K)
+    sharpest = dict(model.named_buffers()).get("friction.sharpest")
+    flow = CompiledFlow(placed, grid, u, sharpest, model.dof)
+    empty = start.new_zeros(0, model.dof)
+    return flow.run(ParameterVector(model).get(), start, Observed(empty, empty, 0.0))

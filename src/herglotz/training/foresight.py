@@ -31,11 +31,10 @@ from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
     candidates,
-    loads,
-    offered,
     places,
     settings_of,
     shapes_of_dry,
+    special,
     started,
     values_of,
 )
@@ -226,9 +225,10 @@ def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> Named
     network = any(name.startswith(NETWORKS) for name in parameters.names)
     if network or told or c.objective != "trajectory" or c.level not in ("linear", "forced") or data.dof > MOST:
         return None
-    every = offered(data, candidates(data, c.translations), own, lacks=False)
-    pushed = NamedTerms((), tuple(name for name in loads(data, one_way=True) if name in own.drag))
-    return replace(every.joined(pushed), one_rate=every.one_rate and c.level == "linear")
+    every, rare = candidates(data, c.translations), set(special(data))
+    if not rare & set(own.features):
+        every = every.only(set(every.names) - rare)
+    return replace(every, one_rate=every.one_rate and c.level == "linear")
 
 
 def _summary(

@@ -12,6 +12,7 @@ from herglotz.data.splits import leading
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.first_states import states_of_pairs
+from herglotz.training.flow import motion
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
@@ -66,6 +67,9 @@ def near_data(
 
     Newton's iteration starts from the recorded positions; None where that does not converge: the runs are elsewhere.
     """
+    found = motion(model, start, grid.h, u)
+    if found is not None:
+        return found
     problem = ShootingProblem(model, data, grid, sigma=1.0)
     with torch.no_grad():
         problem.guess_from_states(states_of_pairs(model, data))
@@ -82,6 +86,9 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
     Blocks of steps are solved at once from straight lines: a block that converges doubles the next one, and after one
     that does not a single step is taken. A few batched evaluations stand for each step's own.
     """
+    found = motion(model, start, h, u)
+    if found is not None:
+        return found
     parameters, n, tol = ParameterVector(model), (start.shape[-1] - 1) // 2, 64 * torch.finfo(start.dtype).eps
     theta, x, k, block = parameters.get(), start[:, None], 0, 1
 

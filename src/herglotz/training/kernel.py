@@ -54,9 +54,12 @@ class Placed(NamedTuple):
     rest: Tensor  # θ of the kernel with 0 at these
 
 
-def kernel_of(model: ContactLagrangian) -> Placed | None:
-    """The kernel that evaluates a model, compiled where it is not known yet; None where there can be none."""
-    c, config, parameters = model.capabilities, model.config, ParameterVector(model)
+def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = None) -> Placed | None:
+    """The kernel that evaluates a model, compiled where it is not known yet; None where there can be none.
+
+    `parameters` are those that a fit moves, by default all; the others are what they are in the model.
+    """
+    c, config = model.capabilities, model.config
     networks = config.potential_width or config.correction_width or config.mass_width or not config.baseline
     plain = not networks and c.constant_c and not config.terms and (c.order == 2 or model.dof == 1)
     like = next(model.parameters())
@@ -70,9 +73,16 @@ def kernel_of(model: ContactLagrangian) -> Placed | None:
     kernel = _kernel(json.dumps(whole.to_dict(), sort_keys=True))
     if kernel is None:
         return None
-    keys = keys_of(parameters.numbers, config)
-    chosen = torch.tensor([kernel.place[key] for key in keys], dtype=torch.long)
-    return Placed(kernel, chosen, torch.zeros(len(kernel.numbers), dtype=torch.float64))
+    every = ParameterVector(model)
+    place = dict(zip(every.numbers, (kernel.place[key] for key in keys_of(every.numbers, config)), strict=True))
+    rest = torch.zeros(len(kernel.numbers), dtype=torch.float64)
+    numbers = every.numbers
+    if parameters is not None and len(parameters.numbers) < len(numbers):
+        rest[torch.tensor(list(place.values()))] = every.get()
+        numbers = parameters.numbers
+    chosen = torch.tensor([place[name] for name in numbers], dtype=torch.long)
+    rest[chosen] = 0.0
+    return Placed(kernel, chosen, rest)
 
 
 def structure(config: ModelConfig) -> ModelConfig:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS, Arrival
-from herglotz.data.roughness import roughness, spread
+from herglotz.data.roughness import roughness
 from herglotz.data.sensors import measured
 from herglotz.data.spikes import spikes
 from herglotz.data.windows import Triples
@@ -38,9 +38,6 @@ from herglotz.training.task import NOISY, Task, drag_starts_the_fit
 from herglotz.training.trajectory_fit import check_size
 
 PROBE = 40  # iterations of the short one-step fits: one measures the noise, other fits start from the others
-FINE = 0.1  # rad
-SURE = 1e-6  # of the spread: exact data are left to named terms that miss whole trajectories by less
-MAY_DIFFER = "zeros of their own in the sensors could replace some terms, and --find-zeros looks for them"
 EXPLAINED = 100.0  # a baseline with an error below this multiple of the σ of exact data explains the data
 
 
@@ -72,11 +69,12 @@ class Look:
     arrival: Arrival  # what happens to recorded inputs before they act
     why_arrival: dict[str, str]  # the reason of each of its fields
     zeros: tuple[float, ...]  # (B · n) what the sensors read at 0, recording after recording; empty: 0; `data` has q
-    apart: str  # what keeps recordings from being followed together; empty: nothing that is known
+    why_zeros: str  # why they are what they are; empty: no recording was found to differ
     friction: str  # why friction is set-valued or not
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
+    turning: bool = True  # angles turn; False: they were found to be positions on a line
     structure: str | None = None  # what was found about the terms, in words; None: it was not asked
     found: Structure | None = None  # named terms that whole trajectories were fitted with
     # Where the baseline explains exact data: its motions, their error.
@@ -104,13 +102,24 @@ def look(
     InputError if the data cannot be used, or do not suit the settings.
     """
     seen = _seen(data, user_settings, stages, plan, named, zeros)
-    hold = "" if seen.found is None else seen.found.hold
-    if not hold:
+    found = seen.found
+    if found is None or not (found.hold or found.zeros or not found.turning):
         return seen
-    stages = stages.labelled(f"{stages.label}, hold {hold}")
-    again = _seen(replace(data, hold=hold), user_settings, stages, plan, named, zeros)
-    why = f"the terms that were found with hold {seen.arrival.hold} miss the data by far less with {hold}"
-    return replace(again, why_arrival=seen.why_arrival | {"hold": why})
+    said = [f", hold {found.hold}"] * bool(found.hold) + [f", zeros {found.zeros}"] * bool(found.zeros)
+    said += [] if found.turning else [", on a line"]
+    data = data if found.turning else on_a_line(data)
+    stages = stages.labelled(stages.label + "".join(said))
+    data = replace(data, hold=found.hold) if found.hold else data
+    again = _seen(data, user_settings, stages, plan, named, found.zeros or zeros)
+    if found.hold:
+        why = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
+        again = replace(again, why_arrival=seen.why_arrival | {"hold": why})
+    return replace(again, why_zeros=found.why_zeros or seen.why_zeros, turning=found.turning)
+
+
+def on_a_line(data: Trajectories) -> Trajectories:
+    """The same with angles that are positions on a line."""
+    return replace(data.unwrapped(), angles=(False,) * data.dof)
 
 
 def _seen(
@@ -131,7 +140,7 @@ def _seen(
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
     base = across_translations(base, kept, settings.translations, outliers=outliers)
     seen = Look(
-        data, train, unseen, kept, dropped, outliers, arrival, why_arrival, zeros, apart="", friction=why_friction,
+        data, train, unseen, kept, dropped, outliers, arrival, why_arrival, zeros, why_zeros="", friction=why_friction,
         noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
     if plan is None:
@@ -164,34 +173,22 @@ def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Traje
 
 
 def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, named: bool, holds: Sequence[str]) -> Look:
-    """Terms from a dictionary of features, from the baseline that explains exact data, or from the search for terms."""
-    kept, base, settings, first = seen.kept, seen.base, seen.settings, seen
+    """Named terms that follow trajectories, or terms of a dictionary of features, or those of the baseline."""
+    kept, base, settings = seen.kept, seen.base, seen.settings
+    if named and terms_are_free(kept, user_settings):
+        # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
+        plain = replace(settings, sticking=settings.sticking or user_settings.sticking)
+        find = lambda: search(kept, base, plain, outliers=seen.outliers, holds=holds)  # noqa: E731
+        found = kept_structure("terms", find, base, settings, stages)
+        seen = replace(seen, structure=found.reason, found=found)
+        if found.sigma is not None:
+            return replace(seen, settings=found.config, base=found.base)
     if structure_is_free(kept, user_settings):
         of = kept_structure("structure", lambda: structured(kept, base, settings), base, settings, stages)
         seen = replace(seen, settings=of.config, base=of.base, structure=of.reason)
     elif settings.features:
         seen = replace(seen, base=start_of_features(kept, base, settings))
-    seen = replace(seen, baseline_motion=_baseline_motion(seen.task(stages)))
-    if not named or not terms_are_free(kept, user_settings):
-        return seen
-    return _searched(first, user_settings, stages, seen, holds)
-
-
-def _searched(first: Look, user_settings: FitConfig, stages: Stages, seen: Look, holds: Sequence[str]) -> Look:
-    """Named terms that follow whole trajectories, or as `seen` where that explains exact data and those do not."""
-    kept, base, settings = first.kept, first.base, first.settings
-    exact = bool(seen.settings.features) and seen.settings.objective == "residual"
-    # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
-    plain = replace(settings, sticking=settings.sticking or user_settings.sticking)
-    find = lambda: search(kept, base, plain, outliers=first.outliers, holds=holds)  # noqa: E731
-    found = kept_structure("terms", find, base, settings, stages)
-    at_one_step = not (_fine(seen.base) or kept.irregular)  # a network may learn what the rule misses at this step
-    explained = exact or (seen.baseline_motion is not None and at_one_step)
-    if explained and (found.sigma is None or found.sigma > SURE * spread(kept)):
-        return seen
-    apart = MAY_DIFFER if found.apart and not seen.zeros else ""
-    seen = replace(seen, structure=found.reason, found=found, apart=apart)
-    return seen if found.sigma is None else replace(seen, settings=found.config, base=found.base, baseline_motion=None)
+    return replace(seen, baseline_motion=_baseline_motion(seen.task(stages)))
 
 
 def _with_friction(
@@ -208,11 +205,6 @@ def _with_friction(
         ), "sticking is looked for in driven data alone, where no setting decides"
     sticking, why = friction_holds(kept)
     return replace(settings, sticking=sticking), why
-
-
-def _fine(base: Baseline) -> bool:
-    """Whether a recorded step turns the phase so little that a rule of order 4 is exact to rounding."""
-    return base.max_step * max(v / x for v, x in zip(base.speed, base.scale, strict=True)) < FINE
 
 
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:

@@ -62,7 +62,12 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
         return _unmoved(data, directions(translations, data.angles))
     angles = data.angles
     features = tuple(_of_one(data)) if len(angles) == 1 else features_of(angles)
-    return NamedTerms(features, tuple(_frictions(data)), True)
+    return NamedTerms((*features, *special(data)), tuple(_frictions(data)), True)
+
+
+def special(data: Trajectories) -> tuple[str, ...]:
+    """Powers of the distance, and bends at 0: what the other terms are much alike to where it is not the law."""
+    return (*distances(data), *kinks(data))
 
 
 def _of_one(data: Trajectories) -> list[str]:
@@ -77,24 +82,12 @@ def _frictions(data: Trajectories) -> list[str]:
     """Friction beside the viscous and the dry one: dampers between lengths, for those between joints are `coupled`."""
     drag = []
     for i, angle in enumerate(data.angles, 1):
-        drag += [f"|v{i}| v{i}"] if angle else [f"|v{i}| v{i}", f"q{i} v{i}", f"q{i}^2 v{i}"]
-    drag += loads(data, one_way=False)
+        drag += [f"|v{i}| v{i}", f"|v{i}|", *([] if angle else [f"q{i} v{i}", f"q{i}^2 v{i}"])]
+    drag += [f"load {i}" for i, angle in enumerate(data.angles, 1) if angle]  # which no potential is
     if not any(data.angles):
         drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(data.dof), 2)]
         drag += [AIR] if data.dof > 1 and len(set(data.units)) == 1 else []
     return drag
-
-
-def loads(data: Trajectories, *, one_way: bool) -> tuple[str, ...]:
-    """Constant forces, which no potential has, on the angles that only turn one way, or on the others."""
-    return tuple(f"load {i + 1}" for i, angle in enumerate(data.angles) if angle and turns_one_way(data, i) == one_way)
-
-
-def same_as_friction(data: Trajectories, friction: Sequence[float]) -> dict[str, float]:
-    """The loads that dry friction of these sizes is on angles that only turn one way: each pushes where it is < 0."""
-    ways = (data.q[data.lengths[0] - 1] - data.q[0]).sign().tolist()
-    same = {f"load {i + 1}": friction[i] * way for i, way in enumerate(ways)}
-    return {name: same[name] for name in loads(data, one_way=True)}
 
 
 def turns_one_way(data: Trajectories, i: int) -> bool:
@@ -104,7 +97,7 @@ def turns_one_way(data: Trajectories, i: int) -> bool:
         lag = max(1, one.samples // BACK)
         signs.append((one.q[lag:, i] - one.q[:-lag, i]).sign())
     seen = torch.cat(signs)
-    return bool((seen == seen[0]).all()) and float(seen[0]) != 0
+    return data.angles[i] and bool((seen == seen[0]).all()) and float(seen[0]) != 0
 
 
 def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTerms:
@@ -133,16 +126,6 @@ def kinks(data: Trajectories) -> tuple[str, ...]:
     away, beyond = sorted((abs(float(data.q.min())), abs(float(data.q.max()))))
     crossed = float(data.q.min()) < 0 < float(data.q.max()) and away > SIDE * beyond
     return ("|q1| q1", "|q1|^3") if data.dof == 1 and not any(data.angles) and crossed else ()
-
-
-def offered(data: Trajectories, every: NamedTerms, beside: NamedTerms, *, lacks: bool) -> NamedTerms:
-    """The candidates, with distances or kinks where a model of the terms `beside` has one or `lacks` a force.
-
-    Kinks also where it has so many powers of a length that they may be a series of something else.
-    """
-    more = (*distances(data), *kinks(data)) if every.springs else ()
-    series = bool(kinks(data)) and len(set(beside.features) - set(own_terms(data.angles))) >= SERIES
-    return every.joined(NamedTerms(more)) if lacks or series or set(more) & set(beside.features) else every
 
 
 def central(data: Trajectories, every: NamedTerms) -> list[NamedTerms]:
@@ -227,15 +210,6 @@ def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
     return {"q1^2": ("potential.stiffness", 0.5), CONSTANT: ("potential.tilt", 1.0)}
 
 
-def without_terms(every: NamedTerms, base: Baseline) -> tuple[NamedTerms, dict]:
-    """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
-    own, zero = own_terms(base.angles), (0.0,) * len(base.angles)
-    base = base if every.springs else replace(base, stiffness=zero, tilt=zero)
-    values = {"potential.stiffness": base.stiffness, "potential.tilt": base.tilt, "damping.rate": (base.rate,)}
-    features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
-    return every.only(tuple(own)), {**values, **features}
-
-
 def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:
     """The settings of a model that is made of these terms."""
     driven = data.u is not None and config.use_inputs
@@ -303,11 +277,6 @@ def values_of(parameters: ParameterVector, theta: Tensor) -> dict:
     return by_term(named, holders(of.features, of.drag))
 
 
-def shapes_of_dry(parameters: ParameterVector) -> Tensor:
-    """Places of the numbers that shape dry friction: where its force is 0 they have no effect."""
-    return torch.cat([parameters.index(name) for name in ("friction.breakaway", "friction.log")])
-
-
 def places(parameters: ParameterVector) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
     of, at = parameters.model.config, {}
@@ -316,3 +285,8 @@ def places(parameters: ParameterVector) -> dict[str, list[int]]:
     if of.coulomb:
         at[DRY] = parameters.index(DRY).tolist()
     return at
+
+
+def shapes_of_dry(parameters: ParameterVector) -> Tensor:
+    """Places of the numbers that shape dry friction: where its force is 0 they have no effect."""
+    return torch.cat([parameters.index(name) for name in ("friction.breakaway", "friction.log")])

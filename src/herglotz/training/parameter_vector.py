@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import cast
 
 import torch
@@ -15,18 +16,24 @@ from herglotz.models import Capabilities, ContactLagrangian, numbers_of
 class ParameterVector:
     """Partials of a model at any vector of parameters, without touching the model; usable inside vmap and jacrev.
 
-    Numbers that the model's configuration calls `absent` are 0 and no part of the vector.
+    Numbers that the model's configuration calls `absent` are 0 and no part of the vector. Of the others `free` may name
+    those that are: the rest are what they are in the model.
     """
 
-    def __init__(self, model: ContactLagrangian):
+    def __init__(self, model: ContactLagrangian, free: Collection[str] | None = None):
         self.model = model
         named, every = dict(model.named_parameters()), numbers_of(model)
         self.names = list(named)
         self.shapes = [p.shape for p in named.values()]
         absent = set(model.config.absent)
-        self.numbers = [name for name in every if name not in absent]  # (P,) by name
+        wanted = [name for name in every if name not in absent and (free is None or name in free)]
+        self.numbers = wanted  # (P,) by name
         self.entries = [every[name] for name in self.numbers]  # parameter and entry of each
-        self.learned = torch.tensor([name not in absent for name in every]) if absent else None  # (N,)
+        self.learned = None if len(wanted) == len(every) else torch.tensor([name in wanted for name in every])  # (N,)
+        self.held: Tensor | None = None  # (N,) what is no part of the vector; None: 0
+        if free is not None:
+            still = torch.tensor([name not in absent for name in every])
+            self.held = torch.where(still, nn.utils.parameters_to_vector(model.parameters()).detach().cpu(), 0.0)
 
     def get(self) -> Tensor:
         """The current parameters as one vector (P,)."""
@@ -47,7 +54,8 @@ class ParameterVector:
         if self.learned is None:
             return theta
         at = self.learned.nonzero()[:, 0].to(theta.device)
-        return theta.new_zeros(len(self.learned)).index_copy(0, at, theta)
+        rest = theta.new_zeros(len(self.learned)) if self.held is None else self.held.to(theta)
+        return rest.index_copy(0, at, theta)
 
     def partials(
         self, theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int, u: Tensor | None = None

@@ -42,6 +42,7 @@ class Plan:
     restarts: int  # random initialisations of the one-step fit
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
     every: int = 1  # how many recorded samples are one that whole trajectories are fitted to
+    turning: bool = True  # angles turn; False: they are positions on a line, as of a free spring
     absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
     reasons: dict[str, str] = field(default_factory=dict)
@@ -65,6 +66,7 @@ class Plan:
         needed = {
             "every": self.every > 1,
             "substeps": self.substeps > 1,
+            "turning": not self.turning,
             "sigma": not one_step,
             "restarts": one_step,
             "departures": self.network not in ("none", "plain"),
@@ -113,6 +115,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "delay": "delay of the inputs",
     "lag": "lag of the actuator",
     "zeros": "what the sensors read at 0, recording after recording",
+    "turning": "angles turn",
     "drag": "friction beside the viscous one",
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",

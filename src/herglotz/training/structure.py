@@ -26,15 +26,17 @@ from herglotz.models.features import expand, lengths, revolute
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
-from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.distributed import of_first
-from herglotz.training.found_terms import Found
+from herglotz.training.found_model import settings as settings_of_trial
 from herglotz.training.linear_start import SHARED, LinearFit
 from herglotz.training.named_terms import MOVING, by_term, distances, holders, places, started, values_of
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.zeros import reference_of
 from herglotz.training.pruning import prune
+from herglotz.training.search import Search
+from herglotz.training.sensor_zeros import in_words
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
@@ -63,8 +65,10 @@ class Structure(NamedTuple):
     reason: str  # in words and numbers
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
     doubt: bool = False  # another model may fit better: held-out free runs decide
-    apart: bool = False  # sensors whose zeros differ between recordings would lower the misfit
-    every: int = 1  # how many recorded samples are one that is fitted
+    zeros: tuple[float, ...] = ()  # (B · n) of the sensors, which differ between recordings; found terms are without
+    why_zeros: str = ""  # them in words
+    turning: bool = True  # angles turn; False: these terms are those of positions on a line, as of a free spring
+    compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`Search.compared`)
     hold: str = ""  # of inputs, with which these terms miss the data by far less than with the one that was tried
 
 
@@ -121,32 +125,32 @@ def kept_structure(
 def search(
     data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool, holds: Sequence[str] = ()
 ) -> Structure:
-    """The named terms that whole trajectories ask for (`dictionary_search`); unchanged where they follow no data.
+    """The named terms that whole trajectories ask for (`training.search`); unchanged where they follow no data.
 
     Where they miss the data, inputs are tried with these other `holds`.
     """
-    found = DictionarySearch(data, base, config, outliers=outliers).run()
+    data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
+    own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
+    wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
+    found = wanted.run()
+    turning = not wanted.better_on_a_line(found)
     if found is None:
-        return Structure(config, base, "no dictionary of terms: its model cannot follow 20 steps")
+        return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     noise = precision(data)
-    limit = max(noise if math.isfinite(noise) else 0.0, EXACT_ENOUGH * found.spread)
-    named = ", ".join(("mass, stiffness, viscous friction", *found.terms.names))
+    limit = max(noise if math.isfinite(noise) else 0.0, EXACT_ENOUGH * found.fitter.spread)
+    settings, found_base = settings_of_trial(found, wanted.config)
+    settings = replace(settings, dtype=config.dtype, device=config.device)
+    base = replace(found_base, low=base.low, high=base.high)
+    taken = [offer.name for offer in found.fitter.offers if offer.name in found.taken]
+    named = ", ".join(("mass", "damping", *taken))
     miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, limit))
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
     doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
-    hold = _better_hold(found, data, holds, outliers=outliers) if doubt and found.every == 1 else ""
-    return Structure(found.config, found.base, words, found.rms, doubt, found.apart, found.every, hold)
-
-
-def _better_hold(found: Found, data: Trajectories, holds: Sequence[str], *, outliers: bool) -> str:
-    """The hold of the inputs with which the terms found miss the data by far less; "" where there is none."""
-    misses = {"": HELD_OTHERWISE * found.rms}
-    for hold in holds:
-        search = DictionarySearch(replace(data, hold=hold), found.base, found.config, outliers=outliers)
-        other = search.refit(found, found.terms)
-        misses |= {} if other is None else {hold: other.rms}
-    return min(misses, key=misses.__getitem__)
+    zeros, why, compared = (), "", wanted.compared(found)
+    if (differ := wanted.apart(found)) is not None:
+        zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
+    return Structure(settings, base, words, found.rms, doubt, zeros, why, turning, compared, wanted.held(found, holds))
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

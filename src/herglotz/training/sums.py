@@ -45,9 +45,10 @@ class Sums(NamedTuple):
             self.by_state[k] += by_state.T @ right
         self.slopes.copy_(Z[torch.arange(grid.segments, device=Z.device), grid.end])
 
-    def add_joints(self, to: Tensor, by: Tensor, r: Tensor) -> Tensor:
+    def add_joints(self, to: Tensor, by: Tensor, r: Tensor, own: Tensor | None = None) -> Tensor:
         """Add the rows by · ∂(end of the segment before − start) of the segments `to`, with residuals r, (J, d) each.
 
+        `own` (J, n, P) is by how much residuals of momenta shrink as the masses that they are over grow.
         Return what couples the start of each segment with the next, (S, d, d).
         """
         upper = torch.zeros_like(self.blocks)
@@ -55,6 +56,9 @@ class Sums(NamedTuple):
             return upper
         P, rows = len(self.corner), self.slopes[to - 1] * by[..., None]
         by_theta, before = rows[..., :P], rows[..., P:]
+        if own is not None:
+            n = own.shape[1]
+            by_theta = torch.cat([by_theta[:, :n], by_theta[:, n : 2 * n] - own, by_theta[:, 2 * n :]], 1)
         self.corner.addmm_(by_theta.flatten(0, 1).T, by_theta.flatten(0, 1))
         self.by_theta.addmv_(by_theta.flatten(0, 1).T, r.flatten())
         self.blocks[to - 1] += before.mT @ before

@@ -193,7 +193,7 @@ class SegmentStages:
         rest = self.fit(self.lengths[0], trial.noise, None, trial, ~out)
         if rest is None or heavy_tailed(rest.misfit):
             return None
-        return None if float(rest.problem.joint_residuals(rest.path).abs().max()) > FAR else rest
+        return None if float(rest.problem.joint_residuals(rest.path, rest.theta).abs().max()) > FAR else rest
 
     def at_once(
         self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None

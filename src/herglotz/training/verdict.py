@@ -27,6 +27,7 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, precision
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
+from herglotz.training.flow import motion
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
@@ -54,10 +55,12 @@ STATE_ITERATIONS = 10  # of fitting the states of unseen windows: 2n numbers a w
 def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories) -> Tensor:
     """Errors of free runs over windows of 20 recorded steps from states (N, 2n+1) at the samples, (N', n)."""
     grid = segment_grid(data, FIRST_SEGMENT, task.base.model_step)
-    start, u = state_of(states[grid.start_sample]), step_inputs(fitted.model, data, grid)
+    start, u = states[grid.start_sample], step_inputs(fitted.model, data, grid)
     with torch.no_grad():
-        out = Stepper(fitted.model).rollout(*start, h=grid.h, inputs=u)
-    return grid.at_samples(out.q) - data.q
+        nodes = motion(fitted.model, start, grid.h, u)
+        if nodes is None:
+            nodes = Stepper(fitted.model).rollout(*state_of(start), h=grid.h, inputs=u).states.joined
+    return grid.at_samples(nodes[..., : data.dof]) - data.q
 
 
 def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tensor:
@@ -168,8 +171,7 @@ def judged(
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)
     kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
-    apart = "" if seen.zeros else seen.apart
-    return {"verdict": in_words(errors, ahead, metrics | {"apart": apart})} | kept_numbers
+    return {"verdict": in_words(errors, ahead, metrics)} | kept_numbers
 
 
 def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -> str:
@@ -185,15 +187,13 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
         return f"{FAILS} beyond the recording: {errors}. Try {_remedy(metrics, False)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics)}"
-    return f"{FITS}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors, metrics)
+    return f"{FITS}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors)
 
 
-def _worse(errors: Errors, metrics: dict[str, Any]) -> str:
+def _worse(errors: Errors) -> str:
     """By how much a model that fits misses more than the noise, or what stands for it."""
-    apart = metrics.get("apart")
-    apart = f". The recordings may differ: {apart}. Try each by itself, or --sensor-zeros" if apart else ""
     known = "" if math.isfinite(errors.noise) else ", for which its misfit of the training data stands,"
-    return f"{WORSE}{known} by a factor of {errors.worst / errors.limit:.2g}: {errors}{apart}"
+    return f"{WORSE}{known} by a factor of {errors.worst / errors.limit:.2g}: {errors}"
 
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any]) -> str:
@@ -215,8 +215,6 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any]) -> str
 
 
 def _remedy(metrics: dict[str, Any], training: bool) -> str:
-    if metrics.get("apart"):
-        return f"each recording by itself, or --sensor-zeros, for they may differ: {metrics['apart']}"
     if not training:
         return "a simpler level, or a larger train fraction: the unseen part differs from the training part"
     if metrics["objective"] in ("residual", "raw"):

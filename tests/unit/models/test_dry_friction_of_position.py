@@ -11,7 +11,6 @@ import herglotz as hz
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
-from herglotz.training.sensor_zeros import odd
 
 H = 0.05
 
@@ -117,18 +116,6 @@ def test_dry_terms_need_dry_friction():
         )  # fmt: skip
 
 
-def test_mirror_images():
-    # fails if sensors' zeros are found by taking friction that a mirror keeps for one that it turns round
-    model = ContactLagrangian(
-        ModelConfig(
-            angles=(True, False), scale=(1.0,) * 2, speed=(1.0,) * 2, stiffness=(0.0,) * 2, tilt=(0.0,) * 2,
-            level="forced", coulomb=True, potential_width=0,
-            drag=("cos(q1) sgn(v1)", "sin(q1) sgn(v1)", "q2 sgn(v2)", "q2^2 sgn(v2)"),
-        )
-    )  # fmt: skip
-    first = dict(zip(hz.training.parameter_vector.ParameterVector(model).numbers, range(99), strict=False))
-    turned = {k for k in range(4) if first[f"drag.coefficient[{k}]"] in odd(model).tolist()}
-    assert turned == {1, 2}
 
 
 def test_dry_terms_bring_dry_friction():

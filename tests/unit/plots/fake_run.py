@@ -53,6 +53,16 @@ def fake_run(
     history += [{"stage": "whole trajectory", "iteration": 22 + k, "cost": 40 * 0.3**k + 4} for k in range(8)]
     model, data, states = model.to(dtype), data.to(dtype), State(*(x.to(dtype) for x in states))
     box = box_of(*(x.double() for x in states))
+    sizes = ((2, 0.1, False), (3, 0.02, False), (3, 0.01, True), (5, 0.011, False))
+    compared = [{"numbers": k, "held_out": error, "offers": [], "taken": taken} for k, error, taken in sizes]
     return Run(
-        model, FitConfig(level=level), {"plan": PLAN.to_dict()}, data, (count,) * trajectories, states, h, box, history
+        model,
+        FitConfig(level=level),
+        {"plan": PLAN.to_dict(), "compared": compared},
+        data,
+        (count,) * trajectories,
+        states,
+        h,
+        box,
+        history,
     )

@@ -32,6 +32,7 @@ from herglotz.plots import (
     plot_momentum_vs_generating_function,
     plot_phase_portrait,
     plot_plan,
+    plot_sizes,
     plot_training,
     plot_trajectory,
     save_animation,
@@ -103,8 +104,20 @@ def test_save_figures_writes_all_and_nothing_else(tmp_path):
     assert save_figures(fake_run(steps=20), folder) == [folder / f"{name}.png" for name in FIGURES]
     assert sorted(x.name for x in folder.iterdir()) == sorted(f"{name}.png" for name in FIGURES)
     assert (set(FIGURES), set(IDENTITIES)) == (
-        {"trajectory", "phase_portrait", "learned", "training", "plan"}, {"momentum_vs_dS", "hj_residual"}
+        {"trajectory", "phase_portrait", "learned", "training", "plan", "sizes"}, {"momentum_vs_dS", "hj_residual"}
     )  # fmt: skip
+
+
+def test_the_sizes_show_the_best_of_each_and_the_one_that_was_taken():
+    run = fake_run(steps=12)
+    figure = plot_sizes(run)
+    _, best, taken = figure.axes[0].lines
+    # fails if the line is not the least error of each size, or another model is in colour
+    assert np.array_equal(best.get_xydata(), [[2, 0.1], [3, 0.01], [5, 0.011]])
+    assert np.array_equal(taken.get_xydata(), [[3, 0.01]])
+    assert "3 numbers" in title(figure)
+    with pytest.raises(InputError, match="no search for terms"):
+        plot_sizes(replace(run, metrics={}))
 
 
 def test_the_plan_has_a_box_for_every_reason():

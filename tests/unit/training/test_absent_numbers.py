@@ -14,7 +14,6 @@ from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.equation import equation_of
 from herglotz.training.equation_numbers import Joint
-from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.foresight import _with_absent_terms
 from herglotz.training.named_terms import NamedTerms, settings_of
 from herglotz.training.parameter_vector import ParameterVector
@@ -82,31 +81,6 @@ class OneNumber(SimpleNamespace):
         return self.x, torch.eye(len(self.x), dtype=self.x.dtype)
 
 
-@pytest.mark.parametrize(("value", "absent"), [(2.0, True), (3.0, False)])
-def test_numbers_that_say_nothing_are_left_out(value, absent):
-    # fails if one that is worth less than half the logarithm of the number of data stays, or one that is worth more
-    # goes: 2² < ln 500 = 6.2 < 3²
-    vector = ParameterVector(two_bodies(()))
-    x = torch.full((len(vector.numbers),), 10.0, dtype=torch.float64)
-    x[vector.numbers.index("friction.viscous[0]")] = value
-    fit = SimpleNamespace(theta=x, problem=SimpleNamespace(parameters=vector))
-    config = SimpleNamespace(order=2, substeps=1, level="forced", sticking=False)
-    start = OneNumber(x=x, fit=fit, config=config, terms=NamedTerms(("q1 v2",)), rms=1.0, coloured=False)
-    tried = []
-
-    def refit(_of, terms):
-        tried.append(terms.absent)
-        return SimpleNamespace(
-            terms=terms, rms=1.0, fit=SimpleNamespace(theta=x[1:]), config=config, whole=True,
-            as_likely=lambda _less, _floor: False,
-        )  # fmt: skip
-
-    data = SimpleNamespace(q=torch.zeros(250, 2), dof=2, angles=(False, False), u=None)
-    kept = FewerNumbers(data, 0.0, 2, refit, lambda *_: (None, None))._absent(start)  # type: ignore[arg-type]
-    assert tried[:absent] == [("friction.viscous[0]",)] * absent
-    assert kept.terms.absent == ("friction.viscous[0]",) * absent
-
-
 def test_the_message_on_a_misspelt_number_names_no_weights():
     # fails if the hundreds of weights of a network stand between the user and the numbers that have names
     config = replace(two_bodies(()).config, potential_width=16)
@@ -126,51 +100,6 @@ def test_numbers_that_were_not_learned_have_no_uncertainty():
     assert [x.words for x in found if x.name == "potential.stiffness"] == ["the stiffness k of the potential of b"]
     assert [x.words for x in found if x.name == "friction.viscous"] == ["viscous friction of a"]
     assert all(x.std == 1.0 for x in found)
-
-
-def test_a_model_of_a_part_is_tried_with_fewer_numbers_again():
-    # fails if a search of all data, which begins with the absent numbers of a part, asks a simpler model for numbers
-    # that it has not (the whole fit ended so), keeps its rate at 0, or revives numbers that were absent before
-    before = ("potential.tilt[0]", "damping.rate", "friction.viscous[1]", "coupling.viscous")
-    vector = ParameterVector(two_bodies(()))
-    x = torch.full((len(vector.numbers),), 10.0, dtype=torch.float64)
-    x[vector.numbers.index("potential.tilt[1]")] = 0.0
-    config = SimpleNamespace(order=2, substeps=1, level="forced", sticking=False)
-    fit = SimpleNamespace(theta=x, problem=SimpleNamespace(parameters=vector))
-    start = OneNumber(
-        x=x, fit=fit, config=config, terms=NamedTerms(("q1 v2",), absent=before), rms=1.0, coloured=False,
-        cost_without=lambda _names, _floor: 0.0,
-    )  # fmt: skip
-    tried = []
-    data = SimpleNamespace(q=torch.zeros(250, 2), dof=2, angles=(True, True), u=None)
-    every = FewerNumbers(data, 0.0, 2, lambda _of, terms: tried.append(terms), lambda *_: (None, None))  # type: ignore[arg-type]
-    assert every.of(start) is start  # type: ignore[arg-type]
-    assert [(terms.apart, terms.one_rate, terms.absent) for terms in tried[:3]] == [
-        (True, False, before[:3]), (False, True, before[:1]), (False, False, (*before, "potential.tilt[1]")),
-    ]  # fmt: skip
-    assert all(terms.absent[: len(before)] == before for terms in tried[3:])
-
-
-@pytest.mark.parametrize(("coloured", "whole", "likely", "taken"), [
-    (False, True, True, True), (True, True, True, False), (False, False, True, False), (False, True, False, False),
-])  # fmt: skip
-def test_a_smaller_subset_in_another_valley_is_tried(coloured, whole, likely, taken):
-    # fails if numbers go one by one alone: a spring and a tilt stood for the friction of a cart, where friction alone
-    # missed the data by less than the quadratic model of the fit had it
-    vector = ParameterVector(two_bodies(()))
-    x = torch.full((len(vector.numbers),), 4.0, dtype=torch.float64)
-    fit = SimpleNamespace(theta=x, problem=SimpleNamespace(parameters=vector))
-    config = SimpleNamespace(order=2, substeps=1, level="forced", sticking=False)
-    start = OneNumber(x=x, fit=fit, config=config, terms=NamedTerms(("q1 v2",)), rms=1.0, coloured=coloured)
-
-    def refit(_of, terms):
-        few = len(terms.absent) == 5
-        own = SimpleNamespace(theta=x[len(terms.absent) :])
-        return SimpleNamespace(terms=terms, fit=own, whole=whole, as_likely=lambda _less, _floor: few and likely)
-
-    data = SimpleNamespace(q=torch.zeros(250, 2), dof=2, angles=(False, False), u=None)
-    kept = FewerNumbers(data, 0.0, 2, refit, lambda *_: (None, None))._absent(start)  # type: ignore[arg-type]
-    assert len(kept.terms.absent) == 5 * taken
 
 
 @pytest.mark.parametrize("order", [2, 4])

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,11 +10,7 @@ from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, verdict
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.choose import choose
-from herglotz.training.dictionary_search import FINER, DictionarySearch
 from herglotz.training.foresight import foresee
-from herglotz.training.look import look
-from herglotz.training.named_terms import NamedTerms
 from herglotz.training.plan import Plan
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
@@ -32,17 +27,6 @@ def kinked(samples=1800, h=0.02):
     return Trajectories.of(
         h * torch.arange(samples, dtype=torch.float64), torch.tensor(out, dtype=torch.float64)[:, None]
     )
-
-
-def test_a_force_that_is_missing_is_not_met_by_more_samples():
-    # fails if all samples are fitted: seconds, for the same misfit
-    data = kinked()
-    found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
-    assert found is not None
-    assert found.every >= 3
-    assert found.fit.problem.data.samples < data.samples / 2
-    assert found.config.substeps == 1
-    assert found.base.model_step < 2 * data.typical_step
 
 
 @pytest.fixture(scope="module")
@@ -85,34 +69,6 @@ def test_recordings_keep_three_samples(plan):
     assert run.metrics["follows_data"]
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({}, 12),
-        ({"coloured": False}, 1),
-        ({"rms": 1.4}, 1),
-        ({"step": 1.1}, 6),
-        ({"step": 3.9}, 6),
-        ({"step": 4.1}, 3),
-        ({"step": math.inf}, 1),
-        ({"substeps": 4}, 3),
-        ({"zeros": True}, 1),
-    ],
-)
-def test_how_many_samples_tell_enough(change, says):
-    # fails if noise is not averaged over all samples, or steps that are too long for these are kept: 12 in a step
-    values = {"coloured": True, "rms": 2.0, "step": 0.9, "substeps": 1} | change
-    found = SimpleNamespace(
-        coloured=values["coloured"], rms=values["rms"], terms=NamedTerms(),
-        config=SimpleNamespace(substeps=values["substeps"]),
-        changed_by=lambda _problem: values["step"] * FINER / 4 * values["rms"],
-    )  # fmt: skip
-    search = object.__new__(DictionarySearch)
-    search.config = FitConfig(find_zeros=values.get("zeros", False))
-    search.noise, search.floor, search._problem = 1.0, 1e-9, lambda *_: (None, None)  # type: ignore[assignment]
-    assert search.kept_of(found, 12) == says  # type: ignore[arg-type]
-
-
 def test_model_steps_are_as_long_as_those_between_samples_that_stay():
     # fails if they are cut into recorded ones again, which takes as long as all samples do
     data = kinked(60)
@@ -120,11 +76,3 @@ def test_model_steps_are_as_long_as_those_between_samples_that_stay():
     sparse = task.thinned(4)
     assert sparse.data.samples == 15
     assert (sparse.base.max_step, sparse.base.model_step) == (4 * task.base.max_step, 4 * task.base.model_step)
-
-
-def test_the_plan_takes_what_the_search_kept():
-    # fails if the last fit takes all samples again
-    made = simulate(scene("damped_oscillator"), trajectories=1, steps=60, h=0.1, noise=1e-3, seed=0)
-    seen = look(made, FitConfig(), Stages(False, None, "", resume=False))
-    assert seen.found is not None
-    assert choose(replace(seen, found=seen.found._replace(every=3)), FitConfig()).every == 3

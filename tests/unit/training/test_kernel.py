@@ -33,8 +33,14 @@ MODELS = {
     "joints without a number": replace(JOINTS, absent=("friction.viscous[0]", "coupling.viscous")),
     "joints apart": replace(JOINTS, coupled=False, diagonal=True, features=("cos(q1 - q2) v1 v2",)),
     "a slide and a joint": replace(JOINTS, angles=(False, True), features=("cos(q2) v1 v2", "q1^3"), drag=("q1 v1",)),
-    "lengths": replace(JOINTS, angles=(False, False), features=("(q1 - q2)^2", "r^-1"), coupled=False, diagonal=True,
-                       drag=("(v1 - v2)", "|v| v")),
+    "lengths": replace(
+        JOINTS,
+        angles=(False, False),
+        features=("(q1 - q2)^2", "r^-1"),
+        coupled=False,
+        diagonal=True,
+        drag=("(v1 - v2)", "|v| v"),
+    ),
     "own structure": replace(PENDULUM, alike=False, stiffness=(1.0,)),
 }
 

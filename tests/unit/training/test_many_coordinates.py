@@ -1,15 +1,11 @@
 """Fits of many coordinates wait for smaller gains only where strengths of the prior are compared."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import pytest
 import torch
 
 from herglotz.data import Trajectories
 from herglotz.training import FitConfig, trajectory_fit
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
@@ -74,21 +70,3 @@ def test_a_hurried_stage_steps_through_its_start_alone(monkeypatch, hurried):
     monkeypatch.setattr(problems, "solve", lambda self, x: patient.append(self.patient) or solve(self, x))
     assert stages.fit(stages.lengths[0], 0.01, None, None) is not None
     assert patient[-2:] == ([True, False] if hurried else [True])
-
-
-def test_longer_segments_of_a_search_are_hurried():
-    # fails if a search, which compares many models, waits for gains of 1e-4 in each
-    search: Any = object.__new__(DictionarySearch)
-    search.floor = 0.0
-    stages = SimpleNamespace(lengths=[20, 40, 80], hurried=False, grow=lambda *_: None)
-    search._stages, search._found = lambda *_: stages, lambda *_: (stages.hurried, stages.lengths)
-    config, grid = SimpleNamespace(substeps=1, sticking=False), SimpleNamespace(length=40)
-    found = SimpleNamespace(
-        whole=False,
-        terms=None,
-        values={},
-        config=config,
-        rms=1.0,
-        fit=SimpleNamespace(problem=SimpleNamespace(grid=grid)),
-    )
-    assert search._longer(found) == (True, [0, 80])

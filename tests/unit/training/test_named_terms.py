@@ -4,7 +4,6 @@ import json
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -15,17 +14,11 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, Plan, dictionary_search, fit, laplace
-from herglotz.training.baseline import estimate_baseline
-from herglotz.training.dictionary_search import DictionarySearch
+from herglotz.training import Plan, fit, laplace
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.equation_words import number
-from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.fit import _joint
-from herglotz.training.found_terms import Found
-from herglotz.training.linear_terms import starts_of
-from herglotz.training.named_terms import NamedTerms, candidates, loads, offered, turns_one_way
-from herglotz.training.pruning import joining
+from herglotz.training.named_terms import candidates
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
 
@@ -43,85 +36,6 @@ def test_duffing_is_found_from_one_noisy_recording(duffing):
     assert plan["network"] == "none"
     assert duffing.metrics["train_rms"] < 1.2 * 0.003
     assert duffing.metrics["extrapolation_rms"] < 1.5 * 0.003
-
-
-def test_a_search_begins_with_as_few_samples_as_tell_the_motion(monkeypatch):
-    # fails if a search works on all samples of a recording that is finer than its motion, or the fit on some of them
-    data, begun = simulate(scene("duffing"), trajectories=1, steps=1500, h=0.02, noise=1e-5, seed=0), []
-    begin = DictionarySearch._begun
-    monkeypatch.setattr(DictionarySearch, "_begun", lambda self: begun.append(self.data.samples) or begin(self))
-    found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
-    assert found is not None
-    assert begun
-    assert max(begun) < 600
-    assert set(found.terms.names) == {"q1^2", "q1^4"}
-    assert found.rms == pytest.approx(1e-5, rel=0.1)
-    assert len(found.fit.states()) == 1501
-    assert found.config.substeps == 1
-
-
-@pytest.mark.parametrize("where", ["joins", "begins"])
-def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
-    # fails if friction that would create energy joins the terms, or stays with those of the linear start
-    data = simulate(scene("duffing"), trajectories=1, steps=200, h=0.1, noise=0.003, seed=0)
-    dry, begin = "friction.coulomb", DictionarySearch._begun
-
-    def begun(self):
-        found = begin(self)
-        if where == "begins":
-            assert found is not None
-            found = self.refit(found, replace(found.terms, dry=True))
-            assert found is not None
-            found = replace(found, values={**found.values, dry: (-1.0,)})
-            assert found.pushes
-        return found
-
-    asked = iter([dry, None, None])
-    refit = DictionarySearch.refit
-
-    def pushed(self, found, terms, *rest, **settings):
-        more = refit(self, found, terms, *rest, **settings)
-        assert more is not None
-        return more if not more.terms.dry else replace(more, values={**more.values, dry: (-1.0,)})
-
-    monkeypatch.setattr(DictionarySearch, "_begun", begun)
-    for last in ("_pruned", "_likeliest", "_last_terms"):  # which may leave the term out as well
-        monkeypatch.setattr(DictionarySearch, last, lambda _self, found: found)
-    monkeypatch.setattr(FewerNumbers, "of", lambda _self, found: found)
-    if where == "joins":
-        monkeypatch.setattr(DictionarySearch, "_missing", lambda _self, _found: next(asked))
-        monkeypatch.setattr(DictionarySearch, "refit", pushed)
-    found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
-    assert found is not None
-    assert not found.terms.dry
-
-
-@pytest.mark.parametrize(
-    ("rms", "length", "taken"), [(1.0, 300, True), (1.02, 300, True), (1.1, 300, False), (1.0, 150, False)]
-)
-def test_fewer_terms_are_taken_where_they_are_as_likely(rms, length, taken):
-    # fails if what a number is worth, ½ log N, has another sign or size, or shorter segments count as whole
-    # trajectories: 900 samples, 8 numbers less: misfits may grow by a factor of exp(27.2 / 900) = 1.031
-    def found(numbers, rms, length):
-        data = SimpleNamespace(q=torch.zeros(450, 2))
-        problem = SimpleNamespace(grid=SimpleNamespace(length=length), data=data)
-        return SimpleNamespace(rms=rms, fit=SimpleNamespace(problem=problem, theta=torch.zeros(numbers)))
-
-    rich, simple = found(9, 1.0, 300), found(1, rms, length)
-    assert Found.as_likely(simple, rich, 0.0) is taken  # pyright: ignore
-
-
-@pytest.mark.parametrize("moved", [0.0, 3.0])
-def test_the_change_of_a_motion_is_counted_sample_by_sample(moved):
-    # fails if misfits of two problems are added: every sample moves by `moved` times the size of its own misfit
-    def problem(misfit):
-        path = SimpleNamespace(x=torch.zeros(2, 1, 3))
-        return SimpleNamespace(d=2, pack=lambda *_: None, solve=lambda _: path, misfit=lambda _: misfit)
-
-    misfit = torch.tensor([1.0, -2.0, 2.0])
-    own, other = (problem(size * misfit) for size in (1.0, 1.0 + moved))
-    found = SimpleNamespace(fit=SimpleNamespace(theta=None, path=own.solve(None), problem=own))
-    assert Found.changed_by(found, other) == pytest.approx(moved * 3**0.5)  # pyright: ignore
 
 
 def test_with_translations_the_candidates_are_those_that_no_translation_moves():
@@ -187,27 +101,6 @@ def test_names_that_look_like_the_grammar_stay_apart(names):
         model.get_parameter("kinetic.sum.coefficient").fill_(0.7)
     a, b = names
     assert f"({a} {b}′ − {b} {a}′)" in " ".join(str(equation_of(SimpleNamespace(model=model, data=data))).split())  # pyright: ignore
-
-
-def test_a_damper_between_two_bodies_is_found():
-    # fails if no damper between coordinates is offered, or it pushes one body alone: friction of each body by itself
-    # cannot do what it does, and the search ended in masses and rates that were 400 times too large
-    K = torch.tensor([[12.0, -2.0], [-2.0, 2.0]], dtype=torch.float64)
-    C = torch.tensor([[0.15, -0.1], [-0.1, 0.1]], dtype=torch.float64)
-    weight, eye = torch.tensor([[1.0], [0.3]], dtype=torch.float64), torch.eye(2, dtype=torch.float64)
-    A = torch.cat([torch.cat([0 * eye, eye], 1), torch.cat([-K / weight, -C / weight], 1)])
-    x = torch.tensor([[0.5, 0.0, 0.0, 0.0], [0.0, 0.4, 0.3, 0.0]], dtype=torch.float64)
-    x = torch.stack([x @ torch.linalg.matrix_exp(0.05 * k * A).mT for k in range(301)], 1)[..., :2].flatten(0, 1)
-    q = x + 1e-3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
-    t = 0.05 * torch.arange(301, dtype=torch.float64).repeat(2)
-    run = fit(Trajectories.of(t, q, (301, 301), names=("a", "b")), progress=False)
-    terms = {(term.left[-2:], term.what): term for term in run.equation().terms}
-    for left, by in (("a″", -0.1), ("b″", 0.1)):
-        found = terms[left, "(a′ − b′)"]
-        assert found.deviation is not None
-        assert found.deviation < 0.002  # measured: 0.0003
-        assert abs(found.value - by) < 5 * found.deviation
-    assert run.metrics["verdict"].startswith("fits to the noise")
 
 
 def test_signs_of_an_equation():  # fails if the first minus inside a line loses its blank
@@ -305,21 +198,6 @@ def test_wrong_drag_is_an_input_error(text, says):
         parse_drag(text, (True, False))
 
 
-def test_a_distance_is_found_where_it_matters():
-    # fails if powers of r are no candidates, one of them does not stand alone, or springs are taken for a distance
-    names = {}
-    for system, noise in (("kepler", 0.0), ("kepler", 1e-3), ("chain", 1e-3)):
-        settings = {"masses": 2} if system == "chain" else {}
-        data = simulate(scene(system, **settings), trajectories=3, steps=50, h=0.1, noise=noise, seed=1)
-        local, every = local_polynomials(data), candidates(data)
-        assert local is not None
-        starts = starts_of(data, estimate_baseline(data), every, local)
-        names[system, noise] = {name for name in starts[0].terms.features if name.startswith("r")}
-        assert not any(name.startswith("r^") for name in every.names)
-        assert ("r^-1" in offered(data, every, starts[0].terms, lacks=False).names) is (system == "kepler")
-    assert names == {("kepler", 0.0): {"r^-1"}, ("kepler", 1e-3): {"r^-1"}, ("chain", 1e-3): set()}
-
-
 def test_a_planet_is_found_in_noise_with_its_rotation():
     # fails if 1/r is missed or a term that noise brings joins it: the rotation is lost with either
     data = simulate(scene("kepler"), trajectories=3, steps=60, h=0.1, noise=1e-3, seed=1)
@@ -329,21 +207,6 @@ def test_a_planet_is_found_in_noise_with_its_rotation():
     symmetries = run.symmetries()
     assert len(symmetries) == 1
     assert "rotation" in str(symmetries)
-
-
-def test_the_best_of_many_terms_has_to_bring_more():
-    # fails if a term joins that is no better than the best of twenty terms of noise is by chance: 12.3 of 400 residuals
-    J = torch.linalg.qr(torch.randn(400, 21, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
-    free, others = torch.tensor([0]), torch.arange(1, 21)
-    for gain, found in ((math.log(400) + 5.0, None), (math.log(400) + 7.0, 4)):
-        b = J.T @ (J[:, 5] * gain**0.5 + 0.1 * J[:, 7])
-        assert joining(J.T @ J, b, free, others, math.log(400)) == found
-
-
-def test_rounding_is_no_reason_for_a_term():
-    # fails if a term may join that lowers a misfit which is below that of exact data
-    search = SimpleNamespace(all=candidates(simulate(scene("duffing"), trajectories=1, steps=9, h=0.1)), floor=1e-8)
-    assert DictionarySearch._missing(search, SimpleNamespace(terms=NamedTerms(), rms=0.9e-8)) is None  # pyright: ignore
 
 
 def test_deviations_are_no_smaller_than_rounding(duffing):
@@ -357,21 +220,6 @@ def test_deviations_are_no_smaller_than_rounding(duffing):
         assert wide.deviation == pytest.approx(by * term.deviation)
         assert wide.alone == pytest.approx(50 * term.alone)
     assert equation_of(duffing, _joint(duffing, plan, 0.0)).terms == duffing.equation().terms
-
-
-@pytest.mark.parametrize("pushes", [True, False])
-def test_likelier_terms_do_not_push(monkeypatch, pushes):  # fails if friction that creates energy is kept for its fit
-    search: Any = object.__new__(DictionarySearch)
-    found, other = (SimpleNamespace(terms=SimpleNamespace(names=names), coloured=False) for names in (("a", "b"), ()))
-    found.config, other.pushes = SimpleNamespace(substeps=1), pushes
-    search.data, search.all, search.floor = SimpleNamespace(dof=1), SimpleNamespace(names=()), 0.0
-    search._problem = lambda *_: (SimpleNamespace(task=SimpleNamespace(config=None)), None)
-    search.refit = lambda *_, **_settings: other
-    search._held = search._longer = lambda it: it
-    monkeypatch.setattr(dictionary_search, "likelier", lambda *_: [SimpleNamespace(values={}, terms=(), states=None)])
-    monkeypatch.setattr(dictionary_search, "preferred", lambda *_: True)
-    monkeypatch.setattr(dictionary_search, "replace", lambda it, **_: it)
-    assert search._likeliest(found) is (found if pushes else other)
 
 
 def test_lines_of_an_equation_break_between_terms():
@@ -410,131 +258,9 @@ def test_numbers_with_their_deviations(value, deviation, alone, written):
     assert number(value, deviation, alone) == written
 
 
-@pytest.mark.parametrize(
-    ("rms", "coloured", "beaten", "joins"),
-    [(0.9, False, False, True), (0.9, True, False, False), (0.9, True, True, True), (0.6, True, False, True),
-     (1.1, False, True, False), (1.1, True, True, False), (0.98, False, True, False)],
-)  # fmt: skip
-def test_a_term_joins_where_it_halves_the_misfit(rms, coloured, beaten, joins):
-    # fails if blocks of time, which are foretold to first order, turn away a term that takes half of the squared
-    # misfit; or if one stays that takes less of white noise than the criterion which proposed it had foretold
-    fit = SimpleNamespace(problem=SimpleNamespace(data=SimpleNamespace(q=torch.zeros(60, 1))))
-    found, more = (
-        SimpleNamespace(rms=x, coloured=c, beaten_by=lambda *_: beaten, fit=fit)
-        for x, c in ((1, True), (rms, coloured))
-    )
-    assert Found.joined_by(found, more, 0.0) is joins  # pyright: ignore
-
-
 def test_a_constant_force_is_the_zero_of_an_input():
     # fails if both are candidates: they grew to 2860 m/s² that cancelled
     t = torch.arange(9.0)
     free, driven = (candidates(Trajectories.of(t, t[:, None], u=u)) for u in (None, t[:, None]))
     assert "q1" in free.features
     assert set(free.features) - set(driven.features) == {"q1"}
-
-
-@pytest.mark.parametrize(
-    ("finer", "most", "substeps"),
-    [({2: 1.03}, 4, 2), ({2: 1.1, 4: 1.0}, 4, 4), ({2: 1.1, 4: 1.1}, 4, 1), ({2: 1.1, 4: 1.0}, 3, 1)],
-)
-def test_shorter_steps_may_cost_what_one_number_is_worth(finer, most, substeps):
-    # fails if noise alone keeps steps that are too long, or the next length is not tried: of 60 samples ½ log N is
-    # worth 3.5 % of the RMS, and dry friction errs by the step in which a velocity changes sign; or if there are more
-    # steps than a search has time for
-    search = stepping_search(finer, most)
-    assert search._finer(search.at(1, 1.0)).config.substeps == substeps
-    vars(search).pop("in_vain", None)
-    search._longer = None  # the same segments stay, to be compared over
-    assert search._finer(search.at(1, 1.0), longer=False).config.substeps == substeps
-
-
-@pytest.mark.parametrize(
-    ("n", "coloured", "rms", "substeps"),
-    [(2, True, 0.97, 2), (2, True, 0.9, 4), (1, True, 0.97, 4), (2, False, 0.97, 4)],
-)
-def test_steps_of_several_coordinates_are_halved_again_where_that_misses_less(n, coloured, rms, substeps):
-    # fails if two motors with a force that no term has are fitted with 16 steps a sample, which miss the data as much
-    # and cost 16 times as much; if an axis with dry friction, or noise, is held to the same: from 13 samples a period
-    # of one its free runs then missed 7.2 times the noise instead of 3.4
-    search = stepping_search({4: rms, 8: 0.5}, 4, n, coloured=coloured)
-    assert search._finer(search.at(2, 1.0)).config.substeps == substeps
-
-
-class Stepped(SimpleNamespace):
-    """Of a `Found` what tells whether its steps are worth halving."""
-
-    halved_before = Found.halved_before
-    worth_halving = Found.worth_halving
-
-
-def stepping_search(finer: dict[int, float], most: int, n: int = 1, *, coloured: bool = False) -> Any:
-    """A search whose fits with so many steps in a recorded one miss the data by `finer`; steps are halved once."""
-    search: Any = object.__new__(DictionarySearch)
-    search.floor, search.finest, search.data = 0.0, most, SimpleNamespace(q=torch.zeros(60, 1))
-    fit, started = SimpleNamespace(problem=SimpleNamespace(n=n, data=search.data)), []
-
-    def at(m: int, rms: float) -> Stepped:
-        started.append(m)
-        config = SimpleNamespace(substeps=m, sticking=None)
-        return Stepped(rms=rms, terms=(), config=config, fit=fit, coloured=coloured)
-
-    search.at, search.refit = at, lambda *steps: at(steps[-1], finer[steps[-1]])
-    search._longer = lambda found: found
-    search._too_long = lambda found: found.config.substeps == started[0] and not hasattr(search, "in_vain")
-    return search
-
-
-@pytest.mark.parametrize(("back", "offered"), [(0.0, ()), (3.0, ("load 1",))])
-def test_a_load_and_dry_friction_are_one_force_where_a_joint_never_turns_back(back, offered):
-    # fails if both are candidates: 5369604 − 5369599 sgn θ′ met a rotating pendulum to 1e-8 rad, and its free runs
-    # from unseen starts missed by 40 % of the motion; or if the load is lost where the motion turns back
-    t = torch.linspace(0, 6, 300, dtype=torch.float64)
-    q = (5 * t + back * (3 * t).sin())[:, None]  # turns back where 3 back > 5
-    data = Trajectories.of(t, q, angles=(True,))
-    assert tuple(x for x in candidates(data).drag if x.startswith("load")) == offered
-    assert loads(data, one_way=True) == tuple({"load 1"} - set(offered))
-    q[100] -= 0.2  # fails if one sample that noise has moved is a turn: the step before it is 0.1
-    assert turns_one_way(Trajectories.of(t, q, angles=(True,)), 0) is (back == 0)
-
-
-@pytest.mark.parametrize("way", [1.0, -1.0])
-def test_what_pushes_on_a_joint_that_turns_one_way_is_a_load(way, monkeypatch):
-    # fails if such a joint is left without a constant force once its friction has turned out to push
-    t = torch.arange(60.0, dtype=torch.float64)
-    data = Trajectories.of(t, way * t[:, None], angles=(True,))
-    search = object.__new__(DictionarySearch)
-    search.data = data
-    monkeypatch.setattr(search, "refit", lambda found, terms: SimpleNamespace(terms=terms, of=found), raising=False)
-    start = Found(NamedTerms((), (), True), FitConfig(), {"friction.coulomb": (-3.0,)}, None, None, True, 1.0)  # type: ignore[arg-type]
-    left: Any = search._braking(start)
-    assert left.terms.drag == ("load 1",)
-    assert left.of.values["load 1"] == -3.0 * way  # the force −(−3) sgn θ′
-    assert not left.terms.dry
-
-
-def test_a_load_is_asked_for_once_friction_that_joins_a_one_way_joint_pushes(monkeypatch):
-    # fails if such a joint has neither constant force any more
-    t = torch.arange(60.0, dtype=torch.float64)
-    search: Any = object.__new__(DictionarySearch)
-    search.data, search.floor, search.all = (
-        Trajectories.of(t, t[:, None], angles=(True,)),
-        0.0,
-        NamedTerms((), (), True),
-    )
-    start: Any = SimpleNamespace(terms=NamedTerms(), pushes=False, coloured=False, rms=1.0)
-    asked, names = iter(["friction.coulomb", None]), []
-
-    def missing(_found):
-        names.append(search.all.names)
-        return next(asked)
-
-    search._begun, search._missing = lambda: start, missing
-    search.refit = lambda _found, terms: SimpleNamespace(terms=terms, pushes=True)
-    for last in ("_pruned", "_likeliest", "_last_terms"):
-        setattr(search, last, lambda found: found)
-    search._problem, search.order = None, 2
-    monkeypatch.setattr(FewerNumbers, "of", lambda _self, found: found)
-    monkeypatch.setattr(dictionary_search, "exchanged", lambda found, *_: found)
-    assert search.run() is start
-    assert names == [("friction.coulomb",), ("load 1",)]

@@ -12,7 +12,6 @@ from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, rivals
 from herglotz.training.baseline import Baseline, estimate_baseline
-from herglotz.training.named_terms import DRAG, STILL
 from herglotz.training.plan import Plan
 from herglotz.training.stages import Stages
 from herglotz.training.structure import Structure
@@ -62,9 +61,9 @@ def held(monkeypatch):
         start = {name: tuple(values) for name, values in found.get("start", {}).items()}
         return SimpleNamespace(**{**vars(seen), "base": SimpleNamespace(start=start)})
 
-    def held_out(seen, config, plan, every=1):  # noqa: ARG001
+    def held_out(_seen, _config, plan, every=1):
         thinned.append(every)
-        found = errors["bare" if seen.name == "bare" else plan.network]
+        found = errors[plan.network]
         return {"until": min(found["rms"], 1.0)} | found
 
     monkeypatch.setattr(rivals, "look", look)
@@ -72,13 +71,13 @@ def held(monkeypatch):
     monkeypatch.setattr(rivals, "_held_out", held_out)
     monkeypatch.setattr(rivals, "_going_on", going_on)
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=NOISE, seed=0)
-    found = SimpleNamespace(doubt=True, apart=False)
-    seen = SimpleNamespace(name="named", kept=data, train=data, found=found, zeros=(), apart="", settings=FitConfig())
+    found = SimpleNamespace(doubt=True)
+    seen = SimpleNamespace(
+        name="named", kept=data, train=data, found=found, zeros=(), why_zeros="", turning=True, settings=FitConfig()
+    )
 
-    def winner(named, networks, bare=None):
-        errors.update({"none": named, "potential": networks, "bare": bare})
-        less = SimpleNamespace(**{**vars(seen), "name": "bare"})
-        monkeypatch.setattr(rivals, "_without_terms", lambda _: None if bare is None else less)
+    def winner(named, networks):
+        errors.update({"none": named, "potential": networks})
         return rivals.held_out_winner(data, FitConfig(), Stages(False, None, "", resume=False), seen)  # type: ignore[arg-type]
 
     return SimpleNamespace(winner=winner, looks=looks, seen=seen, thinned=thinned)
@@ -172,27 +171,6 @@ def test_errors_count_up_to_the_spread(monkeypatch):
     assert found["rms"] == pytest.approx(1e9 * spread / 2**0.5)
 
 
-@pytest.mark.parametrize(
-    ("named", "bare", "kept"),
-    [(0.1, 0.103, "bare"), (0.1, 0.107, "named"), (40, 30, "named"), (1.0, 0.6, "named"), (math.nan, 0.1, "bare")],
-)
-def test_terms_that_lower_the_error_of_free_runs_by_too_little_go(held, named, bare, kept):
-    # fails if terms that go on with the disturbances of a motor axis stay: 7.0 mm over its last quarter, 5.8 without;
-    # or if they go where both free runs are lost: the pendulum of a motor that swings up had no weight left
-    errors = {"rms": named, "sigma": NOISE}, {"rms": 90.0, "sigma": NOISE}
-    start = {"friction.coulomb": (0.2,)}
-    seen, chosen = held.winner(*errors, bare={"rms": bare, "sigma": NOISE, "start": start})
-    assert seen.name == kept
-    assert kept == "named" or seen.base.start == start
-    assert ("friction and inputs alone" in chosen.reasons["objective"]) is (kept == "bare")
-
-
-def test_networks_are_compared_with_what_won_before(held):
-    # fails if they win over terms that are gone: 0.15 against 0.2, and 0.1 without terms
-    bare = {"rms": 0.1, "sigma": NOISE}
-    assert held.winner({"rms": 0.2, "sigma": NOISE}, {"rms": 0.15, "sigma": NOISE}, bare=bare)[0].name == "bare"
-
-
 def test_recordings_that_leave_nothing_to_hold_out_have_no_rivals(held):
     # fails if the fit of 10 samples ends in a fraction that nobody set: its training part has 7, and
     # of these 2 are left
@@ -200,22 +178,6 @@ def test_recordings_that_leave_nothing_to_hold_out_have_no_rivals(held):
     seen, chosen = held.winner(None, None)
     assert seen.name == "named"
     assert "7 samples" in chosen.reasons["objective"]
-
-
-def test_what_is_left_without_terms_is_a_model_of_friction_and_inputs():
-    # fails if the start of a term stays, or a rule of order 4, which asks for one; or if a joint has no rival left
-    data = simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, seed=0)
-    config = FitConfig(features=("q1^2",), drag=("|v1| v1",), order=4)
-    base = estimate_baseline(data)
-    base = replace(base, start={STILL: (1.0,), DRAG: (2.0,), "friction.coulomb": (3.0,)})
-    seen: Any = Seen(data, config, base)
-    left: Any = rivals._without_terms(seen)
-    assert (left.settings.features, left.settings.drag, left.settings.order) == ((), (), 2)
-    assert left.base.start == {"friction.coulomb": (3.0,)}
-    assert "q1^2, |v1| v1" in left.structure
-    assert rivals._without_terms(replace(seen, settings=FitConfig())) is None
-    two: Any = Seen(Trajectories.of(data.t, data.q.repeat(1, 2)), config, base)
-    assert rivals._without_terms(two) is None
 
 
 def test_the_last_fit_goes_on_from_the_first_part():
@@ -238,7 +200,9 @@ def test_the_last_fit_goes_on_from_the_first_part():
 def test_networks_take_the_inputs_as_named_terms_have_shown_them(monkeypatch):
     # fails if named terms, which found another hold, are compared with networks that have the one that was mistaken
     data = simulate(scene("driven_pendulum"), trajectories=1, steps=40, h=0.1, seed=0)
-    seen = SimpleNamespace(arrival=SimpleNamespace(hold="zero"), zeros=(), apart="", why_arrival={"hold": "found"})
+    seen = SimpleNamespace(
+        arrival=SimpleNamespace(hold="zero"), zeros=(), why_zeros="", turning=True, why_arrival={"hold": "found"}
+    )
     looks = []
 
     def look(data, *_, **__):

@@ -121,7 +121,8 @@ def test_joints_of_segments_weigh_momenta_by_their_mass():
     weights = []
     for unit in (1.0, 1e3):
         model, data, _ = _two_springs(unit)
-        weights.append(ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=NOISE).joint_weight)
+        problem = ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=NOISE)
+        weights.append(problem._weights(problem.parameters.get()))
     expected = torch.tensor([1.0, 1.0, 1.0, 1e-6], dtype=torch.float64)  # the noise is in one unit, the mass is not
     torch.testing.assert_close(weights[1] / weights[0], expected, rtol=1e-6, atol=0)
 

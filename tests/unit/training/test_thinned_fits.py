@@ -8,10 +8,8 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.training import FitConfig, dictionary_search, foresight, sensor_zeros
+from herglotz.training import FitConfig, foresight
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.dictionary_search import DictionarySearch
-from herglotz.training.sensor_zeros import ZerosOf
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 
@@ -26,25 +24,6 @@ def swing(samples=60, recordings=1):
 def task_of(data, **settings):
     config = FitConfig(level="linear", objective="trajectory", **settings)
     return Task(data, estimate_baseline(data), config, Stages(False, None, "", resume=False))
-
-
-def test_a_thinned_search_reads_its_start_off_all_samples(monkeypatch):
-    # fails if the linear problem is made of the samples that stay, or shooting starts from states at all of them
-    data, asked = swing(), {}
-    search = DictionarySearch(data, estimate_baseline(data), FitConfig(), every=EVERY)
-
-    def starts(of, *_):
-        asked["linear"] = of.samples
-        return []
-
-    def grown(*given):
-        asked["shooting"] = given[-1].samples
-
-    monkeypatch.setattr(dictionary_search, "starts_of", starts)
-    monkeypatch.setattr(search, "_grown", grown)
-    assert search._begun() is None
-    assert asked == {"linear": 60, "shooting": 20}
-    assert search.data.samples == 20
 
 
 class Asked(Exception):
@@ -97,51 +76,3 @@ def test_foresight_of_a_thinned_fit(monkeypatch):
 def looked(data, every=1) -> Any:
     found = SimpleNamespace(sigma=0.01, every=every, apart=True)
     return SimpleNamespace(kept=data, outliers=False, found=found, task=lambda _stages: task_of(data))
-
-
-def test_zeros_are_looked_for_with_the_samples_that_were_fitted(monkeypatch):
-    # fails if a fit to every m-th sample is repeated with all of them, or starts from samples between
-    asked = []
-
-    class Seen:
-        lengths = (20,)
-
-        def __init__(self, task, *_):
-            asked.append((task.data.samples, task.base.model_step))
-
-        def fit(self, *_, begin):
-            asked.append(begin.samples)
-
-    data = swing()
-    monkeypatch.setattr(sensor_zeros, "SegmentStages", Seen)
-    assert ZerosOf(looked(data, EVERY)).fit(data) is None
-    assert asked == [(20, EVERY * task_of(data).base.model_step), 20]
-
-
-@pytest.mark.parametrize(
-    ("wanted", "alone", "looks"), [(None, 0.9, False), (None, 0.1, True), (True, 0.9, True), (True, 0.1, True)]
-)
-def test_a_second_search_waits_for_a_difference(monkeypatch, wanted, alone, looks):
-    # fails if recordings that are followed together cost a second search that nobody asked for, if those that are not
-    # have none, or if the misfit of the reference is taken over samples of other recordings
-    data = swing(recordings=2)
-    thin = data.thinned(EVERY)  # its samples are not those of the data
-    missed = torch.where(thin.trajectory == 0, 1.0, 50.0)[:, None]
-    fits = iter([
-        SimpleNamespace(path=None, noise=30.0, problem=SimpleNamespace(
-            data=thin, grid=SimpleNamespace(sample=torch.arange(thin.samples)), misfit=lambda _path: missed)),
-        SimpleNamespace(noise=alone),
-    ])  # fmt: skip
-
-    def look(*_):
-        raise Asked
-
-    stub = SimpleNamespace(reference=0, fit=lambda _data: next(fits))
-    monkeypatch.setattr(sensor_zeros, "ZerosOf", lambda _seen: stub)
-    monkeypatch.setattr(sensor_zeros, "look", look)
-    config, seen = FitConfig(find_zeros=wanted), looked(data)
-    if looks:
-        with pytest.raises(Asked):
-            sensor_zeros.sensor_zeros(data, config, seen)
-    else:
-        assert sensor_zeros.sensor_zeros(data, config, seen) is None

@@ -21,6 +21,21 @@ EACH, MOST = 64, 256  # points of the grid, a coordinate and at most: more do no
 BREAKAWAY = 0.01  # of Stribeck's excess force, in forces of the baseline: a broad one would replace viscous friction
 
 
+class Gaussian:
+    """The prior of some numbers, each by itself: N(start, spread²)."""
+
+    def __init__(self, start: Tensor, weight: Tensor):
+        self.start, self.weight = start, weight  # (P,) each; weight is 1 / spread², 0 where nothing is known
+
+    def cost(self, theta: Tensor) -> Tensor:
+        """½ Σ ((θ − start) / spread)²."""
+        return ((theta - self.start).square() * self.weight).sum() / 2
+
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr)."""
+        return self.cost(theta), self.weight.diag(), self.weight * (theta - self.start)
+
+
 class Prior:
     """Gaussian prior, as residuals that join a least-squares problem.
 

@@ -12,6 +12,8 @@ until each trajectory is one.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from copy import copy
 from typing import Any
 
 import torch
@@ -26,8 +28,11 @@ from herglotz.training.arrowhead import Arrowhead
 from herglotz.training.distributed import everywhere, world
 from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.joint_masses import JointMasses
 from herglotz.training.problems.least_squares import StatesProblem
+from herglotz.training.problems.prior import Gaussian
 from herglotz.training.solvers.lifted_newton import (
     Path,
     linear_recurrence,
@@ -56,13 +61,8 @@ class ShootingProblem(StatesProblem):
     ):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
-        self.better = self._known_better()  # (N, n)
-        self.weight = self.used.to(data.q)[:, None] * self.better  # (N, n)
-        # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
-        relative = self.deviations / self.scale
-        action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
         self.s = s
-        self.joint_weight = torch.cat([self.scale * relative, self.mass * self.speed * relative, action])
+        self._weigh()
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
         self._slopes: tuple[Path, Tensor] | None = None  # a path and its `sensitivities`, which end in P + d or d
@@ -72,6 +72,29 @@ class ShootingProblem(StatesProblem):
         placed = kernel_of(model) if self.d == 2 * self.n and s is None and world()[1] == 1 else None
         sharpest = dict(model.named_buffers()).get("friction.sharpest")
         self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, sharpest, self.n)
+
+    def _weigh(self) -> None:
+        """What residuals are divided by, which follows from σ."""
+        self.better = self._known_better()  # (N, n)
+        self.weight = self.used.to(self.data.q)[:, None] * self.better  # (N, n)
+        # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
+        relative = self.deviations / self.scale
+        action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
+        self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
+
+    def of(self, free: Collection[str], sigma: float, prior: Gaussian | None = None) -> ShootingProblem:
+        """The same problem over some of the parameters, by name, the rest being what they are in the model."""
+        other = copy(self)
+        other.parameters, other.prior, other.sigma = ParameterVector(self.parameters.model, free), prior, sigma
+        other.P, other.deviations = len(other.parameters.numbers), sigma * self.data.balance
+        other._solved = other._at = other._slopes = other.path = None
+        other._weigh()
+        if self.compiled is not None:
+            placed = kernel_of(self.parameters.model, other.parameters)
+            assert placed is not None
+            other.compiled = copy(self.compiled)
+            other.compiled.placed = placed
+        return other
 
     def _known_better(self) -> Tensor:
         """How much better than by σ the samples are known that free runs over whole trajectories start from, (N, n).
@@ -157,7 +180,7 @@ class ShootingProblem(StatesProblem):
         path = self.solve(x)
         if path is None:
             return x.new_full((), torch.inf)
-        fit, joints = self._residuals(path.x)
+        fit, joints = self._missed_by(path.x), self._joints(path.x, self._weights(x[: self.P]))
         anchor = self._anchor(x)
         return self.loss(fit, joints) + anchor.square().sum() / 2 + self.prior_cost(x[: self.P])
 
@@ -171,14 +194,16 @@ class ShootingProblem(StatesProblem):
             matrix = Arrowhead(sums.corner, sums.border, sums.blocks, torch.zeros_like(sums.blocks), self._eliminate)
             return x.new_full((), torch.inf), matrix, x.new_zeros(len(x) - self.P * held)
         self.path, self._at = path, x.clone()
-        fit, joints = self._residuals(path.x)
+        weights, slopes = self._weights(theta), None if held or not self.masses.move else self.masses.slopes(theta)
+        fit, joints = self._missed_by(path.x), self._joints(path.x, weights)
         if self.compiled is None:
             root = self.root_weights(fit)
             by = root * self.weight / self.deviations
             sums.add_samples(self.grid, self._slopes_of(theta, path, held=held), by, root * fit)
         to = self.grid.joined.nonzero()[:, 0]
         root = self.root_weights(joints[to])
-        upper = sums.add_joints(to, root / self.joint_weight, root * joints[to])
+        own = None if slopes is None else (root * joints[to])[:, self.n : 2 * self.n, None] * slopes
+        upper = sums.add_joints(to, root / weights, root * joints[to], own)
         anchored, anchor = self._anchored() - self.P, self._anchor(x)
         segment, at = anchored // self.d, anchored % self.d
         sums.blocks[segment, at, at] += 1 / self._anchor_weight**2
@@ -258,57 +283,34 @@ class ShootingProblem(StatesProblem):
     def _missed(self, x: Tensor) -> Tensor:
         return self.grid.at_samples(x[..., : self.n]) - (self.data.q - self.zeros)
 
-    def by_zeros(self, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What (JᵀJ, Jᵀr) have of zeros z of sensors, where the normal equations of all unknowns were made last.
-
-        `which` zero, from 0, each sample has, (N,); −1: none. Columns (unknowns, Z, n), diagonal and gradient (Z, n).
-        """
-        assert self.path is not None
-        assert self._at is not None
-        count = int(which.max()) + 1
-        fit, _ = self._residuals(self.path.x)
-        by = self.weight * self.root_weights(fit) / self.deviations  # ∂r/∂z
-        rows = self.slopes_at_samples(self._at[: self.P], self.path) * by.square()[..., None]  # (N, n, P + d)
-        segment = self.grid.node // (self.grid.h.shape[1] + 1)
-        # Of every segment, whose samples have one zero: (S, P + d, n).
-        S, of = self.grid.segments, torch.full((self.grid.segments,), -1, device=which.device)
-        of[segment] = which
-        own = rows.new_zeros(S, *rows.shape[:0:-1]).index_add(0, segment, rows.mT)
-        columns = rows.new_zeros(self.P + S * self.d, count, self.n)
-        for z in range(count):
-            columns[: self.P, z] = own[of == z, : self.P].sum(0)
-            columns[self.P :, z] = torch.where((of == z)[:, None, None], own[:, self.P :], 0.0).flatten(0, 1)
-        kept = which >= 0
-        zero = rows.new_zeros(count, self.n)
-        diagonal = zero.index_add(0, which[kept], by[kept].square())
-        return columns, diagonal, zero.index_add(0, which[kept], (by * self.root_weights(fit) * fit)[kept])
-
-    def joint_residuals(self, path: Path) -> Tensor:
+    def joint_residuals(self, path: Path, theta: Tensor) -> Tensor:
         """End of each segment less the start of the next, (S, d), over the joint's weight."""
-        return self._residuals(path.x)[1]
+        return self._joints(path.x, self._weights(theta))
 
-    def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Data residuals and their Jacobian, (N·n,) and (N·n, unknowns), over σ and in the order of the samples.
+    def _missed_by(self, x: Tensor) -> Tensor:
+        """Data residuals (N, n)."""
+        return self.weight * self._missed(x) / self.deviations
 
-        Both carry the square roots of the weights: those of a robust loss, those of known starts, and 0 for
-        samples that are not used.
-        """
-        r = self.misfit(path) / self.sigma
-        by = self.weight * self.root_weights(self.weight * r)
-        Z = self.slopes_at_samples(theta, path) * (by / self.deviations)[..., None]
-        segment = self.grid.node // (self.grid.h.shape[1] + 1)
-        J = Z.new_zeros(len(Z), self.n, self.P + self.grid.segments * self.d)
-        J[..., : self.P] = Z[..., : self.P]
-        for i in range(self.d):
-            J[torch.arange(len(Z)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
-        return (by * r).flatten(), J.flatten(0, 1)
-
-    def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Data residuals (N, n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
-        fit = self.weight * self._missed(x) / self.deviations
+    def _joints(self, x: Tensor, weights: Tensor) -> Tensor:
+        """Joint residuals (S, d), zero for a segment that starts a trajectory."""
         ends = x[torch.arange(len(x), device=x.device), self.grid.end, : self.d]
-        joints = (ends.roll(1, 0) - x[:, 0, : self.d]) / self.joint_weight
-        return fit, torch.where(self.grid.joined[:, None], joints, 0.0)
+        joints = (ends.roll(1, 0) - x[:, 0, : self.d]) / weights
+        return torch.where(self.grid.joined[:, None], joints, 0.0)
+
+    @property
+    def masses(self) -> JointMasses:
+        """The masses that momenta of joints are over."""
+        return JointMasses(self.parameters, self.data.q)
+
+    def _weights(self, theta: Tensor) -> Tensor:
+        """What joints are divided by at θ, (d,): momenta by a speed times the mass there.
+
+        With a mass that is held, a fit would let it go to 0, and all defects of momenta with it.
+        """
+        with torch.no_grad():
+            mass = self.masses.at(theta) if self.masses.move else self.mass
+        return torch.cat([self.joint_weight[: self.n], mass * self.joint_weight[self.n : 2 * self.n],
+                          self.joint_weight[2 * self.n :]])  # fmt: skip
 
     @property
     def _anchor_weight(self) -> float:

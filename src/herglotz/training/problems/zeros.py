@@ -52,7 +52,7 @@ class WithZeros:
         if not bool(torch.isfinite(cost)):
             return cost, x.new_zeros(len(x), len(x)), torch.zeros_like(x)
         A = dense(A)
-        columns, diagonal, slope = self.problem.by_zeros(self.which)
+        columns, diagonal, slope = by_zeros(self.problem, self.which)
         C = columns.flatten(1)
         A = torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)])
         b = torch.cat([b, slope.flatten()])
@@ -66,3 +66,29 @@ class WithZeros:
         z = torch.cat([x[-self.count :].reshape(-1, self.problem.n), x.new_zeros(1, self.problem.n)])
         self.problem.zeros = z[self.which]
         return x[: -self.count]
+
+
+def by_zeros(problem: ShootingProblem, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What (JᵀJ, Jᵀr) have of zeros z of sensors, where the normal equations of all unknowns were made last.
+
+    `which` zero, from 0, each sample has, (N,); −1: none. Columns (unknowns, Z, n), diagonal and gradient (Z, n).
+    """
+    assert problem.path is not None
+    assert problem._at is not None
+    count = int(which.max()) + 1
+    fit = problem._missed_by(problem.path.x)
+    by = problem.weight * problem.root_weights(fit) / problem.deviations  # ∂r/∂z
+    rows = problem.slopes_at_samples(problem._at[: problem.P], problem.path) * by.square()[..., None]  # (N, n, P + d)
+    segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
+    # Of every segment, whose samples have one zero: (S, P + d, n).
+    S, of = problem.grid.segments, torch.full((problem.grid.segments,), -1, device=which.device)
+    of[segment] = which
+    own = rows.new_zeros(S, *rows.shape[:0:-1]).index_add(0, segment, rows.mT)
+    columns = rows.new_zeros(problem.P + S * problem.d, count, problem.n)
+    for z in range(count):
+        columns[: problem.P, z] = own[of == z, : problem.P].sum(0)
+        columns[problem.P :, z] = torch.where((of == z)[:, None, None], own[:, problem.P :], 0.0).flatten(0, 1)
+    kept = which >= 0
+    zero = rows.new_zeros(count, problem.n)
+    diagonal = zero.index_add(0, which[kept], by[kept].square())
+    return columns, diagonal, zero.index_add(0, which[kept], (by * problem.root_weights(fit) * fit)[kept])

@@ -1,0 +1,49 @@
+"""A model that a search has found, as settings and starting values of a fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from herglotz.training.baseline import Baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.dictionary import keys_of
+from herglotz.training.named_terms import candidates, settings_of, started, values_of
+from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.task import build_model
+from herglotz.training.trials import FINER, ROUNDING, Trial, moved
+
+
+def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
+    """The settings of a model that has what a trial has taken and nothing else, and the baseline it starts from."""
+    fitter, data = trial.fitter, trial.problem.data
+    bare = replace(fitter.base, start={})
+    own = set(trial.problem.parameters.numbers)
+    keys = [fitter.keys[name] for name in fitter.start if name in own]
+    every = candidates(data, config.translations)
+    terms = every.only(keys)
+    dry = any(key.startswith(("friction.coulomb", "friction.breakaway")) for key in keys)
+    forces = [key for key in keys if key.startswith(("friction.", "coupling."))]
+    between = any(key in keys for key in ("kinetic.off_diagonal", "coupling.viscous"))
+    terms = replace(terms, dry=dry, apart=not between, one_rate=every.one_rate or not forces)
+    variant = trial.fitter.variant
+    of = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
+    names = ParameterVector(build_model(bare, of, "none"))
+    absent = [
+        name for name, key in zip(names.numbers, keys_of(names.numbers, names.model.config), strict=True)
+        if key not in keys and not key.startswith("friction.log_smooth")
+    ]  # fmt: skip
+    of = replace(of, absent=tuple(absent))
+    numbers = ParameterVector(build_model(bare, of, "none"))
+    value = {fitter.keys[name]: x for name, x in trial.values.items()}
+    theta = data.q.new_tensor([value[key] for key in keys_of(numbers.numbers, numbers.model.config)])
+    values = values_of(numbers, theta)
+    if fitter.precise and data.dof > 1 and data.u is None and variant.substeps > 1 and not dry:
+        fourth = replace(of, order=4, substeps=1)  # no kernel has it: a search makes do with short steps
+        own = started(fitter.base, data, values, fourth)
+        grid = segment_grid(data, trial.length, own.model_step)
+        problem = ShootingProblem(build_model(own, fourth, "none"), data, grid, sigma=trial.problem.sigma)
+        if moved(trial, problem, problem.parameters.get()) <= FINER * max(trial.rms, fitter.floor / ROUNDING):
+            return fourth, own
+    return of, started(fitter.base, data, values, of)

@@ -1,0 +1,65 @@
+"""The masses that momenta at the joints of segments are over, and how they change with the parameters."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from herglotz.models.feature_kinetic import FeatureKinetic
+from herglotz.models.mass import PositionKinetic
+from herglotz.models.terms import Kinetic
+from herglotz.training.parameter_vector import ParameterVector
+
+FEW = 8  # samples that say how large a mass is
+
+
+class JointMasses:
+    """The diagonal of the mass matrix over a few of the positions q, (N, n)."""
+
+    def __init__(self, parameters: ParameterVector, q: Tensor):
+        self.parameters = parameters
+        self.q = q[torch.linspace(0, len(q) - 1, FEW, device=q.device).round().long()]
+
+    @property
+    def move(self) -> bool:
+        """Whether the parameters say how large a mass is: the first coordinate's is 1."""
+        return self.q.shape[1] > 1 and self.parameters.model.config.baseline
+
+    def at(self, theta: Tensor) -> Tensor:
+        """At θ, (n,), positive."""
+        named = self.parameters.unflatten(theta)
+        own = {name: value for name, value in named.items() if name.startswith("kinetic.")}
+        mass = functional_call(_Mass(self.parameters.model.kinetic), own, (self.q,))
+        return mass.diagonal(0, -2, -1).abs().mean(0).clamp_min(torch.finfo(theta.dtype).tiny ** 0.5)
+
+    def slopes(self, theta: Tensor) -> Tensor:
+        """∂ log mass / ∂θ, (n, P)."""
+        rows = []
+        with torch.enable_grad():
+            at = theta.detach().requires_grad_()
+            for mass in self.at(at).log():
+                known = (
+                    torch.autograd.grad(mass, at, retain_graph=True, allow_unused=True)[0]
+                    if mass.requires_grad
+                    else None
+                )
+                rows.append(torch.zeros_like(theta) if known is None else known)
+        return torch.stack(rows)
+
+
+class _Mass(nn.Module):
+    """The mass matrix of a kinetic term as a module whose parameters can be given."""
+
+    def __init__(self, kinetic: nn.Module):
+        super().__init__()
+        self.kinetic = kinetic
+
+    def forward(self, q: Tensor) -> Tensor:
+        """(k, n, n) at positions (k, n)."""
+        of = self.kinetic
+        if not isinstance(of, FeatureKinetic):
+            return of.mass(q) if isinstance(of, PositionKinetic) else cast(Kinetic, of).mass().expand(len(q), -1, -1)
+        return _Mass(of.base)(q) + of.mass(q)

@@ -1,0 +1,92 @@
+"""What the quadratic model of a fit says of offers: those that may join, those that may leave, and exchanges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from herglotz.training.offers import Offer
+from herglotz.training.pruning import inverse_of
+from herglotz.training.trials import Trial
+
+
+def gains(trial: Trial) -> list[tuple[float, Offer]]:
+    """By how much each offer that is not taken lowers the cost by the quadratic model, in units of the misfit."""
+    left, found = [offer for offer in trial.fitter.offers if offer.name not in trial.taken], everything(trial)
+    if found is None:
+        return []
+    H, g, at = found
+    free = torch.tensor([at[name] for name in trial.problem.parameters.numbers])
+    own = (torch.tensor([at[name] for name in offer.numbers]) for offer in left)
+    return [(_gain(H, g, free, i), offer) for i, offer in zip(own, left, strict=True)]
+
+
+def swaps(trial: Trial) -> Iterator[tuple[float, str, str]]:
+    """By how much a new offer lowers the cost in the place of an old one by the quadratic model, at the best."""
+    numbers, found = trial.problem.parameters.numbers, everything(trial)
+    if found is None:
+        return
+    H, g, at = found
+    old = {at[offer.numbers[0]]: offer.name for offer in trial.fitter.offers if offer.name in trial.taken}
+    for offer in trial.fitter.offers:
+        own = [at[name] for name in offer.numbers]
+        if offer.name in trial.taken or not old:
+            continue
+        free = torch.tensor([*(at[name] for name in numbers), *own])
+        C = inverse_of(H[free][:, free])
+        values = g.new_tensor([*(trial.values[name] for name in numbers), *(0.0 for _ in own)])
+        x = values - C @ g[free]
+        cost = x.square() / C.diagonal() / 2
+        places = [k for k, i in enumerate(free.tolist()) if i in old]
+        k = min(places, key=lambda k: float(cost[k]))
+        yield float(g[free] @ C @ g[free]) / 2 - float(cost[k]), offer.name, old[int(free[k])]
+
+
+def order_of(trial: Trial) -> list[str]:
+    """The offers that are taken as they leave one after the other, the one that costs least first."""
+    numbers = trial.problem.parameters.numbers
+    found = trial.curvature(numbers)
+    if found is None:
+        return []
+    H, x = found[0], trial.theta.clone()
+    offers = {offer.numbers[0]: offer for offer in trial.fitter.offers if offer.name in trial.taken}
+    keep, order = list(range(len(numbers))), []
+    while left := [i for i in keep if numbers[i] in offers]:
+        C = inverse_of(H[keep][:, keep])
+        place = {i: k for k, i in enumerate(keep)}
+        i = min(left, key=lambda i: float(x[i] ** 2 / C[place[i], place[i]]) - worth(trial, offers[numbers[i]]))
+        k = place[i]
+        x[keep] = x[keep] - C[:, k] / C[k, k] * x[i]
+        order.append(offers[numbers[i]].name)
+        out = {numbers.index(name) for name in offers[numbers[i]].numbers}
+        keep = [j for j in keep if j not in out]
+    return order
+
+
+def worth(trial: Trial, offer: Offer) -> float:
+    """Twice what the numbers of an offer have to lower the cost by at least."""
+    return math.log(trial.score.count) * len(offer.numbers)
+
+
+def everything(trial: Trial) -> tuple[Tensor, Tensor, dict[str, int]] | None:
+    """(H, g) of the numbers of all offers at a fit, and their places."""
+    fitter = trial.fitter
+    every = set(fitter.numbers(offer.name for offer in fitter.offers))
+    found = trial.curvature(list(every))
+    at = {name: i for i, name in enumerate(name for name in fitter.start if name in every)}
+    return None if found is None else (*found, at)
+
+
+def _gain(H: Tensor, g: Tensor, free: Tensor, own: Tensor) -> float:
+    """By how much numbers `own` lower the cost by the quadratic model, the free ones following."""
+    size = torch.where(H.diagonal() > 0, H.diagonal(), 1.0).sqrt()
+    A, b = H / size[:, None] / size, g / size
+    C = torch.linalg.pinv(A[free][:, free], hermitian=True) @ torch.cat([A[free][:, own], b[free, None]], 1)
+    S = A[own][:, own] - A[free][:, own].T @ C[:, :-1]
+    slope = b[own] - A[free][:, own].T @ C[:, -1]
+    values, vectors = torch.linalg.eigh(S)
+    along = vectors.T @ slope
+    return float(torch.where(values > 1e-9, along.square() / values.clamp_min(1e-300), 0.0).sum()) / 2

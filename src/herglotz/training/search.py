@@ -1,0 +1,286 @@
+"""One search over offers, from both ends: up from the simplest model, and down from the whole dictionary.
+
+A model is a set of offers (`offers`), fitted by multiple shooting over segments that grow while it follows the data.
+The quadratic model of a fit says which offers are worth a fit; the fit is compared by the one inequality of `score`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.sensors import measured
+from herglotz.data.smoothing import local_polynomials
+from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
+from herglotz.training.baseline import Baseline, estimate_baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.linear_terms import starts_of
+from herglotz.training.named_terms import candidates, special, started
+from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.problems.grid import FIRST_SEGMENT
+from herglotz.training.problems.robust import FREEDOM
+from herglotz.training.quadratic import gains, order_of, swaps, worth
+from herglotz.training.sensor_zeros import apart
+from herglotz.training.task import build_model
+from herglotz.training.trials import FINER, ITERATIONS, ROUNDING, Compared, Fitter, Trial, Variant, is_precise, moved
+
+PART = 2000  # samples that a search is made of, where there are more than twice as many
+FEW = 5  # iterations of trials on more samples than a search is made of, each for one offer
+TRIED = 3  # offers whose fits are compared, of those that the quadratic model puts first
+FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
+
+
+class Search:
+    """See the head of this module."""
+
+    def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False):
+        self.data, self.base, self.config = data, base, config
+        self.freedom = FREEDOM if outliers else None
+        self.order = 4 if is_precise(data) and data.dof == 1 else 2
+        self.fitters: dict[Variant, Fitter] = {}
+        self.tried, self.most = TRIED, ITERATIONS
+        self.finest = max(1, min(FINEST, STEPS // data.samples))
+
+    def fitter(self, variant: Variant) -> Fitter:
+        """Of one variant."""
+        if variant not in self.fitters:
+            self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom)
+        return self.fitters[variant]
+
+    @inside()
+    def run(self) -> Trial | None:
+        """The model that held-out time asks for; None where not even the shortest segments can be followed."""
+        few = self.data.liveliest(PART)
+        if few.samples < self.data.samples / 2:
+            search = Search(few, self.base, self.config, outliers=self.freedom is not None)
+            search.order = self.order
+            found = search.run()
+            if found is None:
+                return None
+            fitter = self.fitter(found.fitter.variant)
+            first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
+            found = fitter.fit(found.taken, found.values, first, None)
+            self.tried, self.most = 1, FEW
+            return None if found is None else self.settled(self.finer(fitter.leap(found)))
+        part(FIRST_TERMS)
+        fitter = self.fitter(Variant(self.order))
+        best = self.climbed(fitter.simple, {})
+        part(MORE_TERMS)
+        ends = [best]
+        for taken, values in [] if best is not None and best.at_the_noise else self.starts(fitter):
+            ends.append(self.climbed(taken, values))
+            best = self.better(best, ends[-1])
+        if best is None:
+            return None
+        part(FEWER_TERMS)
+        every = [offer.name for offer in best.fitter.offers]
+        down = best.fitter.fit(every, best.values, best.length, best, 2 * ITERATIONS)
+        down = down and best.fitter.grow(down)
+        ends.append(None if down is None else self.settled(self.finer(down), swapped=True))
+        best = self.better(best, ends[-1])
+        return self.stuck(best and self.braking(self.finalist(best, ends)))
+
+    def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
+        """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
+
+        Blocks in between are foretold from both sides; where a force is missing, as residuals above the noise show,
+        terms that make up for it there may not carry on.
+        """
+        if best.at_the_noise or not best.whole:
+            return best
+        fitter = best.fitter
+        simple = fitter.fit(fitter.simple, best.values, best.length, best, 2 * ITERATIONS)
+        others = {end.taken: end for end in (simple, *ends) if end is not None and end.length == best.length}
+        scored = [(end, end.fitter.foretold(end)) for end in others.values()]
+        scored = sorted(((end, x) for end, x in scored if x is not None), key=lambda pair: pair[1].numbers)
+        winner, least = best, None
+        for end, found in scored:
+            if least is None or found.replaces(least, fitter.offered):
+                winner, least = end, found
+        return winner
+
+    def starts(self, fitter: Fitter) -> list[tuple[list[str], dict[str, float]]]:
+        """Offers and values that one linear problem of smoothed accelerations gives."""
+        local, data = local_polynomials(self.data), self.data
+        if local is None:
+            return []
+        found, every = [], candidates(data, self.config.translations)
+        every = every.only(set(every.names) - set(special(data)))
+        for start in starts_of(data, self.base, every, local)[:1]:
+            base = started(self.base, data, start.values, fitter.settings)
+            numbers = ParameterVector(build_model(base, fitter.settings, "none"))
+            values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
+            found.append(([offer.name for offer in fitter.offers if values[offer.numbers[0]] != 0], values))
+        return found
+
+    def climbed(self, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
+        """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
+        fitter = self.fitter(Variant(self.order))
+        trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
+        while trial is not None:
+            trial = self.finer(trial)
+            while (more := self.richer(trial)) is not None:
+                trial = self.finer(more)
+            if (longer := trial.fitter.longer(trial)) is None:
+                return self.settled(trial)
+            trial = longer
+        return None
+
+    def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
+        """The better one of two models."""
+        if up is None or down is None:
+            return up or down
+        rich, simple = (up, down) if up.problem.P > down.problem.P else (down, up)
+        return rich if rich.replaces(simple) else simple
+
+    def settled(self, trial: Trial, *, swapped: bool = False) -> Trial:
+        """With offers that join and leave, and take the place of others, until none does."""
+        seen = {trial.taken}
+        ways = (self.richer, self.simpler, *([self.swapped] if swapped else []))
+        while other := next((x for way in ways if (x := way(trial)) is not None and x.taken not in seen), None):
+            seen.add(other.taken)
+            other = other.fitter.fit(other.taken, other.values, other.length, other, 2 * self.most) or other
+            trial = self.finer(other.fitter.grow(other))
+        return trial
+
+    def richer(self, trial: Trial) -> Trial | None:
+        """With one more offer, the first of those that the quadratic model puts first; None where none replaces it."""
+        more = ((gain - worth(trial, offer) / 2, offer) for gain, offer in gains(trial))
+        names = [offer.name for gain, offer in sorted(more, key=lambda x: -x[0])[: self.tried] if gain > 0]
+        fit = trial.fitter.fit
+        tried = (fit(trial.taken | {name}, trial.values, trial.length, trial, self.most) for name in names)
+        return next((other for other in tried if other is not None and other.replaces(trial)), None)
+
+    def swapped(self, trial: Trial) -> Trial | None:
+        """With one offer in the place of another, by the quadratic model; None where that is no better.
+
+        One that stands before the other in the dictionary, which has the usual laws first, need not be better.
+        """
+        place = {offer.name: i for i, offer in enumerate(trial.fitter.offers)}
+        least = -math.log(trial.score.count) / 2
+        for _, new, old in sorted((x for x in swaps(trial) if x[0] > least), reverse=True)[: self.tried]:
+            taken = trial.taken - {old} | {new}
+            other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS)
+            if other is None:
+                continue
+            if not trial.replaces(other) if place[new] < place[old] else other.replaces(trial):
+                return other
+        return None
+
+    def simpler(self, trial: Trial) -> Trial | None:
+        """With fewer offers, half of them at first, those that the quadratic model misses least; None: none go."""
+        fitter, order = trial.fitter, order_of(trial)
+        count = len(order) // 2
+        while count > 0:
+            most = 2 * self.most if count > 1 else self.most
+            less = fitter.fit(trial.taken - set(order[:count]), trial.values, trial.length, trial, most)
+            if less is not None and not trial.replaces(less):
+                return less
+            count //= 2
+        return None
+
+    def finer(self, trial: Trial) -> Trial:
+        """With halved steps while that changes the motion by a good part of the misfit."""
+        while trial.fitter.variant.substeps < self.finest:
+            fitter = trial.fitter
+            other = self.fitter(replace(fitter.variant, substeps=2 * fitter.variant.substeps))
+            problem = other.problem(trial.length).of(other.numbers(trial.taken), trial.problem.sigma)
+            if moved(trial, problem, trial.theta) <= FINER * max(trial.rms, fitter.floor / ROUNDING):
+                break
+            fit = other.fit(trial.taken, trial.values, trial.length, trial)
+            if fit is None or trial.replaces(fit):
+                break
+            trial = other.grow(fit)
+        return trial
+
+    def compared(self, trial: Trial) -> list[dict[str, Any]]:
+        """The models that were compared with this one over segments of its length, as plain values, by their size."""
+        rows: dict[frozenset[str], Compared] = {}
+        for fitter in self.fitters.values():
+            for row in fitter.compared:
+                before = rows.get(row.taken)
+                better = math.isfinite(row.held_out) and (before is None or row.held_out < before.held_out)
+                if row.length == trial.length and better:
+                    rows[row.taken] = row
+        rows[trial.taken] = Compared(trial.length, trial.problem.P, trial.score.rms, trial.taken)
+        order = [offer.name for offer in (*trial.fitter.offers, *trial.fitter.loads)]
+        return [
+            {
+                "numbers": row.numbers,
+                "held_out": row.held_out,
+                "offers": [name for name in order if name in row.taken],
+                "taken": row.taken == trial.taken,
+            }
+            for row in sorted(rows.values(), key=lambda row: (row.numbers, row.held_out))
+        ]
+
+    def better_on_a_line(self, trial: Trial | None) -> bool:
+        """Whether angles that are taken for positions on a line, as of a free spring, give a better model."""
+        if not any(self.data.angles) or self.config.translations or (trial is not None and trial.at_the_noise):
+            return False
+        data = replace(self.data, angles=(False,) * self.data.dof)
+        base = estimate_baseline(data, outliers=self.freedom is not None)
+        other = Search(data, base, self.config, outliers=self.freedom is not None).run()
+        if other is None or trial is None or not other.replaces(trial):
+            return other is not None and trial is None
+        ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
+        return ahead is not None and (its is None or ahead.replaces(its, trial.fitter.offered))
+
+    def apart(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
+        """Zeros of sensors (B, n) that recordings differ in, and their deviations; None: the score asks for none."""
+        asked = self.config.find_zeros or (self.config.find_zeros is None and not trial.at_the_noise)
+        if len(self.data) == 1 or not asked:
+            return None
+        names = trial.problem.parameters.numbers
+        problem = trial.problem.of(names, trial.problem.sigma, trial.fitter.prior(names))
+        found = apart(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
+        if found is None:
+            return None
+        data = measured(self.data, found[0].flatten().tolist())
+        other = Fitter(data, self.base, self.config, trial.fitter.variant, self.freedom)
+        fit = other.fit(trial.taken, trial.values, trial.length, trial, 2 * ITERATIONS)
+        more = (len(data) - 1) * data.dof
+        return found if fit is not None and fit.with_more(more).gain(trial) > 0 else None
+
+    def held(self, trial: Trial, holds: Sequence[str]) -> str:
+        """The hold of the inputs that the same model asks for; "" where none of these is better."""
+        best, found = trial, ""
+        for hold in [] if trial.at_the_noise else holds:
+            fitter = Fitter(replace(self.data, hold=hold), self.base, self.config, trial.fitter.variant, self.freedom)
+            other = fitter.fit(trial.taken, trial.values, trial.length, trial, 2 * ITERATIONS)
+            if other is not None and other.replaces(best):
+                best, found = other, hold
+        return found
+
+    def braking(self, trial: Trial) -> Trial:
+        """With a load in the place of dry friction that pushes, which would create energy, or with neither."""
+        for i in range(self.data.dof):
+            name = "friction.coulomb" + (f"[{i}]" if self.data.dof > 1 else "")
+            if name not in trial.taken or trial.values[name] > 0:
+                continue
+            every = (*trial.fitter.offers, *trial.fitter.loads)
+            loads = [offer.name for offer in every if offer.name == f"load {i + 1}"]
+            taken = trial.taken - {name} | set(loads)
+            trial = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS) or trial
+        return trial
+
+    def stuck(self, trial: Trial | None) -> Trial | None:
+        """With friction that can hold a joint still, where that is as likely."""
+        dry = trial is not None and any(name.startswith("friction.coulomb") for name in trial.taken)
+        if trial is None or not dry or self.config.sticking is False:
+            return trial
+        fitter = self.fitter(replace(trial.fitter.variant, sticking=True))
+        least = 0.01 * max(self.base.speed)
+        values = {
+            name: max(x, least) if name.startswith("friction.coulomb") and x != 0 else x
+            for name, x in trial.values.items()
+        }
+        held = fitter.fit(trial.taken, values, trial.length, trial, 2 * ITERATIONS)
+        if held is None or trial.replaces(held):
+            return trial
+        return self.settled(self.finer(held))

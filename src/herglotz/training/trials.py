@@ -1,0 +1,276 @@
+"""A model of a search with its fit, and the fits of subsets of a dictionary's numbers.
+
+A model is a set of offers (`offers`), fitted by multiple shooting over segments that grow while it follows the data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import AT_THE_NOISE, coarse, precision
+from herglotz.data.smoothing import smoothed
+from herglotz.training.baseline import Baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.dictionary import keys_of
+from herglotz.training.first_states import first_states, states_of_pairs
+from herglotz.training.named_terms import candidates, settings_of, started, turns_one_way
+from herglotz.training.offers import offers_of, without_offers
+from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.problems.grid import segment_grid, segment_lengths
+from herglotz.training.problems.prior import Gaussian, prior_of
+from herglotz.training.problems.robust import scale_of
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.score import Score, free_run_score, score
+from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
+from herglotz.training.solvers.lifted_newton import Path
+from herglotz.training.task import EXACT, build_model
+
+ITERATIONS = 15  # of a fit: a trial that needs more starts too far off
+SEEN = 0.75  # of every trajectory: finalists are fitted to it, and run free over the rest
+SHORT = (5, 10)  # recorded steps of the first segments: over these motion is all but linear in the forces
+LOST, FOLLOWED = 2.0, 0.05  # times what shorter segments miss, and of the spread: longer ones are not followed
+FINER = 0.3  # of the misfit: a rule that changes the motion by more is worth trying
+FAR_OFF, NEAR = 1e-3, 1e-8  # damping of the first iteration
+ROUNDING = 10.0  # times the σ of exact data: smaller misfits are no reason for anything
+SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What a model is beside its numbers."""
+
+    order: int
+    substeps: int = 1
+    sticking: bool = False
+
+
+class Compared(NamedTuple):
+    """A model that was scored."""
+
+    length: int  # recorded steps of its segments
+    numbers: int
+    held_out: float  # RMS error over held-out blocks, in units of q over the balance
+    taken: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A model with its fit."""
+
+    fitter: Fitter
+    taken: frozenset[str]
+    values: dict[str, float]  # of all numbers
+    problem: ShootingProblem
+    path: Path
+
+    @property
+    def theta(self) -> Tensor:
+        """(P,) of the free numbers."""
+        return self.path.x.new_tensor([self.values[name] for name in self.problem.parameters.numbers])
+
+    @cached_property
+    def rms(self) -> float:
+        """Misfit of the data, in units of q over the balance."""
+        r = self.problem.misfit(self.path)
+        return scale_of(r) if self.problem.freedom else float(r.square().mean().sqrt())
+
+    @property
+    def length(self) -> int:
+        """Recorded steps of its segments."""
+        return self.problem.grid.length
+
+    @property
+    def whole(self) -> bool:
+        """Whether it follows whole trajectories."""
+        return self.problem.grid.segments == len(self.problem.data)
+
+    @property
+    def at_the_noise(self) -> bool:
+        """Whether it follows whole trajectories as precisely as they are known."""
+        return self.whole and self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
+
+    @cached_property
+    def score(self) -> Score:
+        """Its loss over held-out blocks."""
+        found = score(self.problem, self.path, self.theta, self.problem.P, self.fitter.floor)
+        self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
+        return found
+
+    def replaces(self, simple: Trial) -> bool:
+        """Whether this richer model replaces a simpler one."""
+        return self.gain(simple) > 0
+
+    def gain(self, simple: Trial) -> float:
+        """By how much it does; infinite where it follows longer segments."""
+        if self.length != simple.length:
+            return math.inf if self.length > simple.length else -math.inf
+        return self.score.gain(simple.score, self.fitter.offered)
+
+    def with_more(self, count: int) -> Trial:
+        """The same, scored as a model of so many more numbers."""
+        other = replace(self)
+        other.__dict__["score"] = replace(self.score, numbers=self.score.numbers + count)
+        return other
+
+    def curvature(self, names: Sequence[str]) -> tuple[Tensor, Tensor] | None:
+        """(H, g) of these numbers at the fit, the states being eliminated, in units of its misfit."""
+        problem = self.problem.of(names, self.problem.sigma, self.fitter.prior(names))
+        problem.path = self.path
+        states = self.path.x[:, 0, : problem.d]
+        names = problem.parameters.numbers
+        x = problem.pack(states.new_tensor([self.values[name] for name in names]), states)
+        cost, A, b = problem.normal_equations(x)
+        found = A.reduced(b) if bool(torch.isfinite(cost)) else None
+        by = (problem.sigma / max(self.rms, self.fitter.floor)) ** 2
+        finite = found is not None and bool(torch.isfinite(found[0]).all()) and bool(torch.isfinite(found[1]).all())
+        return (found[0] * by, found[1] * by) if finite and found is not None else None
+
+
+class Fitter:
+    """Fits of subsets of a dictionary's numbers to recordings, by one variant of its model."""
+
+    def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None):
+        self.data, self.variant, self.freedom = data, variant, freedom
+        terms = candidates(data, config.translations)
+        settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
+        first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
+        base = started(base, data, first, settings)
+        self.base, self.settings = base, settings
+        self.model = build_model(base, settings, "none")
+        every = ParameterVector(self.model)
+        self.keys = dict(zip(every.numbers, keys_of(every.numbers, self.model.config), strict=True))
+        self.always, every_offer, self.simple = offers_of(self.model, list(self.keys.values()))
+        without_offers(self.model, every_offer)
+        one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]  # is dry friction already
+        self.offers = [offer for offer in every_offer if offer.name not in one_way]
+        self.loads = [offer for offer in every_offer if offer.name in one_way]
+        self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
+        own, self._prior = prior_of(self.model, base, None), {}
+        for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
+            self._prior[every.numbers[i]] = spread**-2
+        lengths = segment_lengths(data)
+        self.lengths = [*(length for length in SHORT if length < lengths[0]), *lengths]
+        self.problems: dict[int, ShootingProblem] = {}
+        self.floor = ROUNDING * EXACT["float64"] * max(base.scale)
+        self.offered = len(self.always) + sum(len(offer.numbers) for offer in self.offers)
+        self.smooth = smoothed(data)
+        self.precise, self.precision = is_precise(data), precision(data)
+        self.spread = spread_of(data)
+        self.compared: list[Compared] = []
+
+    def prior(self, names: Sequence[str]) -> Gaussian:
+        """Of these numbers, in the order of the model."""
+        own = [name for name in self.start if name in set(names)]
+        like = self.data.q
+        return Gaussian(
+            like.new_tensor([self.start[name] for name in own]),
+            like.new_tensor([self._prior.get(name, 0.0) for name in own]),
+        )
+
+    def problem(self, length: int) -> ShootingProblem:
+        """Of all numbers."""
+        if length not in self.problems:
+            grid = segment_grid(self.data, length, self.base.model_step)
+            sigma = min(max(self.precision, self.floor), self.spread)
+            self.problems[length] = ShootingProblem(self.model, self.data, grid, sigma=sigma, freedom=self.freedom)
+        return self.problems[length]
+
+    def numbers(self, taken: Iterable[str]) -> list[str]:
+        """Of a model with these offers."""
+        taken = set(taken)
+        every = (*self.offers, *self.loads)
+        return [*self.always, *(name for offer in every if offer.name in taken for name in offer.numbers)]
+
+    def fit(
+        self, taken: Iterable[str], values: dict[str, float], length: int, before: Trial | None, most: int = ITERATIONS
+    ) -> Trial | None:
+        """From these values, and from the states of a fit before or smoothed samples; None where no path is found."""
+        taken, every = frozenset(taken), self.problem(length)
+        names = self.numbers(taken)
+        sigma = every.sigma if before is None else max(before.rms, self.floor)
+        problem = every.of(names, sigma, self.prior(names))
+        names = problem.parameters.numbers
+        theta = self.data.q.new_tensor([values.get(name, self.start[name]) for name in names])
+        if before is None:
+            states = first_states(problem, theta, self.smooth)
+            if problem.compiled is None:
+                problem.guess_from_states(states_of_pairs(self.model, self.smooth))
+        else:
+            states = before.problem.states_at(before.path, problem.grid.start_sample)
+            if problem.compiled is None:
+                problem.guess_from(before.problem, before.path)
+        x = problem.pack(theta, states)
+        near = before is not None and before.length == length
+        damping = NEAR if near else FAR_OFF
+        result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
+        path = problem.solve(result.x) if math.isfinite(result.cost) else None
+        if path is None:
+            return None
+        found = self.start | dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
+        return Trial(self, taken, found, problem, path)
+
+    def foretold(self, trial: Trial) -> Score | None:
+        """The score of a free run over the last quarter of every trajectory, which is not fitted; None: no path."""
+        names = trial.problem.parameters.numbers
+        problem = self.problem(trial.length).of(names, max(trial.rms, self.floor), self.prior(names))
+        part = torch.cat([torch.arange(length) < round(SEEN * length) for length in self.data.lengths])
+        problem.used, problem.path = part.to(self.data.t.device), trial.path
+        problem._weigh()
+        x = problem.pack(trial.theta, trial.path.x[:, 0, : problem.d])
+        result = levenberg_marquardt(problem, x, max_iterations=2 * ITERATIONS, rtol=1e-3, patience=2, damping=NEAR)
+        path = problem.solve(result.x) if math.isfinite(result.cost) else None
+        return None if path is None else free_run_score(problem, path, problem.P, self.floor)
+
+    def longer(self, trial: Trial) -> Trial | None:
+        """Over segments of the next length; None where there is none, or the model does not follow the data so long."""
+        if trial.whole:
+            return None
+        length = self.lengths[self.lengths.index(trial.length) + 1]
+        found = self.fit(trial.taken, trial.values, length, trial)
+        followed = max(LOST * trial.rms, FOLLOWED * self.spread)
+        return None if found is None or found.rms > followed else found
+
+    def grow(self, trial: Trial) -> Trial:
+        """Over segments that grow as long as the model follows the data."""
+        while (found := self.longer(trial)) is not None:
+            trial = found
+        return trial
+
+    def leap(self, trial: Trial) -> Trial:
+        """Over whole trajectories at once where a model that is known follows these, or as `grow`."""
+        whole = self.fit(trial.taken, trial.values, self.lengths[-1], trial)
+        return self.grow(trial) if whole is None or whole.rms > FOLLOWED * self.spread else whole
+
+
+def spread_of(data: Trajectories) -> float:
+    """RMS of q about its mean, over the balance."""
+    return float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
+
+
+def is_precise(data: Trajectories) -> bool:
+    """Whether the data are worth a rule of order 4."""
+    return coarse(data) or precision(data) < SMOOTH * spread_of(data)
+
+
+def masses(data: Trajectories) -> tuple[float, ...]:
+    """Logarithms of the roots of masses but the first, 1, that make all coordinates alike, each over its balance."""
+    balance = data.balance.double()
+    return tuple((balance[0] / balance[1:]).log().tolist())
+
+
+def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
+    """By how much the rule of another problem changes the motion of a trial, RMS."""
+    if problem.compiled is None:
+        problem.guess_from(trial.problem, trial.path)
+    path = problem.solve(problem.pack(theta, trial.path.x[:, 0, : problem.d]))
+    if path is None:
+        return math.inf
+    return float((problem.misfit(path) - trial.problem.misfit(trial.path)).square().mean().sqrt())

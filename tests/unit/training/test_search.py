@@ -1,0 +1,237 @@
+"""The search over offers: what it takes, what it leaves, and what its score says."""
+
+from dataclasses import replace
+from typing import TypeVar
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.scenes import scene
+from herglotz.training import FitConfig, Plan, fit
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.found_model import settings
+from herglotz.training.look import look
+from herglotz.training.score import Score, blocks, held_out_residuals, score
+from herglotz.training.search import Search
+from herglotz.training.stages import Stages
+from herglotz.training.trials import Variant
+
+NOISE = 0.003
+T = TypeVar("T")
+
+
+def there(found: T | None) -> T:
+    assert found is not None
+    return found
+
+
+def searched(data, **changes):
+    config = FitConfig(**changes).resolved(data)
+    return Search(data, estimate_baseline(data), config)
+
+
+@pytest.fixture(scope="module")
+def duffing():
+    """A search over 201 samples with noise, and the model that it ends in."""
+    search = searched(simulate(scene("duffing"), trajectories=1, steps=200, h=0.1, noise=NOISE, seed=0))
+    return search, there(search.run())
+
+
+def test_a_cart_and_its_pole_are_found_in_noise():
+    # fails if the search ends in masses that turn with their own angle, or keeps a mass or a spring that cart and pole
+    # lack. The mass between them is 0.15/1.3 of both; the cart's unit is 500 times the pole's
+    data = simulate(scene("cart_pole"), trajectories=3, steps=80, h=0.12, noise=NOISE, seed=0)
+    data = replace(data, q=data.q * torch.tensor([0.002, 1.0], dtype=data.q.dtype), p=None, s=None)
+    found = there(searched(data).run())
+    assert [name for name in found.taken if "v" in name and "viscous" not in name] == ["cos(q2) v1 v2"]
+    assert not {"potential.stiffness[0]", "potential.tilt[0]", "kinetic.off_diagonal"} & found.taken
+    (number,) = [name for name, key in found.fitter.keys.items() if key == "cos(q2) v1 v2"]
+    assert found.values[number] / 0.002 == pytest.approx(0.15 / 1.3, rel=0.02)
+
+
+def test_six_exact_samples_a_period_give_the_equation():
+    # fails if the search starts from accelerations over 1 s alone, or with a rule of order 2 in long steps
+    data, _ = simulate(scene("damped_pendulum"), trajectories=5, steps=40, h=1.0, seed=1).unwrapped().split_time(0.67)
+    found = there(searched(data).run())
+    assert found.taken == {"cos(q1)"}
+    assert found.rms < 1e-7
+
+
+def test_longer_steps_do_not_hide_in_the_parameters():
+    # fails if steps are halved only where that lowers the misfit: small motions fit as well at one step a sample, with
+    # a coefficient that is 1 % off and wrong for large motions
+    data = simulate(
+        scene("damped_pendulum"), trajectories=2, steps=140, h=0.39, noise=0.004, seed=0, q_range=(-0.6, 0.6),
+        v_range=(-0.3, 0.3),
+    )  # fmt: skip
+    found = there(searched(data).run())
+    assert found.taken == {"cos(q1)"}
+    (number,) = [name for name, key in found.fitter.keys.items() if key == "cos(q1)"]
+    assert found.values[number] == pytest.approx(-1.0, abs=0.008)
+
+
+def closed_loop(steps, noise=5e-4):
+    """θ″ = −18 sin θ − 0.9 θ′ + 5 τ under a controller that holds it at slowly moving angles, τ held over each step."""
+    make, h, parts = torch.Generator().manual_seed(3), 0.01, 10
+    x = v = 0.0
+    torques, angles = [], []
+    for k in range(steps):
+        goal = 0.3 + 0.1 * torch.sin(torch.tensor(0.01 * k)).item()
+        angles.append(x)
+        tau = 18 / 5 * goal + 8 * (goal - x) - 1.2 * v
+        torques.append(tau)
+        for _ in range(parts):
+            v += h / parts * (-18 * torch.sin(torch.tensor(x)).item() - 0.9 * v + 5 * tau)
+            x += h / parts * v
+    q = torch.tensor(angles, dtype=torch.float64)
+    q = q + noise * torch.randn(steps, generator=make, dtype=torch.float64)
+    u = torch.tensor(torques, dtype=torch.float64)
+    t = h * torch.arange(steps, dtype=torch.float64)
+    return Trajectories.of(t, q, u=u, angles=(True,), hold="zero")
+
+
+def test_inputs_that_follow_from_the_state_do_not_mislead():
+    # fails if coefficients that cancel take the place of the law: torque with the wrong sign, numbers of 1e5
+    found = there(searched(closed_loop(400)).run())
+    value = {found.fitter.keys[name]: x for name, x in found.values.items()}
+    assert value["friction.input_map"] == pytest.approx(5.0, rel=0.05)
+    assert value["cos(q1)"] == pytest.approx(-18.0, rel=0.05)
+    assert value["damping.rate"] == pytest.approx(0.9, rel=0.2)
+
+
+def test_friction_of_one_direction_is_found():
+    # z″ = −40 z − 1.5 z′ + |z′|: fails if no offer is even in the speed
+    x, v, path = 0.1, 0.0, []
+    for _ in range(200):
+        path.append(x)
+        for _ in range(20):
+            v += 0.001 * (-40 * x - 1.5 * v + abs(v))
+            x += 0.001 * v
+    q = torch.tensor(path, dtype=torch.float64)
+    q = q + 2e-4 * torch.randn(200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = there(searched(Trajectories.of(0.02 * torch.arange(200, dtype=torch.float64), q)).run())
+    assert found.taken == {"q1^2", "|v1|"}
+
+
+@pytest.mark.parametrize(("rate", "word"), [(0.3, "friction.coulomb"), (-0.3, "load 1")])
+def test_what_pushes_on_a_joint_that_turns_one_way_is_a_load(rate, word):
+    # fails if friction drives a joint, which creates energy: where a joint never turns back a load is the same force
+    t = 0.05 * torch.arange(200, dtype=torch.float64)
+    speed = 12 if rate > 0 else 2
+    phi = speed * (1 - torch.exp(-0.2 * t)) / 0.2 - rate / 0.2 * (t - (1 - torch.exp(-0.2 * t)) / 0.2)
+    phi = phi + 1e-3 * torch.randn(200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = Trajectories.of(t, phi, angles=(True,)).unwrapped()
+    found = there(searched(data, sticking=False).run())
+    of_friction = {name for name in found.taken if name in ("friction.coulomb", "load 1")}
+    assert of_friction == {word}
+
+
+def test_the_settings_of_a_model_have_what_it_has_taken(duffing):
+    search, found = duffing
+    of, base = settings(found, search.config)
+    assert set(of.features) == found.taken == {"q1^2", "q1^4"}
+    assert (of.drag, of.coulomb, of.level) == ((), False, "linear")
+    assert base.rate == pytest.approx(found.values["damping.rate"])
+    assert set(base.start) == {"potential.features.sum.coefficient"}
+
+
+def test_an_offer_that_says_nothing_is_not_taken(duffing):
+    # fails if the price of a number is not paid, or the law goes for a worse one
+    search, found = duffing
+    more = there(found.fitter.fit(found.taken | {"q1^6"}, found.values, found.length, found))
+    less = there(found.fitter.fit(found.taken - {"q1^4"}, found.values, found.length, found))
+    assert not more.replaces(found)
+    assert found.replaces(less)
+    assert search.richer(found) is None
+    assert search.simpler(found) is None
+
+
+def test_a_start_without_a_path_is_none():
+    search = searched(simulate(scene("duffing"), trajectories=1, steps=60, h=0.1, noise=NOISE, seed=0))
+    fitter = search.fitter(Variant(2))
+    assert fitter.fit(fitter.simple, {"potential.features.sum.coefficient[0]": 1e300}, 5, None) is None
+
+
+@pytest.mark.parametrize(
+    ("gains", "more", "replaces"),
+    [((20.0,) * 10, 1, True), ((20.0,) * 10, 60, False), ((200.0, *[0.0] * 9), 1, False), ((0.3,) * 10, 1, False)],
+)
+def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, replaces):
+    # fails if a price is left out, or if one block alone decides
+    simple = Score(torch.tensor(gains), 400, 3, 1.0)
+    rich = Score(torch.zeros(10), 400, 3 + more, 1.0)
+    assert rich.replaces(simple, 80) is replaces
+
+
+def test_held_out_residuals_are_those_of_fits_without_the_blocks():
+    # fails if a step of parameters or starts has the wrong sign or size. A linear system: to first order is exact
+    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    search = searched(data)
+    fitter = search.fitter(Variant(2))
+    whole = fitter.grow(there(fitter.fit({"q1^2"}, {}, 5, None, 60)))
+    whole = there(fitter.fit({"q1^2"}, whole.values, whole.length, whole, 60))
+    block = blocks(data)
+    found = held_out_residuals(whole.problem, whole.path, whole.theta, block)
+    for k in (0, 4, 9):
+        out = block == k
+        names = whole.problem.parameters.numbers
+        problem = whole.problem.of(names, whole.problem.sigma, fitter.prior(names))
+        problem.used = ~out
+        problem._weigh()
+        x = problem.pack(whole.theta, whole.path.x[:, 0, : problem.d])
+        for _ in range(6):
+            _, A, b = problem.normal_equations(x)
+            x = x - torch.linalg.solve(A.dense(), b)
+        missed = problem.misfit(there(problem.solve(x)))[out]
+        torch.testing.assert_close(found[out], missed, rtol=0.05, atol=2e-4)
+
+
+def test_a_block_that_is_lost_weighs_no_more_than_it_may():
+    # fails if a number that is none, or one far away, makes a whole score infinite
+    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
+    search = searched(data)
+    fitter = search.fitter(Variant(2))
+    found = there(fitter.fit({"q1^2"}, {}, 5, None))
+    found.path.x[-1, -1, 0] = 1e12
+    assert bool(torch.isfinite(score(found.problem, found.path, found.theta, 2, 1e-9).losses).all())
+
+
+def test_a_search_of_many_samples_is_made_of_some(monkeypatch):
+    # fails if every trial of a long recording is fitted to all of it, or the model to a part alone
+    import herglotz.training.search as module
+
+    monkeypatch.setattr(module, "PART", 200)
+    data, seen = simulate(scene("duffing"), trajectories=1, steps=900, h=0.05, noise=NOISE, seed=0), []
+    fit = module.Fitter.fit
+    monkeypatch.setattr(
+        module.Fitter, "fit", lambda self, *a, **k: seen.append(self.data.samples) or fit(self, *a, **k)
+    )
+    found = there(searched(data).run())
+    assert found.problem.data.samples == 901
+    assert found.taken == {"q1^2", "q1^4"}
+    assert sum(count < 300 for count in seen) > sum(count > 300 for count in seen)
+
+
+def test_a_search_gives_the_same_twice():
+    data = simulate(scene("damped_pendulum"), trajectories=1, steps=80, h=0.2, noise=0.01, seed=2)
+    one, other = (there(look(data, FitConfig(), Stages()).found) for _ in range(2))
+    assert one.config == other.config
+    assert one.base.start == other.base.start
+
+
+def test_an_angle_with_a_spring_is_a_position_on_a_line():
+    # θ″ = −0.8 θ − 0.06 θ′ over turns: fails if an angle has no offer but a pendulum's, if a plan forgets what was
+    # found, or if another recording is read otherwise
+    t = 0.1 * torch.arange(300, dtype=torch.float64)
+    omega = (0.8 - 0.03**2) ** 0.5
+    q = 11 * torch.exp(-0.03 * t) * torch.cos(omega * t)
+    q = q + 0.01 * torch.randn(300, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = Trajectories.of(t, q, names=("theta",), units=("rad",), angles=(True,))
+    run = fit(data, progress=False)
+    plan = run.metrics["plan"]
+    assert (plan["features"], plan["turning"]) == (("q1^2",), False)
+    assert run.metrics["extrapolation_rms"] < 0.012
+    assert there(run.predict(replace(data, q=0.9 * data.q), warmup=30).rms) < 0.015
+    again = fit(data, plan=Plan.from_dict(plan), progress=False)
+    assert again.metrics["extrapolation_rms"] == run.metrics["extrapolation_rms"]
