@@ -37,6 +37,7 @@ class Score:
     count: int  # N, numbers in q
     numbers: int  # k of the model
     rms: float  # of held-out residuals, in units of q over the balance
+    zeros: int = 0  # further numbers, which come together: zeros of sensors
 
     def replaces(self, simple: Score, offered: int) -> bool:
         """Whether this richer model replaces a simpler one, of so many numbers that are offered."""
@@ -49,8 +50,9 @@ class Score:
         return float(by_block.sum()) - self.price(offered) + simple.price(offered) - error
 
     def price(self, offered: int) -> float:
-        """½ k log N + log C(K, k)."""
-        return self.numbers * math.log(self.count) / 2 + math.log(math.comb(offered, self.numbers))
+        """½ k log N + log C(K, k); numbers that come together are one choice."""
+        chosen = math.log(math.comb(max(offered, self.numbers), self.numbers))
+        return (self.numbers + self.zeros) * math.log(self.count) / 2 + chosen
 
 
 def score(problem: ShootingProblem, path: Path, theta: Tensor, numbers: int, floor: float) -> Score:

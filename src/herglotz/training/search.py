@@ -245,7 +245,7 @@ class Search:
         other = Fitter(data, self.base, self.config, trial.fitter.variant, self.freedom)
         fit = other.fit(trial.taken, trial.values, trial.length, trial, 2 * ITERATIONS)
         more = (len(data) - 1) * data.dof
-        return found if fit is not None and fit.with_more(more).gain(trial) > 0 else None
+        return found if fit is not None and fit.with_zeros(more).gain(trial) > 0 else None
 
     def held(self, trial: Trial, holds: Sequence[str]) -> str:
         """The hold of the inputs that the same model asks for; "" where none of these is better."""

@@ -37,6 +37,7 @@ ITERATIONS = 15  # of a fit: a trial that needs more starts too far off
 SEEN = 0.75  # of every trajectory: finalists are fitted to it, and run free over the rest
 SHORT = (5, 10)  # recorded steps of the first segments: over these motion is all but linear in the forces
 LOST, FOLLOWED = 2.0, 0.05  # times what shorter segments miss, and of the spread: longer ones are not followed
+ASTRAY = 0.25  # of the spread: segments that are missed by more are not followed, whatever shorter ones miss
 FINER = 0.3  # of the misfit: a rule that changes the motion by more is worth trying
 FAR_OFF, NEAR = 1e-3, 1e-8  # damping of the first iteration
 ROUNDING = 10.0  # times the σ of exact data: smaller misfits are no reason for anything
@@ -114,10 +115,10 @@ class Trial:
             return math.inf if self.length > simple.length else -math.inf
         return self.score.gain(simple.score, self.fitter.offered)
 
-    def with_more(self, count: int) -> Trial:
-        """The same, scored as a model of so many more numbers."""
+    def with_zeros(self, count: int) -> Trial:
+        """The same, scored as a model with so many zeros of sensors beside its numbers."""
         other = replace(self)
-        other.__dict__["score"] = replace(self.score, numbers=self.score.numbers + count)
+        other.__dict__["score"] = replace(self.score, zeros=count)
         return other
 
     def curvature(self, names: Sequence[str]) -> tuple[Tensor, Tensor] | None:
@@ -235,7 +236,7 @@ class Fitter:
             return None
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
-        followed = max(LOST * trial.rms, FOLLOWED * self.spread)
+        followed = min(max(LOST * trial.rms, FOLLOWED * self.spread), ASTRAY * self.spread)
         return None if found is None or found.rms > followed else found
 
     def grow(self, trial: Trial) -> Trial:

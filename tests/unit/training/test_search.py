@@ -1,5 +1,6 @@
 """The search over offers: what it takes, what it leaves, and what its score says."""
 
+import math
 from dataclasses import replace
 from typing import TypeVar
 
@@ -162,6 +163,13 @@ def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, repla
     simple = Score(torch.tensor(gains), 400, 3, 1.0)
     rich = Score(torch.zeros(10), 400, 3 + more, 1.0)
     assert rich.replaces(simple, 80) is replaces
+
+
+def test_zeros_are_numbers_that_come_together():
+    # fails if many recordings have more zeros than there are offers, or zeros are free
+    plain = Score(torch.zeros(10), 400, 9, 1.0)
+    with_zeros = replace(plain, zeros=100)
+    assert with_zeros.price(53) - plain.price(53) == pytest.approx(50 * math.log(400))
 
 
 def test_held_out_residuals_are_those_of_fits_without_the_blocks():
