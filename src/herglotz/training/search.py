@@ -83,6 +83,8 @@ class Search:
         down = down and best.fitter.grow(down)
         ends.append(None if down is None else self.settled(self.finer(down), swapped=True))
         best = self.better(best, ends[-1])
+        if best is not None and best is not ends[-1]:
+            ends.append(best := self.settled(best, swapped=True))
         return self.stuck(best and self.braking(self.finalist(best, ends)))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:

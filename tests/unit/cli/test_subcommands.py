@@ -135,7 +135,7 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert "\r" not in err  # no bar where there is no terminal, but a line a stage
     assert re.search(r"^segments of \d+: \d+ iterations?, [\d.]+ s$", err, re.M)
     assert {"model.pt", "metrics.json", "config.json", "fit.npz"} <= {x.name for x in folder.iterdir()}
-    assert len(list(folder.glob("*.png"))) == 5
+    assert len(list(folder.glob("*.png"))) == 6
     run = load_run(folder)
     assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (49,))
 
@@ -253,7 +253,7 @@ def test_plot(tiny_csv, tiny_run, tmp_path, capsys):  # fails if a figure is mis
     assert main(["plot", str(tiny_csv), "--out", str(tmp_path)]) == 0
     assert main(["plot", str(tiny_run), "--out", str(tmp_path / "figures")]) == 0
     written = capsys.readouterr().out.split()
-    assert len(written) == 6
+    assert len(written) == 7
     for path in written:
         assert Path(path).read_bytes().startswith(b"\x89PNG")
 
