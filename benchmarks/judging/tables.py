@@ -133,30 +133,35 @@ def complaints(old: Row | None, new: Row | None, floor: float = FLOOR) -> list[s
     return found
 
 
+def _error_ratio(old: dict[str, Any], new: dict[str, Any], floor: float) -> float:
+    """Of the new error to the old one; no number where a row is not judged by its error."""
+    return ratio(old, new, floor)[0] if old["asks"] and new["asks"] else math.nan
+
+
+def _cells(name: str, old: dict[str, Any] | None, new: dict[str, Any] | None, said: list[str], floor: float) -> tuple:
+    """A line of the comparison."""
+    words = f"**{'; '.join(said)}**" if said else ""
+    if old is None or new is None or "cpu_s" not in old or "cpu_s" not in new:
+        return (name, "", "", "", "", "", f"**{said[0]}**" if said else "new" if old is None else "skipped")
+    by = _error_ratio(old, new, floor)
+    pair = f"{shown(old['error'])} → {shown(new['error'])}" if old["asks"] and new["asks"] else ""
+    verdicts = old["verdict"] if old["verdict"] == new["verdict"] else f"{old['verdict']} → {new['verdict']}"
+    times = f"{old['cpu_s']:.1f} → {new['cpu_s']:.1f}", f"{new['cpu_s'] / old['cpu_s']:.2g}"
+    return (name, pair, "" if math.isnan(by) else f"{by:.3g}", verdicts, *times, words)
+
+
 def compared(old: dict[str, Any], new: dict[str, Any], floor: float = FLOOR) -> tuple[str, int]:
     """Markdown of a comparison, and the number of worse rows."""
     before, after = ({row["name"]: row for row in result["rows"]} for result in (old, new))
     names = [*before, *(name for name in after if name not in before)]
-    cells, times, errors = [], [], []
-    worse: dict[str, list[str]] = {}
-    for name in names:
-        a, b = before.get(name), after.get(name)
-        said = complaints(a, b, floor)
-        worse |= {name: said} if said else {}
-        if a is None or b is None or "cpu_s" not in a or "cpu_s" not in b:
-            cells.append((name, "", "", "", "", "", f"**{said[0]}**" if said else "new" if a is None else "skipped"))
-            continue
-        asks = a["asks"] and b["asks"]
-        times.append(b["cpu_s"] / a["cpu_s"])
-        by = ratio(a, b, floor)[0] if asks else math.nan
-        errors += [by] if asks and 0 < by < math.inf else []
-        pair = f"{shown(a['error'])} → {shown(b['error'])}" if asks else ""
-        verdicts = a["verdict"] if a["verdict"] == b["verdict"] else f"{a['verdict']} → {b['verdict']}"
-        cells.append((name, pair, "" if math.isnan(by) else f"{by:.3g}", verdicts,
-                      f"{a['cpu_s']:.1f} → {b['cpu_s']:.1f}", f"{times[-1]:.2g}",
-                      f"**{'; '.join(said)}**" if said else ""))  # fmt: skip
-    both = [(before[name], after[name]) for name in names if name in before and name in after]
-    total = [sum(pair[i]["cpu_s"] for pair in both if all("cpu_s" in x for x in pair)) / 60 for i in (0, 1)]
+    said = {name: complaints(before.get(name), after.get(name), floor) for name in names}
+    worse = {name: words for name, words in said.items() if words}
+    measured = [name for name in names if all("cpu_s" in rows.get(name, {}) for rows in (before, after))]
+    times = [after[name]["cpu_s"] / before[name]["cpu_s"] for name in measured]
+    ratios = [_error_ratio(before[name], after[name], floor) for name in measured]
+    errors = [by for by in ratios if 0 < by < math.inf]
+    cells = [_cells(name, before.get(name), after.get(name), said[name], floor) for name in names]
+    total = [sum(rows[name]["cpu_s"] for name in measured) / 60 for rows in (before, after)]
     lines = [
         f"# The judge: {old['commit']} → {new['commit']}",
         "",
@@ -165,7 +170,7 @@ def compared(old: dict[str, Any], new: dict[str, Any], floor: float = FLOOR) -> 
         f"slower, or missing. Errors below {floor:g} of the spread count as that. Medians of the ratios:",
         f"{shown(_median(errors))} of error, {shown(_median(times))} of time; {total[0]:.1f} → {total[1]:.1f} min.",
         "",
-        *(f"* worse: {name}: {'; '.join(said)}" for name, said in worse.items()),
+        *(f"* worse: {name}: {'; '.join(words)}" for name, words in worse.items()),
         "",
     ]
     head = ("row", "error", "ratio", "verdict", "CPU, s", "ratio", "worse")

@@ -58,6 +58,11 @@ def spread(data: Trajectories) -> float:
     return float((data.q - data.q.mean(0)).square().mean().sqrt())
 
 
+def relative_spread(data: Trajectories) -> float:
+    """`spread` of the positions over their balance."""
+    return float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
+
+
 def coarse(data: Trajectories) -> bool:
     """Whether `precision` is that of the polynomials, and the noise may be far below: the last degree still halves it.
 
@@ -83,7 +88,7 @@ def sparsest(data: Trajectories) -> int:
     Cubics in time through two kept samples before and two behind miss those halfway between by less than a thousandth
     of the spread, RMS. Noise counts as motion: recordings that are noisier keep every sample.
     """
-    spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
+    spread = relative_spread(data)
     found = 1
     for every in THINNINGS:
         if every * ENOUGH > data.samples or not _missed(data, every) <= SMOOTH * spread:

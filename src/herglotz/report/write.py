@@ -11,7 +11,7 @@ from herglotz.data.column_table import column_rows
 from herglotz.data.files import folder_at, write_atomically
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.errors import InputError
-from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
+from herglotz.plots import plot_bands, plot_learned, plot_sizes, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
 from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
@@ -163,6 +163,8 @@ def _plan(run: Run) -> tuple[Block, ...]:
     plan = Plan.from_dict(run.metrics["plan"])
     rows = tuple(("; ".join(taken), why) for taken, why in plan.by_reason(common_unit(run.data.units)))
     blocks: list[Block] = [Table(("decided", "because"), rows)]
+    if run.metrics.get("compared"):
+        blocks.append(Picture(plot_sizes(run), "What smaller and larger models miss held-out time by."))
     if run.history:
         blocks.append(Picture(plot_training(run), "The cost of every stage; each stage minimises its own."))
     return tuple(blocks)

@@ -128,7 +128,6 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
     why = seen.structure or AS_SET
     return {name: why if name in found else AS_SET for name in AS_FOUND} | {
         "level": _level_reason(seen, user_settings),
-        "every": AS_SET,
         "turning": "terms of positions on a line, as of a free spring, miss the data by less",
         "substeps": (HALVED if seen.settings.substeps > 1 else KEPT_STEPS) if named else AS_SET,
         **seen.why_arrival,

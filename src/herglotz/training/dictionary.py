@@ -22,21 +22,26 @@ COEFFICIENTS = re.compile(r"(potential\.features\.sum|kinetic\.sum|drag)\.coeffi
 def dictionary(config: ModelConfig) -> ModelConfig | None:
     """The configuration with all terms of its kind; None where it has something that no dictionary holds."""
     c, n = config, len(config.angles)
-    named = c.known or c.terms or c.translations or c.input_map or c.mass_width or c.correction_width
-    held = c.alike and c.order == 2 and (any(c.stiffness) or any(c.tilt))  # a potential that no term says
-    if named or held or c.potential_width or n > 3 or c.level in ("affine", "full") or c.alike != (n == 1):
+    if n > 3 or c.alike != (n == 1) or _has_other_parts(c):
         return None
     if any(c.angles) and n > 1 and c.diagonal and not c.coupled:
         c = replace(c, diagonal=False)  # joints that are apart have no mass between them
-    features, drag = features_of(c.angles), _drag(c.angles)
+    features, drag = features_of(c.angles), drag_of(c.angles)
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
     whole = replace(
         c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
         input_zero=c.inputs > 0, damping_width=0, rate=0.1, scale=(1.0,) * n, speed=(1.0,) * n, tilt=(0.0,) * n,
         stiffness=(0.0 if n == 1 else 1.0,) * n, seed=0, absent=(),
     )  # fmt: skip
-    held = set(expand(config.features, c.angles)) <= set(whole.features) and set(config.drag) <= set(drag)
-    return whole if held else None
+    known = set(expand(config.features, c.angles)) <= set(whole.features) and set(config.drag) <= set(drag)
+    return whole if known else None
+
+
+def _has_other_parts(c: ModelConfig) -> bool:
+    """Whether a model has networks, parts that are given, or a potential that no term says."""
+    given = c.known or c.terms or c.translations or c.input_map or c.level in ("affine", "full")
+    unnamed = c.alike and c.order == 2 and (any(c.stiffness) or any(c.tilt))
+    return bool(given or unnamed or c.potential_width or c.mass_width or c.correction_width)
 
 
 def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
@@ -51,7 +56,8 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
     return tuple(name for name in lengths(angles) if not name.startswith("r^"))
 
 
-def _drag(angles: tuple[bool, ...]) -> tuple[str, ...]:
+def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
+    """Friction beside the viscous and the dry one: dampers between lengths, for those between joints are `coupled`."""
     drag = [text for i in range(1, len(angles) + 1) for text in (f"|v{i}| v{i}", f"|v{i}|")]
     drag += [f"load {i}" for i, angle in enumerate(angles, 1) if angle]
     drag += [text for i, angle in enumerate(angles, 1) if not angle for text in (f"q{i} v{i}", f"q{i}^2 v{i}")]

@@ -59,6 +59,8 @@ class CompiledFlow:
         self.seen = seen  # how many of the first steps end at a sample
         self.counts = (seen[self.begin[1:]] - seen[self.begin[:-1]] + (self.first >= 0).long()).tolist()
 
+        self.jobs: dict[int, list[list[Piece]]] = {}  # by the width of a row; the same for all subsets of parameters
+
     def run(
         self, theta: Tensor, starts: Tensor, of: Observed, sums: Sums | None = None, rows: Tensor | None = None
     ) -> Tensor | None:
@@ -98,7 +100,7 @@ class CompiledFlow:
                     break
             return found
 
-        for done in self._run(together, list(self._jobs(0 if sums is None else F + d))):
+        for done in self._run(together, self._jobs(0 if sums is None else F + d)):
             for result in done:
                 if result is None:
                     return None
@@ -129,18 +131,21 @@ class CompiledFlow:
             for k in range(0, len(jobs), workers):
                 yield from pool.map(together, jobs[k : k + workers])
 
-    def _jobs(self, width: int) -> Iterator[list[Piece]]:
+    def _jobs(self, width: int) -> list[list[Piece]]:
         """Runs of segments that do not wait for one another, each with enough samples to be worth a thread."""
-        S, total = len(self.place), sum(self.counts)
-        least, a, offset = max(WORK, total // JOBS), 0, 0
-        while a < S:
-            b, samples = a + 1, self.counts[a]
-            while b < S and (samples < least or total - offset - samples < least):
-                samples += self.counts[b]
-                b += 1
-            yield list(self._pieces(a, b, offset, width))
-            offset += samples
-            a = b
+        if width not in self.jobs:
+            S, total, found = len(self.place), sum(self.counts), []
+            least, a, offset = max(WORK, total // JOBS), 0, 0
+            while a < S:
+                b, samples = a + 1, self.counts[a]
+                while b < S and (samples < least or total - offset - samples < least):
+                    samples += self.counts[b]
+                    b += 1
+                found.append(list(self._pieces(a, b, offset, width)))
+                offset += samples
+                a = b
+            self.jobs[width] = found
+        return self.jobs[width]
 
     def _pieces(self, a: int, last: int, offset: int, width: int) -> Iterator[Piece]:
         """Segments whose rows fit into `CHUNK` bytes, and parts of one that is longer; all at once without rows."""

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.checks import MIN_SAMPLES
-from herglotz.data.trajectories import every_mth
 from herglotz.models import ContactLagrangian
 from herglotz.progress import beat
 from herglotz.training.arrowhead import dense
@@ -79,14 +78,11 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     """
     if not fitted.notes.get("follows_data", True) or not bool(torch.isfinite(states).all()):
         return None
-    every = fitted.notes.get("every", 1)
-    length = fitted.notes.get("segment_steps", FIRST_SEGMENT * task.config.substeps) // task.config.substeps // every
-    kept = every_mth(task.data.lengths, every).to(task.data.t.device)
-    known, used = fitted.states[~seen.spikes][kept], None if fitted.used is None else fitted.used[kept]
-    task = task.thinned(every)  # as it was fitted
+    length = fitted.notes.get("segment_steps", FIRST_SEGMENT * task.config.substeps) // task.config.substeps
+    known, used = fitted.states[~seen.spikes], fitted.used
     model, base, absent = _with_absent_terms(task, fitted.model)
     problem = ShootingProblem(
-        model, task.data, segment_grid(task.data, max(length, 1), base.model_step), sigma=fitted.sigma / every**0.5,
+        model, task.data, segment_grid(task.data, max(length, 1), base.model_step), sigma=fitted.sigma,
         prior=prior_of(model, base, fitted.notes.get("departure")), used=used,
         freedom=FREEDOM if fitted.notes.get("robust") else None,
     )  # fmt: skip
@@ -98,12 +94,12 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
         return None
     low, high = task.data.q.amin(0), task.data.q.amax(0)
     runs = _Ahead.of(task.data, seen.data, problem, _turn(task.data, known))
-    guess = runs.stepped_on(fitted.model, states, base.model_step / every)
+    guess = runs.stepped_on(fitted.model, states, base.model_step)
     runs, guess = runs.until_lost(guess, low, high)
     ahead, path = None, None
     if guess is not None:
         ahead = ShootingProblem(
-            model, runs.data, segment_grid(runs.data, runs.data.samples, base.model_step / every), sigma=problem.sigma
+            model, runs.data, segment_grid(runs.data, runs.data.samples, base.model_step), sigma=problem.sigma
         )
         ahead.guess_from_states(guess)
         path = ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))

@@ -12,7 +12,7 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.task import build_model
-from herglotz.training.trials import FINER, ROUNDING, Trial, moved
+from herglotz.training.trials import ALIKE, FINER, Trial, is_precise, moved
 
 
 def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
@@ -37,13 +37,14 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     of = replace(of, absent=tuple(absent))
     numbers = ParameterVector(build_model(bare, of, "none"))
     value = {fitter.keys[name]: x for name, x in trial.values.items()}
-    theta = data.q.new_tensor([value[key] for key in keys_of(numbers.numbers, numbers.model.config)])
+    keys, start = keys_of(numbers.numbers, numbers.model.config), numbers.get().tolist()
+    theta = data.q.new_tensor([value.get(key, x) for key, x in zip(keys, start, strict=True)])  # widths that do not act
     values = values_of(numbers, theta)
-    if fitter.precise and data.dof > 1 and data.u is None and variant.substeps > 1 and not dry:
+    if is_precise(data) and data.dof > 1 and data.u is None and variant.substeps > 1 and not dry:
         fourth = replace(of, order=4, substeps=1)  # no kernel has it: a search makes do with short steps
         own = started(fitter.base, data, values, fourth)
         grid = segment_grid(data, trial.length, own.model_step)
         problem = ShootingProblem(build_model(own, fourth, "none"), data, grid, sigma=trial.problem.sigma)
-        if moved(trial, problem, problem.parameters.get()) <= FINER * max(trial.rms, fitter.floor / ROUNDING):
+        if moved(trial, problem, problem.parameters.get()) <= FINER * max(trial.rms, fitter.floor / ALIKE):
             return fourth, own
     return of, started(fitter.base, data, values, of)

@@ -16,7 +16,7 @@ from herglotz.data.smoothing import LocalPolynomials, smooth_triples
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.linear_start import SHARED, LinearFit
-from herglotz.training.named_terms import DRY, MOVING, STILL, NamedTerms, by_term, central, chains, holders, own_terms
+from herglotz.training.named_terms import MOVING, STILL, NamedTerms, by_term, central, chains, holders, own_terms
 from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
@@ -33,32 +33,23 @@ class LinearStart(NamedTuple):
     error: float  # J⁻¹R, RMS over the triples, in units of q
     size: int  # coefficients of the linear problem, those of masses, springs and friction included
 
-    @property
-    def ways(self) -> list[NamedTerms]:
-        """Its terms, and those without dry friction that drives every joint, where no step may be solved with it."""
-        pushes = self.terms.dry and max(self.values[DRY]) <= 0
-        return [self.terms, replace(self.terms, dry=False)] if pushes else [self.terms]
 
-
-def starts_of(data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials) -> list[LinearStart]:
-    """The likeliest start of all candidates or of the fewer terms of chains of joints, and those of fewer coefficients.
+def start_of(data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials) -> LinearStart | None:
+    """The likeliest start of all candidates or of the fewer terms of chains of joints; None where no mass fits.
 
     The Bayesian information criterion decides: of many candidates noise determines some so poorly that no mass fits,
-    or that they stay for nothing. Those behind the first have fewer coefficients than it, the fewest first: their
-    errors may be noise, which whole trajectories tell. The best start with one power of the distance stands alone where
-    it errs less than the first, or as little with fewer coefficients.
+    or that they stay for nothing. The best start with one power of the distance stands in for the first where it errs
+    less, or as little with fewer coefficients.
     """
     families = (every, *(replace(every.only(x.names), apart=x.apart) for x in chains(data)))
     one_of = central(data, every)
     problem = LinearTerms(data, base, reduce(NamedTerms.joined, [*families, *one_of]), local)
     starts = (start for terms in families if (start := problem.start(terms)) is not None)
     tried = sorted({start.terms: start for start in starts}.values(), key=lambda start: start.size)
-    tried = [*tried[(best := problem.likeliest(tried)) : best + 1], *tried[:best]]
+    first = tried[problem.likeliest(tried)] if tried else None
     others = [start for terms in one_of if (start := problem.start(terms)) is not None and start.terms.features]
     other = min(others, key=lambda start: start.error, default=None)
-    if other is None or (tried and _better(tried[0], other)):
-        return tried
-    return [other]
+    return first if other is None or (first is not None and _better(first, other)) else other
 
 
 def _better(first: LinearStart, other: LinearStart) -> bool:

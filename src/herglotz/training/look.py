@@ -181,7 +181,7 @@ def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, named: boo
         find = lambda: search(kept, base, plain, outliers=seen.outliers, holds=holds)  # noqa: E731
         found = kept_structure("terms", find, base, settings, stages)
         seen = replace(seen, structure=found.reason, found=found)
-        if found.sigma is not None:
+        if found.sigma is not None or not found.turning:  # else `look` looks again
             return replace(seen, settings=found.config, base=found.base)
     if structure_is_free(kept, user_settings):
         of = kept_structure("structure", lambda: structured(kept, base, settings), base, settings, stages)

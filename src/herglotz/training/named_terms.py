@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -16,10 +15,9 @@ from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.models.translations import differences, directions, unchanged
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.dictionary import HIGHEST, WAVES, features_of
+from herglotz.training.dictionary import HIGHEST, WAVES, drag_of, features_of
 from herglotz.training.parameter_vector import ParameterVector
 
-SERIES = 3  # powers of a length beside its spring: more than the potential of an oscillator that is named has
 SIDE = 0.1  # of the way to the farther side of 0: motion that goes less far on the other tells nothing of a bend there
 BACK = 50  # a turn back that is shorter than this part of a recording says next to nothing of dry friction
 NEAR = 0.02  # of the RMS distance: powers of r are candidates where the data stay farther from 0
@@ -62,7 +60,9 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
         return _unmoved(data, directions(translations, data.angles))
     angles = data.angles
     features = tuple(_of_one(data)) if len(angles) == 1 else features_of(angles)
-    return NamedTerms((*features, *special(data)), tuple(_frictions(data)), True)
+    one_unit = len(set(data.units)) == 1  # else there is no length of a velocity
+    drag = tuple(text for text in drag_of(angles) if one_unit or text != AIR)
+    return NamedTerms((*features, *special(data)), drag, True)
 
 
 def special(data: Trajectories) -> tuple[str, ...]:
@@ -76,18 +76,6 @@ def _of_one(data: Trajectories) -> list[str]:
     powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
     every = [*own_terms(data.angles), *(waves if data.angles[0] else powers)]
     return [name for name in every if data.u is None or name != CONSTANT]
-
-
-def _frictions(data: Trajectories) -> list[str]:
-    """Friction beside the viscous and the dry one: dampers between lengths, for those between joints are `coupled`."""
-    drag = []
-    for i, angle in enumerate(data.angles, 1):
-        drag += [f"|v{i}| v{i}", f"|v{i}|", *([] if angle else [f"q{i} v{i}", f"q{i}^2 v{i}"])]
-    drag += [f"load {i}" for i, angle in enumerate(data.angles, 1) if angle]  # which no potential is
-    if not any(data.angles):
-        drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(data.dof), 2)]
-        drag += [AIR] if data.dof > 1 and len(set(data.units)) == 1 else []
-    return drag
 
 
 def turns_one_way(data: Trajectories, i: int) -> bool:

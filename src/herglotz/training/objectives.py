@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
@@ -14,10 +14,8 @@ from herglotz.training.first_states import states_of_pairs
 from herglotz.training.look import PROBE, Look
 from herglotz.training.one_step_fit import NOISE_OF_R, best_restart, fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
-from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import OneStep
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.smoothing_fit import SmoothingFit, fit_smoothing
 from herglotz.training.task import Task, with_sticking
 from herglotz.training.trajectory_fit import TrajectoryFit, fit_states, fit_trajectories
@@ -72,14 +70,12 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     model, sigma = (task.build(plan.network), plan.sigma or 0.0) if plan.fitted_before else _one_step_start(task, plan)
     if task.config.sticking:
         model = with_sticking(model, excess=not plan.fitted_before)
-    every = min(plan.every, (min(task.data.lengths) - 1) // 2)  # three samples of each trajectory stay
-    found = fit_trajectories(task.thinned(every), model, sigma, known=plan.fitted_before)
-    fit = found and (found.fit if every == 1 else _through_all(found.fit, task, every))
-    if found is None or fit is None:  # the model keeps the parameters of the one-step fit
+    found = fit_trajectories(task, model, sigma, known=plan.fitted_before)
+    if found is None:  # the model keeps the parameters of the one-step fit
         return _lost(task, model, "trajectory", sigma, "the model cannot follow the data over 20 steps")
-    problem = fit.problem
-    notes = _chosen(found, fit) | {"segment_steps": problem.grid.longest, "follows_data": True, "every": every}
-    return Fitted(model, fit.states(), "trajectory", problem.sigma, notes, problem.used)
+    problem = found.fit.problem
+    notes = _chosen(found, found.fit) | {"segment_steps": problem.grid.longest, "follows_data": True}
+    return Fitted(model, found.fit.states(), "trajectory", problem.sigma, notes, problem.used)
 
 
 def fit_by_smoothing(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG001
@@ -91,17 +87,6 @@ def fit_by_smoothing(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG
     fit, problem = found.fit, found.fit.problem
     notes = _chosen(found, fit) | {"follows_data": fit.follows_data(), "process": problem.process}
     return Fitted(model, problem.states(fit.x), "smoothing", problem.sigma, notes)
-
-
-def _through_all(fit: TrajectoryFit, task: Task, every: int) -> TrajectoryFit | None:
-    """A fit to every m-th sample as a motion through all of them; None where the steps between have no solution."""
-    old = fit.problem
-    grid = segment_grid(task.data, every * old.grid.length, task.base.model_step)
-    problem = ShootingProblem(
-        old.parameters.model, task.data, grid, sigma=old.sigma, prior=old.prior, freedom=old.freedom
-    )
-    path = problem.solve(problem.pack(fit.theta, problem.guess_from(old, fit.path)))
-    return None if path is None else replace(fit, problem=problem, path=path)
 
 
 OBJECTIVES: dict[str, Callable[[Task, Look, Plan], Fitted]] = {

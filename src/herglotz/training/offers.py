@@ -8,13 +8,13 @@ from typing import NamedTuple
 import torch
 
 from herglotz.models import ContactLagrangian
+from herglotz.training.named_terms import own_terms
 from herglotz.training.parameter_vector import ParameterVector
 
 ALWAYS = ("kinetic.log_diagonal", "kinetic.base.log_diagonal", "damping.rate")
 # Amplitudes with the numbers that shape them, which have no effect where the amplitude is 0.
 SHAPES = {"friction.coulomb": "friction.log_smooth", "friction.breakaway": "friction.log_stribeck"}
 SIMPLE = ("potential.stiffness", "potential.tilt", "friction.input_map")  # of the simplest model, beside `ALWAYS`
-OWN = ("cos(q1)", "sin(q1)", "q1^2", "q1")  # the same of one coordinate
 
 
 class Offer(NamedTuple):
@@ -30,6 +30,7 @@ def offers_of(model: ContactLagrangian, keys: list[str]) -> tuple[tuple[str, ...
     `keys` (`training.dictionary.keys_of`) are what the numbers are.
     """
     numbers, always, found, simple = ParameterVector(model).numbers, [], [], set()
+    own = own_terms(model.config.angles)  # of one coordinate: its spring and tilt
     for number, key in zip(numbers, keys, strict=True):
         stem = re.sub(r"\[\d+\]", "", number)
         if stem in ALWAYS:
@@ -37,7 +38,7 @@ def offers_of(model: ContactLagrangian, keys: list[str]) -> tuple[tuple[str, ...
         elif stem not in SHAPES.values() and not (stem == "friction.viscous" and model.dof == 1):  # that is the rate
             shape = number.replace(stem, SHAPES.get(stem, stem))
             found.append(Offer(key, (number, shape) if shape != number and shape in numbers else (number,)))
-            if stem in SIMPLE or (model.dof == 1 and key in OWN):
+            if stem in SIMPLE or key in own:
                 simple.add(key)
     return tuple(always), found, frozenset(simple)
 

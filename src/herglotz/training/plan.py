@@ -41,7 +41,6 @@ class Plan:
     fitted_before: bool  # starting values and sigma are those of an earlier fit of the same model
     restarts: int  # random initialisations of the one-step fit
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
-    every: int = 1  # how many recorded samples are one that whole trajectories are fitted to
     turning: bool = True  # angles turn; False: they are positions on a line, as of a free spring
     absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
@@ -64,7 +63,6 @@ class Plan:
     def _has_effect(self, name: str) -> bool:
         one_step = self.objective in ("residual", "raw")
         needed = {
-            "every": self.every > 1,
             "substeps": self.substeps > 1,
             "turning": not self.turning,
             "sigma": not one_step,
@@ -120,7 +118,6 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",
     "absent": "numbers that are 0",
-    "every": "recorded samples for each that is fitted",
     "outliers": "outliers expected",
     "continues_probe": "starts from the fit that measured the noise",
     "sigma": "noise assumed",

@@ -1,8 +1,6 @@
-"""Selection of features: the one the fit loses least without is removed, one after the other; or the best joins."""
+"""Selection of features: the one the fit loses least without is removed, one after the other."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
@@ -45,27 +43,6 @@ def prune(
         y[rows[i]] = 0.0
         keep[rows[i]] = False
     return candidates[keep[candidates]], y / scale
-
-
-def joining(
-    A: Tensor,  # (P, P) JᵀJ at a fit in which some coefficients are 0
-    b: Tensor,  # (P,) Jᵀr
-    free: Tensor,  # indices of the unknowns that follow
-    others: Tensor,  # indices of the coefficients that are 0
-    worth: float,  # twice what a coefficient that is named beforehand has to lower the cost by
-) -> int | None:
-    """Which of `others` lowers the cost most by the quadratic model of the fit; None where that is too little.
-
-    The largest gain of K coefficients is large by chance: it has to be 2 log K more (Chen & Chen 2008).
-    """
-    scale = A.diagonal().clamp_min(1e-300).sqrt()
-    S, y = A / scale[:, None] / scale, b / scale
-    C = torch.linalg.pinv(S[free][:, free], hermitian=True) @ S[free][:, others]
-    left = S[others, others] - (S[free][:, others] * C).sum(0)
-    slope = y[others] - C.T @ y[free]
-    gain = torch.where(left > 1e-9, slope.square() / left.clamp_min(1e-300), 0.0)
-    best = int(gain.argmax())
-    return best if float(gain[best]) > worth + 2 * math.log(len(others)) else None
 
 
 def inverse_of(A: Tensor) -> Tensor:

@@ -12,10 +12,12 @@ from herglotz.training.offers import Offer
 from herglotz.training.pruning import inverse_of
 from herglotz.training.trials import Trial
 
+UNSEEN = 1e-9  # of an offer's own curvature: what other numbers leave less of cannot be told from them
+
 
 def gains(trial: Trial) -> list[tuple[float, Offer]]:
     """By how much each offer that is not taken lowers the cost by the quadratic model, in units of the misfit."""
-    left, found = [offer for offer in trial.fitter.offers if offer.name not in trial.taken], everything(trial)
+    left, found = [offer for offer in trial.fitter.offers if offer.name not in trial.taken], trial.everything
     if found is None:
         return []
     H, g, at = found
@@ -26,7 +28,7 @@ def gains(trial: Trial) -> list[tuple[float, Offer]]:
 
 def swaps(trial: Trial) -> Iterator[tuple[float, str, str]]:
     """By how much a new offer lowers the cost in the place of an old one by the quadratic model, at the best."""
-    numbers, found = trial.problem.parameters.numbers, everything(trial)
+    numbers, found = trial.problem.parameters.numbers, trial.everything
     if found is None:
         return
     H, g, at = found
@@ -71,15 +73,6 @@ def worth(trial: Trial, offer: Offer) -> float:
     return math.log(trial.score.count) * len(offer.numbers)
 
 
-def everything(trial: Trial) -> tuple[Tensor, Tensor, dict[str, int]] | None:
-    """(H, g) of the numbers of all offers at a fit, and their places."""
-    fitter = trial.fitter
-    every = set(fitter.numbers(offer.name for offer in fitter.offers))
-    found = trial.curvature(list(every))
-    at = {name: i for i, name in enumerate(name for name in fitter.start if name in every)}
-    return None if found is None else (*found, at)
-
-
 def _gain(H: Tensor, g: Tensor, free: Tensor, own: Tensor) -> float:
     """By how much numbers `own` lower the cost by the quadratic model, the free ones following."""
     size = torch.where(H.diagonal() > 0, H.diagonal(), 1.0).sqrt()
@@ -89,4 +82,4 @@ def _gain(H: Tensor, g: Tensor, free: Tensor, own: Tensor) -> float:
     slope = b[own] - A[free][:, own].T @ C[:, -1]
     values, vectors = torch.linalg.eigh(S)
     along = vectors.T @ slope
-    return float(torch.where(values > 1e-9, along.square() / values.clamp_min(1e-300), 0.0).sum()) / 2
+    return float(torch.where(values > UNSEEN, along.square() / values.clamp_min(1e-300), 0.0).sum()) / 2

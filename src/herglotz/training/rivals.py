@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from herglotz.data import MIN_SAMPLES, Trajectories
-from herglotz.data.roughness import AT_THE_NOISE, precision, sparsest
+from herglotz.data.roughness import AT_THE_NOISE, precision, relative_spread, sparsest
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
@@ -23,35 +23,31 @@ from herglotz.training.one_step_fit import NOISE_OF_R
 from herglotz.training.plan import Plan
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
+from herglotz.training.trials import SEEN
 
-INNER = 0.75  # of the training part that rivals are fitted to
 DROWNED = 0.1  # of a recorded step's curvature: noise above it would be most of what one-step errors minimise
 
 
 def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen: Look) -> tuple[Look, Plan]:
     """The plan whose free run over the last quarter of the training part errs less, with its look at the data."""
     named, shortest = choose(seen, config), min(seen.train.lengths)
-    if shortest - round(INNER * shortest) < MIN_SAMPLES:
+    if shortest - round(SEEN * shortest) < MIN_SAMPLES:
         return seen, _reasoned(named, f"{shortest} samples of a recording leave none to hold out")
     first = stages.keep("held out, named terms", lambda: _held_out(seen, config, named))
     if first["rms"] <= AT_THE_NOISE * precision(seen.kept):
         return seen, _reasoned(
             named, f"free runs over held-out time miss {first['rms']:.2g} with named terms: the noise"
         )
-    if seen.found is None or not seen.found.doubt:
-        return seen, named
-    asked, every = _as_fitted(seen, config, named)
+    asked, every = _as_fitted(seen, config)
     other = _without_names(data, asked, stages, seen)
     networks = choose(other, asked)
     second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
     why = f"free runs over the last quarter of the training part miss {first['rms']:.2g} with named terms, "
     why += f"{second['rms']:.2g} with networks ({networks.objective})"
-    if lost := min(first["rms"], second["rms"]) > _spread(seen):
+    if lost := min(first["rms"], second["rms"]) > relative_spread(seen.kept):
         why += f"; both are lost: with errors up to the spread they miss {first['until']:.2g} and {second['until']:.2g}"
     if first[by := "until" if lost else "rms"] <= MARGIN * second[by]:
         return seen, _reasoned(named, why)
-    if networks.objective == "trajectory":
-        networks = replace(networks, every=named.every)  # longer steps would change the motion
     if networks.objective == "trajectory" and "departure" in second:
         other = _going_on(other, second)
         networks = replace(
@@ -79,15 +75,15 @@ def _going_on(seen: Look, found: dict[str, Any]) -> Look:
     return replace(seen, base=replace(seen.base, start={**seen.base.start, **start}), found=named)
 
 
-def _as_fitted(seen: Look, config: FitConfig, named: Plan) -> tuple[FitConfig, int]:
+def _as_fitted(seen: Look, config: FitConfig) -> tuple[FitConfig, int]:
     """The settings of networks, and how many samples are one where they are tried: what is tried is what is fitted.
 
     One-step errors of all samples would teach them another model where single recorded steps drown in noise: whole
-    trajectories are tried on the samples that named terms are fitted to.
+    trajectories of all samples are tried there.
     """
     every = sparsest(seen.kept)
     if every > 1 and _drowned(seen):
-        return replace(config, objective="trajectory"), named.every
+        return replace(config, objective="trajectory"), 1
     return config, every
 
 
@@ -96,10 +92,6 @@ def _drowned(seen: Look) -> bool:
     t = seen.kept.triples(seen.base.max_step)
     curved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / seen.kept.balance
     return NOISE_OF_R * precision(seen.kept) > DROWNED * float(curved.square().mean().sqrt())
-
-
-def _spread(seen: Look) -> float:
-    return float(((seen.kept.q - seen.kept.q.mean(0)) / seen.kept.balance).square().mean().sqrt())
 
 
 def _of(stages: Stages, zeros: tuple[float, ...]) -> Stages:
@@ -117,11 +109,11 @@ def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict
     Beside it the same of errors that count up to the spread, `until`: of free runs that are lost, as of chaos, it tells
     how long they follow; and that of windows of 20 steps.
     """
-    inner, silent = replace(config, train_fraction=INNER), Stages()
+    inner, silent = replace(config, train_fraction=SEEN), Stages()
     inside = look(seen.train.thinned(every), inner, silent, replace(plan, zeros=()))  # which `seen` has taken off
     task = Task(inside.kept, inside.base, inside.settings, silent, hurried=True)
     fitted = OBJECTIVES[plan.objective](task, inside, plan)
-    errors, spread = free_run_errors(task, inside, fitted), _spread(seen)
+    errors, spread = free_run_errors(task, inside, fitted), relative_spread(seen.kept)
     rms, until = (float(e.square().mean().sqrt()) for e in (errors, errors.clamp(-spread, spread)))
     found: dict[str, Any] = {"rms": rms, "until": until, "sigma": fitted.sigma}
     found["start"] = {name: x.detach().reshape(-1).tolist() for name, x in fitted.model.named_parameters()}

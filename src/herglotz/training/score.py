@@ -25,7 +25,7 @@ from herglotz.training.solvers.lifted_newton import Path
 BLOCKS = 10  # of time, at least, over all trajectories
 STAY = 20  # first samples of a trajectory, and a tenth of it at most, that are never left out: they tell its start
 ROUNDS = 30  # of the scale of Student's t
-LOST = 1e3  # the loss of a residual that is no number
+WORST = 1e3  # the loss of a residual that is no number
 RIDGE = 1e-12  # of the largest: what is added to the curvature by starts, which few samples may not tell
 
 
@@ -51,7 +51,7 @@ class Score:
 
     def price(self, offered: int) -> float:
         """½ k log N + log C(K, k); numbers that come together are one choice."""
-        chosen = math.log(math.comb(max(offered, self.numbers), self.numbers))
+        chosen = math.log(math.comb(offered, self.numbers))
         return (self.numbers + self.zeros) * math.log(self.count) / 2 + chosen
 
 
@@ -77,7 +77,7 @@ def _of_residuals(r: Tensor, block: Tensor, count: int, numbers: int, floor: flo
     for own in r.T:
         scale = max(_scale(own[inside]), floor)
         loss = math.log(scale) + (FREEDOM + 1) / 2 * torch.log1p((own / scale).square() / FREEDOM)
-        losses.index_add_(0, block[inside], loss[inside].nan_to_num(nan=LOST, posinf=LOST))
+        losses.index_add_(0, block[inside], loss[inside].nan_to_num(nan=WORST, posinf=WORST))
     return Score(losses, count, numbers, float(r[inside].square().mean().sqrt()))
 
 

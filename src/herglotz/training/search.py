@@ -19,19 +19,20 @@ from herglotz.data.smoothing import local_polynomials
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.linear_terms import starts_of
-from herglotz.training.named_terms import candidates, special, started
+from herglotz.training.linear_terms import start_of
+from herglotz.training.named_terms import DRY, candidates, special, started
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.quadratic import gains, order_of, swaps, worth
-from herglotz.training.sensor_zeros import apart
-from herglotz.training.task import build_model
-from herglotz.training.trials import FINER, ITERATIONS, ROUNDING, Compared, Fitter, Trial, Variant, is_precise, moved
+from herglotz.training.sensor_zeros import differing_zeros
+from herglotz.training.task import LEAST_GRIP, build_model
+from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Compared, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
 FEW = 5  # iterations of trials on more samples than a search is made of, each for one offer
 TRIED = 3  # offers whose fits are compared, of those that the quadratic model puts first
+EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
 FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
 
 
@@ -72,8 +73,8 @@ class Search:
         best = self.climbed(fitter.simple, {})
         part(MORE_TERMS)
         ends = [best]
-        for taken, values in [] if best is not None and best.at_the_noise else self.starts(fitter):
-            ends.append(self.climbed(taken, values))
+        if (best is None or not best.at_the_noise) and (start := self.linear_start(fitter)) is not None:
+            ends.append(self.climbed(*start))
             best = self.better(best, ends[-1])
         if best is None:
             return None
@@ -106,19 +107,17 @@ class Search:
                 winner, least = end, found
         return winner
 
-    def starts(self, fitter: Fitter) -> list[tuple[list[str], dict[str, float]]]:
-        """Offers and values that one linear problem of smoothed accelerations gives."""
-        local, data = local_polynomials(self.data), self.data
-        if local is None:
-            return []
-        found, every = [], candidates(data, self.config.translations)
-        every = every.only(set(every.names) - set(special(data)))
-        for start in starts_of(data, self.base, every, local)[:1]:
-            base = started(self.base, data, start.values, fitter.settings)
-            numbers = ParameterVector(build_model(base, fitter.settings, "none"))
-            values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
-            found.append(([offer.name for offer in fitter.offers if values[offer.numbers[0]] != 0], values))
-        return found
+    def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
+        """Offers and values that one linear problem of smoothed accelerations gives; None where it gives none."""
+        local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
+        every = every.only(set(every.names) - set(special(self.data)))
+        start = None if local is None else start_of(self.data, self.base, every, local)
+        if start is None:
+            return None
+        base = started(self.base, self.data, start.values, fitter.settings)
+        numbers = ParameterVector(build_model(base, fitter.settings, "none"))
+        values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
+        return [offer.name for offer in fitter.offers if values[offer.numbers[0]] != 0], values
 
     def climbed(self, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
         """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
@@ -126,7 +125,7 @@ class Search:
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
         while trial is not None:
             trial = self.finer(trial)
-            while (more := self.richer(trial)) is not None:
+            while not trial.whole and (more := self.richer(trial)) is not None:
                 trial = self.finer(more)
             if (longer := trial.fitter.longer(trial)) is None:
                 return self.settled(trial)
@@ -192,7 +191,7 @@ class Search:
             fitter = trial.fitter
             other = self.fitter(replace(fitter.variant, substeps=2 * fitter.variant.substeps))
             problem = other.problem(trial.length).of(other.numbers(trial.taken), trial.problem.sigma)
-            if moved(trial, problem, trial.theta) <= FINER * max(trial.rms, fitter.floor / ROUNDING):
+            if moved(trial, problem, trial.theta) <= FINER * max(trial.rms, fitter.floor / ALIKE):
                 break
             fit = other.fit(trial.taken, trial.values, trial.length, trial)
             if fit is None or trial.replaces(fit):
@@ -233,14 +232,14 @@ class Search:
         ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
         return ahead is not None and (its is None or ahead.replaces(its, trial.fitter.offered))
 
-    def apart(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
+    def zeros(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
         """Zeros of sensors (B, n) that recordings differ in, and their deviations; None: the score asks for none."""
         asked = self.config.find_zeros or (self.config.find_zeros is None and not trial.at_the_noise)
         if len(self.data) == 1 or not asked:
             return None
         names = trial.problem.parameters.numbers
         problem = trial.problem.of(names, trial.problem.sigma, trial.fitter.prior(names))
-        found = apart(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
+        found = differing_zeros(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
         if found is None:
             return None
         data = measured(self.data, found[0].flatten().tolist())
@@ -262,7 +261,7 @@ class Search:
     def braking(self, trial: Trial) -> Trial:
         """With a load in the place of dry friction that pushes, which would create energy, or with neither."""
         for i in range(self.data.dof):
-            name = "friction.coulomb" + (f"[{i}]" if self.data.dof > 1 else "")
+            name = DRY + (f"[{i}]" if self.data.dof > 1 else "")
             if name not in trial.taken or trial.values[name] > 0:
                 continue
             every = (*trial.fitter.offers, *trial.fitter.loads)
@@ -273,14 +272,14 @@ class Search:
 
     def stuck(self, trial: Trial | None) -> Trial | None:
         """With friction that can hold a joint still, where that is as likely."""
-        dry = trial is not None and any(name.startswith("friction.coulomb") for name in trial.taken)
+        dry = trial is not None and any(name.startswith(DRY) for name in trial.taken)
         if trial is None or not dry or self.config.sticking is False:
             return trial
         fitter = self.fitter(replace(trial.fitter.variant, sticking=True))
-        least = 0.01 * max(self.base.speed)
+        least = LEAST_GRIP * max(self.base.speed)  # at 0 and below friction is none, and has no slope
+        grip = {DRY: least, EXCESS: least / 100}
         values = {
-            name: max(x, least) if name.startswith("friction.coulomb") and x != 0 else x
-            for name, x in trial.values.items()
+            name: max(x, grip.get(name.split("[")[0], -math.inf)) if x != 0 else x for name, x in trial.values.items()
         }
         held = fitter.fit(trial.taken, values, trial.length, trial, 2 * ITERATIONS)
         if held is None or trial.replaces(held):

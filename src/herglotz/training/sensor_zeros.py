@@ -65,10 +65,10 @@ def _fitted(target: WithZeros, theta: Tensor, begin: Trajectories) -> FoundZeros
     """The zeros as a vector, from 0 with these parameters, and states read off `begin`; None where nothing follows."""
     problem = target.problem
     problem.guess_from_states(states_of_pairs(problem.parameters.model, begin))
-    return moved(target, problem.pack(theta, first_states(problem, theta, begin)))
+    return fitted(target, problem.pack(theta, first_states(problem, theta, begin)))
 
 
-def moved(target: WithZeros, x: Tensor) -> FoundZeros | None:
+def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
     """The zeros as a vector, from 0 where all other unknowns are x; None where nothing follows."""
     problem, x = target.problem, torch.cat([x, x.new_zeros(target.count)])
     result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
@@ -82,12 +82,12 @@ def moved(target: WithZeros, x: Tensor) -> FoundZeros | None:
     return FoundZeros(result.x[-target.count :], variance.clamp_min(0).sqrt(), rms)
 
 
-def apart(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor] | None:
+def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor] | None:
     """Zeros (B, n) that recordings have beside the reference, and deviations, where the fit of a problem ends at x.
 
     None where zeros lead nowhere.
     """
-    found = moved(WithZeros(problem), x)
+    found = fitted(WithZeros(problem), x)
     if found is None:
         return None
     rows = [b for b in range(len(problem.data)) if b != reference_of(problem.data)]

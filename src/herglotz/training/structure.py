@@ -47,7 +47,6 @@ NUMBERS = 3e7  # most numbers in the derivatives of the linear problem: 240 MB
 THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the rule of order 2 for short ones
 MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
 BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
-HELD_OTHERWISE = 0.8  # of the misfit: another hold of the inputs that leaves less is worth another search
 EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
 EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no other model to be tried
 # Settings that name a term of the model.
@@ -133,7 +132,8 @@ def search(
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
     found = wanted.run()
-    turning = not wanted.better_on_a_line(found)
+    if wanted.better_on_a_line(found):  # which a search of its own finds again, with inputs and sizes of its own
+        return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if found is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     noise = precision(data)
@@ -141,16 +141,15 @@ def search(
     settings, found_base = settings_of_trial(found, wanted.config)
     settings = replace(settings, dtype=config.dtype, device=config.device)
     base = replace(found_base, low=base.low, high=base.high)
-    taken = [offer.name for offer in found.fitter.offers if offer.name in found.taken]
-    named = ", ".join(("mass", "damping", *taken))
+    named = ", ".join(("mass", "damping", *found.names))
     miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, limit))
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
     doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
     zeros, why, compared = (), "", wanted.compared(found)
-    if (differ := wanted.apart(found)) is not None:
+    if (differ := wanted.zeros(found)) is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
-    return Structure(settings, base, words, found.rms, doubt, zeros, why, turning, compared, wanted.held(found, holds))
+    return Structure(settings, base, words, found.rms, doubt, zeros, why, True, compared, wanted.held(found, holds))
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

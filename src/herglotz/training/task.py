@@ -42,11 +42,6 @@ class Task:
         """σ of exact data, in units of q."""
         return EXACT[self.config.dtype] * self.size
 
-    def thinned(self, every: int) -> Task:
-        """The same with every m-th sample, and model steps that are as much longer."""
-        longer = {name: every * getattr(self.base, name) for name in ("max_step", "model_step")}
-        return replace(self, data=self.data.thinned(every), base=replace(self.base, **longer)) if every > 1 else self
-
     def build(self, network: str, seed: int | None = None) -> ContactLagrangian:
         """The model that a fit starts from; see `build_model`."""
         return build_model(self.base, self.config if seed is None else replace(self.config, seed=seed), network)

@@ -6,7 +6,7 @@ A model is a set of offers (`offers`), fitted by multiple shooting over segments
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import AT_THE_NOISE, coarse, precision
+from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, relative_spread
 from herglotz.data.smoothing import smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
@@ -31,16 +31,15 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.score import Score, free_run_score, score
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
-from herglotz.training.task import EXACT, build_model
+from herglotz.training.task import EXACT, build_model, with_sticking
+from herglotz.training.trajectory_fit import FAR_OFF, FOLLOWED, LOST, NEAR
 
 ITERATIONS = 15  # of a fit: a trial that needs more starts too far off
 SEEN = 0.75  # of every trajectory: finalists are fitted to it, and run free over the rest
 SHORT = (5, 10)  # recorded steps of the first segments: over these motion is all but linear in the forces
-LOST, FOLLOWED = 2.0, 0.05  # times what shorter segments miss, and of the spread: longer ones are not followed
 ASTRAY = 0.25  # of the spread: segments that are missed by more are not followed, whatever shorter ones miss
 FINER = 0.3  # of the misfit: a rule that changes the motion by more is worth trying
-FAR_OFF, NEAR = 1e-3, 1e-8  # damping of the first iteration
-ROUNDING = 10.0  # times the σ of exact data: smaller misfits are no reason for anything
+ALIKE = 10.0  # times the σ of exact data: misfits below it are all as good
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
 
 
@@ -84,6 +83,11 @@ class Trial:
         return scale_of(r) if self.problem.freedom else float(r.square().mean().sqrt())
 
     @property
+    def names(self) -> list[str]:
+        """What it has taken, in the order of the dictionary."""
+        return [offer.name for offer in (*self.fitter.offers, *self.fitter.loads) if offer.name in self.taken]
+
+    @property
     def length(self) -> int:
         """Recorded steps of its segments."""
         return self.problem.grid.length
@@ -121,18 +125,27 @@ class Trial:
         other.__dict__["score"] = replace(self.score, zeros=count)
         return other
 
-    def curvature(self, names: Sequence[str]) -> tuple[Tensor, Tensor] | None:
+    def curvature(self, names: Collection[str]) -> tuple[Tensor, Tensor] | None:
         """(H, g) of these numbers at the fit, the states being eliminated, in units of its misfit."""
         problem = self.problem.of(names, self.problem.sigma, self.fitter.prior(names))
         problem.path = self.path
         states = self.path.x[:, 0, : problem.d]
-        names = problem.parameters.numbers
-        x = problem.pack(states.new_tensor([self.values[name] for name in names]), states)
+        theta = states.new_tensor([self.values[name] for name in problem.parameters.numbers])
+        x = problem.pack(theta, states)
         cost, A, b = problem.normal_equations(x)
         found = A.reduced(b) if bool(torch.isfinite(cost)) else None
         by = (problem.sigma / max(self.rms, self.fitter.floor)) ** 2
         finite = found is not None and bool(torch.isfinite(found[0]).all()) and bool(torch.isfinite(found[1]).all())
         return (found[0] * by, found[1] * by) if finite and found is not None else None
+
+    @cached_property
+    def everything(self) -> tuple[Tensor, Tensor, dict[str, int]] | None:
+        """`curvature` of the numbers of all offers, and their places."""
+        fitter = self.fitter
+        every = set(fitter.numbers(offer.name for offer in fitter.offers))
+        found = self.curvature(every)
+        at = {name: i for i, name in enumerate(name for name in fitter.start if name in every)}
+        return None if found is None else (*found, at)
 
 
 class Fitter:
@@ -145,7 +158,8 @@ class Fitter:
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
         base = started(base, data, first, settings)
         self.base, self.settings = base, settings
-        self.model = build_model(base, settings, "none")
+        model = build_model(base, settings, "none")
+        self.model = with_sticking(model, excess=False) if variant.sticking else model
         every = ParameterVector(self.model)
         self.keys = dict(zip(every.numbers, keys_of(every.numbers, self.model.config), strict=True))
         self.always, every_offer, self.simple = offers_of(self.model, list(self.keys.values()))
@@ -160,14 +174,12 @@ class Fitter:
         lengths = segment_lengths(data)
         self.lengths = [*(length for length in SHORT if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
-        self.floor = ROUNDING * EXACT["float64"] * max(base.scale)
-        self.offered = len(self.always) + sum(len(offer.numbers) for offer in self.offers)
-        self.smooth = smoothed(data)
-        self.precise, self.precision = is_precise(data), precision(data)
-        self.spread = spread_of(data)
+        self.floor = ALIKE * EXACT["float64"] * max(base.scale)
+        self.offered = len(self.always) + sum(len(offer.numbers) for offer in every_offer)
+        self.smooth, self.precision, self.spread = smoothed(data), precision(data), relative_spread(data)
         self.compared: list[Compared] = []
 
-    def prior(self, names: Sequence[str]) -> Gaussian:
+    def prior(self, names: Collection[str]) -> Gaussian:
         """Of these numbers, in the order of the model."""
         own = [name for name in self.start if name in set(names)]
         like = self.data.q
@@ -251,14 +263,9 @@ class Fitter:
         return self.grow(trial) if whole is None or whole.rms > FOLLOWED * self.spread else whole
 
 
-def spread_of(data: Trajectories) -> float:
-    """RMS of q about its mean, over the balance."""
-    return float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
-
-
 def is_precise(data: Trajectories) -> bool:
     """Whether the data are worth a rule of order 4."""
-    return coarse(data) or precision(data) < SMOOTH * spread_of(data)
+    return coarse(data) or precision(data) < SMOOTH * relative_spread(data)
 
 
 def masses(data: Trajectories) -> tuple[float, ...]:

@@ -7,9 +7,11 @@ import torch
 
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import Stepper, state_of
 from herglotz.training import flow
 from herglotz.training.arrowhead import dense
 from herglotz.training.dictionary import dictionary, keys_of
+from herglotz.training.flow import motion
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
@@ -104,6 +106,7 @@ def test_pieces_add_up_to_the_whole(length, monkeypatch):
     assert problem.compiled is not None
     whole = problem.normal_equations(x)
     monkeypatch.setattr(flow, "CHUNK", 8 * 2 * 40 * 7)  # seven samples at most
+    problem.compiled.jobs.clear()
     pieces = problem.normal_equations(x)
     theta, starts = problem.unpack(x)
     sums = Sums.zeros(problem.P, problem.grid.segments, problem.d, x)
@@ -165,3 +168,37 @@ def test_without_a_compiler_torch_fits(monkeypatch):
     problem, x = problem_of(MODELS["order 2"])
     assert problem.compiled is None
     assert bool(torch.isfinite(problem.normal_equations(x)[0]))
+
+
+def test_threads_add_up_to_the_same(monkeypatch):
+    # fails if jobs share what they write, leave a segment out, or if the number of processors decides a sum
+    problem, x = problem_of(MODELS["joints"])
+    whole = problem.normal_equations(x)
+    monkeypatch.setattr(flow, "WORK", 7)
+    found = []
+    for processors in (1, 4):
+        monkeypatch.setattr(flow.os, "cpu_count", lambda count=processors: count)
+        other, _ = problem_of(MODELS["joints"])
+        assert other.compiled is not None
+        found.append(other.normal_equations(x))
+        assert all(len(jobs) > 2 for jobs in other.compiled.jobs.values())
+    one, several = ((dense(A), b) for _, A, b in found)
+    assert all(torch.equal(*pair) for pair in zip(one, several, strict=True))
+    assert float((one[0] - dense(whole[1])).abs().max()) <= 1e-12 * float(one[0].abs().max())
+    assert float((one[1] - whole[2]).abs().max()) <= 1e-12 * float(whole[2].abs().max())
+
+
+@pytest.mark.parametrize("name", ["driven, dry", "held", "joints"])
+def test_motions_are_the_steppers(name):
+    # fails if a free run by the kernel has another step, input, s or order of its segments
+    problem, _ = problem_of(MODELS[name])
+    model, make = problem.parameters.model, torch.Generator().manual_seed(1)
+    start = 0.3 * torch.randn(3, 2 * model.dof + 1, generator=make, dtype=torch.float64)
+    h = torch.full((3, 12), 0.05, dtype=torch.float64)
+    u = torch.randn(3, 12, model.inputs, generator=make, dtype=torch.float64) if model.inputs else None
+    found = motion(model, start, h, u)
+    assert found is not None
+    with torch.no_grad():
+        stepped = Stepper(model).rollout(*state_of(start), h=h, inputs=u).states.joined
+    assert float((found - stepped).abs().max()) <= 1e-10
+    assert motion(model, start * float("nan"), h, u) is None

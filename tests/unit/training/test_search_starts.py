@@ -12,19 +12,13 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig, trajectory_fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_start import LinearFit
-from herglotz.training.linear_terms import SINGULAR, LinearStart, LinearTerms, starts_of
-from herglotz.training.named_terms import DRY, MOVING, NamedTerms, candidates
+from herglotz.training.linear_terms import SINGULAR, LinearStart, LinearTerms, start_of
+from herglotz.training.named_terms import MOVING, NamedTerms, candidates
 from herglotz.training.trajectory_fit import TrajectoryFit
 
 CART = ("mass", "mass", "mass", MOVING)  # a cart, a pole, and a mass of both that turns with the pole's angle
 
 
-@pytest.mark.parametrize(("friction", "dry"), [((-1.0, 0.0), [True, False]), ((-1.0, 0.1), [True])])
-def test_a_start_with_friction_that_pushes_is_tried_without_it(friction, dry):
-    # fails if a cart with a pole whose smoothed accelerations show such friction is left without a start
-    start = LinearStart(NamedTerms(("cos(q2) v1 v2",), (), True), {DRY: friction}, 0.0, 9)
-    assert [terms.dry for terms in start.ways] == dry
-    assert all(terms.features == start.terms.features for terms in start.ways)
 
 
 @pytest.mark.parametrize("coupling", [0.5, 0.99, -1.5])
@@ -100,8 +94,8 @@ def test_every_start_is_made_regular(monkeypatch):
     monkeypatch.setattr(LinearTerms, "_regular", lambda self, x: (seen.append(x), x)[1])  # noqa: ARG005
     local = local_polynomials(data)
     assert local is not None
-    starts = starts_of(data, estimate_baseline(data), candidates(data), local)
-    assert len(seen) >= len(starts) > 0
+    assert start_of(data, estimate_baseline(data), candidates(data), local) is not None
+    assert seen
 
 
 def test_least_squares_stay_where_no_robust_fit_is_found(monkeypatch):

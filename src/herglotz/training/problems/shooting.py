@@ -61,7 +61,8 @@ class ShootingProblem(StatesProblem):
     ):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
-        self.s = s
+        self.s, self._precise = s, None
+        self.masses = JointMasses(self.parameters, data.q)  # that momenta of joints are over
         self._weigh()
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
@@ -87,6 +88,7 @@ class ShootingProblem(StatesProblem):
         other = copy(self)
         other.parameters, other.prior, other.sigma = ParameterVector(self.parameters.model, free), prior, sigma
         other.P, other.deviations = len(other.parameters.numbers), sigma * self.data.balance
+        other.masses = JointMasses(other.parameters, self.data.q)
         other._solved = other._at = other._slopes = other.path = None
         other._weigh()
         if self.compiled is not None:
@@ -104,7 +106,9 @@ class ShootingProblem(StatesProblem):
         """
         if self.grid.segments > len(self.data):
             return torch.ones_like(self.data.q)
-        better = (self.sigma / precisions(self.data).to(self.data.q)).clamp(max=KNOWN)
+        if self._precise is None:
+            self._precise = precisions(self.data).to(self.data.q)
+        better = (self.sigma / self._precise).clamp(max=KNOWN)
         first = torch.zeros_like(self.data.t, dtype=torch.bool)
         first[(torch.tensor(self.data.offsets)[:, None] + torch.arange(START)).to(first.device)] = True
         return torch.where(first[:, None] & (better > AT_THE_NOISE), better, 1.0)
@@ -296,11 +300,6 @@ class ShootingProblem(StatesProblem):
         ends = x[torch.arange(len(x), device=x.device), self.grid.end, : self.d]
         joints = (ends.roll(1, 0) - x[:, 0, : self.d]) / weights
         return torch.where(self.grid.joined[:, None], joints, 0.0)
-
-    @property
-    def masses(self) -> JointMasses:
-        """The masses that momenta of joints are over."""
-        return JointMasses(self.parameters, self.data.q)
 
     def _weights(self, theta: Tensor) -> Tensor:
         """What joints are divided by at θ, (d,): momenta by a speed times the mass there.
