@@ -1,9 +1,10 @@
 """Named friction forces of one joint or between two: |v| v, v³, q² v, and so on, with a learned coefficient each.
 
-The text of one is a product: a power of a length's position if any, |v|, and a power of the same speed v. That speed is
-a joint's own, or the one of two joints from one another, which a damper between them brakes:
+The text of one is a product: a power or a wave of a position if any, |v|, and a power of the same speed v. That speed
+is a joint's own, or the one of two joints from one another, which a damper between them brakes:
 
     |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
+    cos(q1) v1     sin(2.5 q2) v1
 
 `load 2` is a constant force on coordinate 2: on an angle no potential has it. `|v1|` is what viscous friction has more
 in one direction than in the other. `|v| v` brakes a body that moves in a
@@ -28,11 +29,13 @@ from herglotz.models.term import with_force
 
 HIGHEST = 9  # power of a speed or a position
 _APART = r"v\d+ - v\d+"
+_NUMBER = r"\d+(?:\.\d*)?(?:e[-+]?\d+)?"
+_AT = rf"(?:(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
 _TEXT = re.compile(
-    rf"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
+    rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
     r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)|\|v(?P<even>\d+)\|"
 )
-_DRY = re.compile(r"(?:(?P<wave>cos|sin)\(q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?) sgn\(v(?P<v>\d+)\)")
+_DRY = re.compile(rf"{_AT} sgn\(v(?P<v>\d+)\)")
 AIR = "|v| v"
 
 
@@ -40,7 +43,7 @@ AIR = "|v| v"
 class DragFeature:
     """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of, which brakes the coordinate `on`, and drives `of`.
 
-    If `dry` q_at^a sgn(v); a `wave`, cos or sin, of q_at stands in the place of its power.
+    If `dry` q_at^a sgn(v); a `wave`, cos or sin, of rate · q_at stands in the place of its power.
     """
 
     on: int
@@ -52,6 +55,7 @@ class DragFeature:
     air: bool = False  # |v| v of the whole velocity, on every coordinate
     dry: bool = False
     wave: str = ""
+    rate: float = 1.0
 
     @property
     def even(self) -> bool:
@@ -61,7 +65,9 @@ class DragFeature:
     def position(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the factor that depends on q_at, and its slope."""
         if self.wave:
-            return (q.cos(), -q.sin()) if self.wave == "cos" else (q.sin(), q.cos())
+            x = q * self.rate
+            value, slope = (x.cos(), -x.sin()) if self.wave == "cos" else (x.sin(), x.cos())
+            return value, slope * self.rate
         return _power(q, self.a), _power(q, self.a - 1) * self.a
 
 
@@ -89,30 +95,41 @@ def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
     found = match.groupdict()
     speed = found["v"] or found["apart"]
     on, *of = (int(digits) for digits in re.findall(r"\d+", speed or found["load"] or found["even"]))
-    at, c = int(found["q"] or on), 0 if speed is None else int(found["c"] or 1)
-    a = int(found["a"] or 1) if found["q"] else 0
+    at, a, wave, rate = _position(text, found, on, angles)
+    c = 0 if speed is None else int(found["c"] or 1)
     refuse({
         f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
         f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
         f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in (None, speed),
-        f"drag '{text}': a power of an angle is not periodic; leave q{at} out": a and any(angles[at - 1 : at]),
         f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": speed and not (a <= HIGHEST >= c >= 1),
     })  # fmt: skip
     b = int(found["size"] is not None or found["even"] is not None)
-    return DragFeature(on - 1, at - 1, a, b, c, of[0] - 1 if of else None)
+    return DragFeature(on - 1, at - 1, a, b, c, of[0] - 1 if of else None, wave=wave, rate=rate)
 
 
 def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) -> DragFeature:
     """Dry friction of a joint by the position of a coordinate."""
-    on, at, a = (int(found[name] or 1) for name in ("v", "angle" if found["wave"] else "q", "a"))
-    n = len(angles)
+    on, n = int(found["v"] or 1), len(angles)
+    at, a, wave, rate = _position(text, found, on, angles)
     refuse({
         f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at)),
-        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{at}) sgn(v{on})'":
-            not found["wave"] and any(angles[at - 1 : at]),
-        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": not 1 <= a <= HIGHEST,
+        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": not wave and not 1 <= a <= HIGHEST,
     })  # fmt: skip
-    return DragFeature(on - 1, at - 1, 0 if found["wave"] else a, 0, 0, dry=True, wave=found["wave"] or "")
+    return DragFeature(on - 1, at - 1, a, 0, 0, dry=True, wave=wave, rate=rate)
+
+
+def _position(
+    text: str, found: dict[str, str | None], on: int, angles: Sequence[bool]
+) -> tuple[int, int, str, float]:
+    """The number of the coordinate whose position a force depends on, `on` without one, its power, wave and rate."""
+    at, wave, rate = int(found["angle"] or found["q"] or on), found["wave"] or "", float(found["rate"] or 1)
+    a = int(found["a"] or 1) if found["q"] else 0
+    angle = any(angles[at - 1 : at])
+    refuse({
+        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{at})' in its place": a and angle,
+        f"drag '{text}': a wave of an angle is periodic; write a whole number before q{at}": angle and rate % 1,
+    })  # fmt: skip
+    return at, a, wave, rate
 
 
 class Drag(nn.Module):

@@ -6,7 +6,7 @@
     base    = "r" | "q" index | "v" index | "(" form ")" | size
     size    = "|" "q" index "|"                   |q1|^3, and before a power of the same coordinate: |q1| q1^2
     form    = [sign] addend { sign addend }
-    addend  = [ number ["*"] ] "q" index
+    addend  = [ number ["*"] ] "q" index | number             a number in a wave alone: cos(2.5 q1 + 0.3)
 
 Only r takes negative powers; odd powers of |q1| stand for sgn(q1) q1^k, of k from 2 on. Blanks separate, and mean
 nothing else.
@@ -31,13 +31,17 @@ HOW = "write sums of products of numbers, v1, and one of cos(q1 - q2), sin(q1), 
 
 @dataclass(frozen=True)
 class Product:
-    """factor · f(w·q) · ∏ v: f = cos, sin, a power of the linear form x, sgn(x) times one, or one of r = |q| (no w)."""
+    """factor · f(w·q + phase) · ∏ v: f = cos, sin, a power of the form x, sgn(x) times one, or one of r = |q| (no w).
+
+    Waves alone have a phase.
+    """
 
     factor: float
     function: str  # "cos", "sin", "power", "signed" or "radius"
     form: tuple[float, ...] = ()  # w, n numbers
     power: int = 0
     velocities: tuple[int, ...] = ()  # coordinates of the factors v, repeated for powers
+    phase: float = 0.0
 
 
 Feature = tuple[Product, ...]
@@ -82,7 +86,7 @@ class _Reader:
 
     def _product(self, factor: float) -> Product:
         begin = self._next()[2]
-        functions: list[tuple[str, tuple[float, ...], int]] = []
+        functions: list[tuple[str, tuple[float, ...], int, float]] = []
         velocities: list[int] = []
         numbers = count = 0
         more = (("mark", "("), ("mark", "|"))
@@ -106,7 +110,8 @@ class _Reader:
                 f"'{self.text[begin : self._next()[2]].strip()}' has {len(functions)} functions of the position, and a "
                 "product takes one; q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
             )
-        return self._checked(Product(factor, *(functions or [("power", (0.0,) * self.n, 0)])[0], tuple(velocities)))
+        function, form, power, phase = (functions or [("power", (0.0,) * self.n, 0, 0.0)])[0]
+        return self._checked(Product(factor, function, form, power, tuple(velocities), phase))
 
     def _checked(self, product: Product) -> Product:
         """The product, if the coordinates allow it."""
@@ -114,28 +119,32 @@ class _Reader:
         used = [True] * self.n if radial else product.form
         if product.power and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
             raise self._error("a power of an angle is not periodic; use cos or sin")
+        if product.phase and product.function not in ("cos", "sin"):
+            raise self._error(f"a power of q + {product.phase:g} is a sum of powers; write these, or a wave")
         if radial and product.velocities:
             raise self._error("powers of r join the potential; write the product without velocities")
         return product
 
-    def _function(self) -> tuple[str, tuple[float, ...], int]:
-        """cos, sin, or a power of a form, a coordinate or r."""
+    def _function(self) -> tuple[str, tuple[float, ...], int, float]:
+        """cos, sin, or a power of a form, a coordinate or r: its name, the form, the power and the phase."""
         kind, token, where = self._next()
         if token in ("cos", "sin"):
             self.at += 1
             if not self._is("("):
                 raise self._unread(where)
-            return token, self._form(), 0
+            form, phase = self._form()
+            return token, form, 0, phase
         if token == "r":
             self.at += 1
-            return "radius", (), self._power(negative=True)
+            return "radius", (), self._power(negative=True), 0.0
         if token == "(":
-            return "power", self._form(), self._power()
+            form, phase = self._form()
+            return "power", form, self._power(), phase
         if token == "|":
-            return self._size()
+            return *self._size(), 0.0
         if kind == "coordinate":
             i = self._coordinate()
-            return "power", tuple(float(i == j) for j in range(self.n)), self._power()
+            return "power", tuple(float(i == j) for j in range(self.n)), self._power(), 0.0
         raise self._unread(where)
 
     def _size(self) -> tuple[str, tuple[float, ...], int]:
@@ -157,17 +166,21 @@ class _Reader:
             raise self._error(f"the force of |q{i + 1}| jumps at 0; write |q{i + 1}| q{i + 1} or |q{i + 1}|^3")
         return ("signed" if own % 2 else "power"), tuple(float(i == j) for j in range(self.n)), power
 
-    def _form(self) -> tuple[float, ...]:
-        """The n numbers w of a linear form in parentheses."""
+    def _form(self) -> tuple[tuple[float, ...], float]:
+        """The n numbers w of a linear form in parentheses, and its constant."""
         begin = self._next()[2]
         self.at += 1
-        w = [0.0] * self.n
+        w, phase = [0.0] * self.n, 0.0
         sign: float | None = self._sign() or 1.0
         while sign is not None:
-            if self._next()[0] == "number":
+            number = self._next()[0] == "number"
+            if number:
                 sign *= self._number()
-                self._take("*")
+                number = not self._take("*")
             kind, token, _ = self._next()
+            if number and kind != "coordinate":
+                phase, sign = phase + sign, self._sign()
+                continue
             if kind != "coordinate" or token[0] != "q":
                 break
             at = self._coordinate()
@@ -178,7 +191,7 @@ class _Reader:
         if sign is not None or not self._take(")"):
             words = self.text[begin + 1 :].partition(")")[0]
             raise self._error(f"cannot read the linear form '{words}'; write q1 - q2 or 2*q1 + q3")
-        return tuple(w)
+        return tuple(w), phase
 
     def _power(self, negative: bool = False) -> int:
         """The power after the present base; 1 where none is written."""

@@ -43,7 +43,7 @@ class FeatureKinetic(nn.Module):
     def mass(self, q: Tensor) -> Tensor:
         """Return the features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
         c, n = self.sum, self.sum.dof
-        f = (c.ridge(q @ c.form.T, 0) * c.weights()) @ self.of
+        f = (c.ridge(c.forms(q), 0) * c.weights()) @ self.of
         out = q.new_zeros(*q.shape, n)
         for k, velocities in enumerate(self.monomials):
             if len(velocities) == 2:
@@ -80,7 +80,7 @@ class FeatureKinetic(nn.Module):
         As each f is a function of one number, its derivatives are those of f times w and w wᵀ: no jets are multiplied.
         """
         c, order = self.sum, phase.order
-        x, weights = phase.mean.value @ c.form.T, c.weights()
+        x, weights = c.forms(phase.mean.value), c.weights()
         f = [c.ridge(x, k) * weights for k in range(max(by_order) + order + 1)]
         whole = lambda part: reduce(torch.add, [part(k, R) for k, R in by_order.items()])  # noqa: E731
         value = whole(lambda k, R: f[k] * R.value).sum(-1)

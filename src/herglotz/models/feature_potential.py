@@ -35,6 +35,7 @@ class Combination(nn.Module):
         numbers = {
             "factor": torch.tensor([p.factor for p in self.products], dtype=torch.float64),
             "form": form,  # (ridges, n) w
+            "phase": torch.tensor([p.phase for p in self.products[: self.ridges]], dtype=torch.float64),
             "outer": form[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w wᵀ
             "power": torch.tensor([float(p.power) for p in self.products], dtype=torch.float64),
             "group": torch.tensor([g for _, g in every], dtype=torch.long),
@@ -43,6 +44,8 @@ class Combination(nn.Module):
             self.register_buffer(name, value, persistent=False)
         self.factor: Tensor
         self.form: Tensor
+        self.phase: Tensor
+        self.shifted = any(p.phase for p in self.products)
         self.outer: Tensor
         self.power: Tensor
         self.group: Tensor
@@ -54,8 +57,13 @@ class Combination(nn.Module):
         known = torch.ones_like(self.coefficient[:1])
         return torch.cat([self.coefficient, known])[self.group.clamp_max(self.learned)] * self.factor
 
+    def forms(self, q: Tensor) -> Tensor:
+        """Return w·q and the phases, (..., ridges)."""
+        x = q @ self.form.T
+        return x + self.phase if self.shifted else x
+
     def ridge(self, x: Tensor, k: int) -> Tensor:
-        """Return the k-th derivative of the functions of w·q, at x = w·q, (..., ridges)."""
+        """Return the k-th derivative of the functions of w·q, at x = w·q + phase, (..., ridges)."""
         functions = (
             lambda y: _wave(y, k), lambda y: _wave(y, k + 3), lambda y: self._powers(y, k),
             lambda y: y.sign() * self._powers(y, k, "signed"),
@@ -101,7 +109,7 @@ class FeaturePotential(nn.Module):
         c, parts = self.sum, []
         ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
         if c.ridges:
-            x = q @ c.form.T
+            x = c.forms(q)
             parts.append((c.ridge(x, 0) @ ridge, (c.ridge(x, 1) * ridge) @ c.form))
         if c.ridges < len(c.products):
             square = (q * q).sum(-1)
@@ -111,7 +119,7 @@ class FeaturePotential(nn.Module):
 
     def _of_forms(self, q: Tensor, weights: Tensor, order: int, y: Tensor | None) -> Jet:
         """Return the sum of the functions of w·q as a jet, or its derivative along y."""
-        c, x, k = self.sum, q @ self.sum.form.T, 0 if y is None else 1
+        c, x, k = self.sum, self.sum.forms(q), 0 if y is None else 1
         if y is not None:
             weights = weights * (y @ c.form.T)
         f = [c.ridge(x, k + j) * weights for j in range(order + 1)]

@@ -40,6 +40,7 @@ class Baseline:
     high: Tensor  # (n,) highest
     input_map: tuple[float, ...] = ()  # (n · m) accelerations per unit of each input, row by row
     start: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # values of parameters, where they are known
+    spreads: Mapping[str, float] = field(default_factory=dict)  # prior deviations of terms, where they have a prior
 
     @property
     def inputs(self) -> int:

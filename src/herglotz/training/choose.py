@@ -107,7 +107,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
         forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
-        absent=c.absent, turning=seen.turning,
+        absent=c.absent, turning=seen.turning, spreads=dict(base.spreads),
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures, zeros=seen.zeros,

@@ -8,8 +8,10 @@ that is left out moves another model. A network is no formula: the equation says
 
 from __future__ import annotations
 
+import re
 import textwrap
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,12 +19,14 @@ import torch
 
 from herglotz.models.jet import coordinates
 from herglotz.training.equation_numbers import Joint, Numbers
-from herglotz.training.equation_terms import Reader
+from herglotz.training.equation_terms import Line, Reader
 from herglotz.training.equation_words import BESIDE, UNKNOWN, number
 from herglotz.training.fitted_run import FittedRun
 
 WIDTH = 78  # two blanks stand before each line on screen
 BRACKETS = "in brackets: standard deviation, of the last digits or as ±, by noise alone"
+WAVE = re.compile(r"((?:sin|cos)\((?P<form>[^()]*)\))(?P<speeds>(?: [^ ()]+′²?)*)")
+FEW = 6  # waves of one form with the same speeds that a line has at most: more are a function that is told below
 TOGETHER = "\N{NO-BREAK SPACE}"  # inside a term: lines break between terms
 
 
@@ -36,6 +40,7 @@ class Term:
     deviation: float | None  # standard deviation; None: it was not computed
     unit: str
     alone: float | None = None  # standard deviation with all other numbers held, which rounds the value
+    function: str = ""  # of which this is a wave, as it stands in the line: f1(x) x′²; empty: the term stands there
 
     def size(self, digits: int = UNKNOWN) -> str:
         """The number without its sign, as it is printed; `digits` where nothing tells how many the motion needs."""
@@ -44,6 +49,12 @@ class Term:
     def told(self, digits: int = UNKNOWN) -> str:
         """The term with its sign."""
         return f"{'−' if self.value < 0 else '+'} {self.size(digits)} {self.what}".rstrip()
+
+    def wave(self, digits: int = UNKNOWN) -> str:
+        """The same as a part of its function, without a deviation: each of its waves alone says nothing."""
+        found = WAVE.fullmatch(self.what)
+        assert found is not None
+        return replace(self, what=found[1], deviation=None).told(digits)
 
 
 @dataclass(frozen=True, repr=False)
@@ -58,9 +69,13 @@ class Equation:
 
     def __str__(self) -> str:
         lines = [line for left in self.lefts for line in self._lines_of(left)]
+        for name in dict.fromkeys(term.function for term in self.terms if term.function):
+            waves = [term.wave(self._digits) for term in self.terms if term.function == name]
+            lines += _wrapped(name.split(")")[0] + ")", waves)
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
-        bracketed = any("(" in x for x in (*self.lefts, *(term.size(self._digits) for term in self.terms)))
+        sizes = (term.size(self._digits) for term in self.terms if not term.function)
+        bracketed = any("(" in x for x in (*self.lefts, *sizes))
         told = f"with {self.units}; {BRACKETS}" if bracketed else f"with {self.units}"
         for note in (told, *self.notes):
             lines += textwrap.wrap(note, WIDTH, break_long_words=False)
@@ -72,13 +87,10 @@ class Equation:
 
     def _lines_of(self, left: str) -> list[str]:
         """The line with this left side, broken between terms; nothing of a force that is 0."""
-        own = [term.told(self._digits).replace(" ", TOGETHER) for term in self.terms if term.left == left]
-        if not own and left.startswith("force on "):
-            return []
-        right, minus = " ".join(own) or "0", f"−{TOGETHER}"
-        right = "−" + right.removeprefix(minus) if right.startswith(minus) else right.removeprefix(f"+{TOGETHER}")
-        wrapped = textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
-        return [line.replace(TOGETHER, " ") for line in wrapped]
+        terms = (term for term in self.terms if term.left == left)
+        own = (f"+ {term.function}" if term.function else term.told(self._digits) for term in terms)
+        own = list(dict.fromkeys(own))  # a function once
+        return [] if not own and left.startswith("force on ") else _wrapped(left, own)
 
     def __repr__(self) -> str:
         return f"Equation({' '.join(str(replace(self, notes=())).split())})"  # what stands below it is long
@@ -104,10 +116,11 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
     network = network_of(run)
     numbers = Numbers(run.model, joint, BESIDE if network else UNKNOWN)
     reader, terms = Reader(run, numbers), []
-    for x in reader.lines():
+    lines = list(reader.lines())
+    for x, function in zip(lines, _functions(lines), strict=True):
         words = (x.what or "the constant") + (f" of {x.of or 'L'}" if len(reader.lefts) > 1 else "")
-        value, deviation, alone = numbers.known(x.value, words)
-        terms.append(Term(x.left, x.what, value, deviation, x.unit, alone))
+        value, deviation, alone = numbers.known(x.value, "" if function else words)
+        terms.append(Term(x.left, x.what, value, deviation, x.unit, alone, function))
     data = run.data
     labels = (*zip(data.names, data.units, strict=True), *(data.input_labels if run.model.inputs else ()))
     units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1")]
@@ -115,6 +128,8 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
         units.append(f"{', '.join(data.degrees)} recorded in deg (1 rad = 57.3 deg)")
     units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []
     every = (*reader.explained(), *notes, *map(str, numbers.trades()))
+    if any(term.function for term in terms):
+        every = ("f1 and so on: functions of what was recorded alone; beyond its range they are not known", *every)
     return Equation(tuple(terms), tuple(reader.lefts), ", ".join(units) or "plain numbers", network, every)
 
 
@@ -140,3 +155,25 @@ def network_of(run: FittedRun) -> str | None:
         parts.append(f"damping of the level '{config.level}', which depends on the state")
     parts += [f"the term '{name}'" for name in config.terms]
     return ", ".join(parts) or None
+
+
+def _functions(lines: Iterable[Line]) -> list[str]:
+    """The function that each line is a wave of, with the speeds beside it; "" of a line that stands by itself."""
+    found = []
+    for line in lines:
+        match = WAVE.fullmatch(line.what)
+        of = "" if match is None else ", ".join(dict.fromkeys(re.findall(r"[^\W\d]\w*", match["form"])))
+        found.append((line.left, of, "" if match is None else match["speeds"]) if of else None)
+    counts, names = Counter(found), {}
+    for key in found:
+        if key is not None and counts[key] > FEW and key not in names:
+            names[key] = f"f{len(names) + 1}({key[1]}){key[2]}"
+    return [names.get(key, "") for key in found]
+
+
+def _wrapped(left: str, terms: Sequence[str]) -> list[str]:
+    """A line of terms with their signs, broken between them."""
+    right, minus = " ".join(x.replace(" ", TOGETHER) for x in terms) or "0", f"−{TOGETHER}"
+    right = "−" + right.removeprefix(minus) if right.startswith(minus) else right.removeprefix(f"+{TOGETHER}")
+    lines = textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
+    return [line.replace(TOGETHER, " ") for line in lines]

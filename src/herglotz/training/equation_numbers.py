@@ -40,12 +40,13 @@ class Numbers:
     def known(self, value: Tensor, words: str) -> tuple[float, float | None, float | None]:
         """The value, its deviation, and the one that it is rounded by; None where nothing tells them.
 
-        `words` are what the number is called where it is not determined.
+        `words` are what the number is called where it is not determined; "": that is not told.
         """
         slopes, joint = self._slopes(value), self.joint
         if joint is None or not slopes:
             return float(value.detach()), None, None
-        self.told[words] = slopes
+        if words:
+            self.told[words] = slopes
         at, g = torch.tensor(list(slopes)), joint.covariance.new_tensor(list(slopes.values()))
         deviation = math.sqrt(max(0.0, float(g @ joint.covariance[at][:, at] @ g)))
         alone = float((g.abs() * joint.alone[at]).min())

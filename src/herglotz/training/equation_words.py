@@ -31,8 +31,10 @@ def drag_in_words(f: DragFeature, i: int, names: Sequence[str], sign: str = "") 
         return f"√({' + '.join(f'{name}′²' for name in names)}) {names[i]}′"
     speed = f"{names[f.on]}′" if f.of is None else f"({names[f.on]}′ − {names[f.of]}′)"
     position, size = [raised(names[f.at], f.a)] if f.a else [], [f"|{speed.strip('()')}|"] if f.b else []
+    if f.wave:
+        position = [f"{f.wave}({'' if f.rate == 1 else f'{plain(f.rate)} '}{names[f.at]})"]
     if f.dry:
-        return f"{f'{f.wave}({names[f.at]})' if f.wave else position[0]} {sign}"
+        return f"{position[0]} {sign}"
     return " ".join([*position, *size, *([raised(speed, f.c)] if f.c else [])])
 
 
@@ -40,7 +42,7 @@ def slope(p: Product, i: int, names: Sequence[str]) -> tuple[str, float, int]:
     """∂/∂q_i of a product without velocities: its text, its factor, and the power of length in the unit of a force."""
     if p.function == "radius":
         return f"{raised(distance(names), p.power - 2)} {names[i]}".strip(), p.factor * p.power, 2 - p.power
-    form, w = _form(p.form, names), p.form[i]
+    form, w = _form(p.form, names, p.phase), p.form[i]
     if p.function == "power":
         return raised(_inner(p.form, names), p.power - 1), p.factor * p.power * w, 2 - p.power
     if p.function == "signed":
@@ -53,9 +55,10 @@ def distance(names: Sequence[str]) -> str:
     return "ρ" if "r" in names else "r"
 
 
-def _form(form: tuple[float, ...], names: Sequence[str]) -> str:
+def _form(form: tuple[float, ...], names: Sequence[str], phase: float = 0.0) -> str:
     parts = [(w, name) for w, name in zip(form, names, strict=True) if w]
     text = " ".join(f"{'−' if w < 0 else '+'} {'' if abs(w) == 1 else f'{plain(abs(w))} '}{name}" for w, name in parts)
+    text += f" {'−' if phase < 0 else '+'} {plain(abs(phase))}" if phase else ""
     return text.removeprefix("+ ")
 
 
@@ -81,7 +84,7 @@ def _product(p: Product, names: Sequence[str]) -> str:
     speeds = [raised(f"{names[i]}′", p.velocities.count(i)) for i in dict.fromkeys(p.velocities)]
     if p.function == "radius":
         return raised(distance(names), p.power)
-    form = _form(p.form, names)
+    form = _form(p.form, names, p.phase)
     if p.function in ("cos", "sin"):
         return " ".join([f"{p.function}({form})", *speeds])
     power = p.power - (p.function == "signed")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
-from herglotz.training.named_terms import candidates, settings_of, started, values_of
+from herglotz.training.named_terms import settings_of, started, values_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
@@ -18,10 +18,11 @@ from herglotz.training.trials import ALIKE, FINER, Trial, is_precise, moved
 def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     """The settings of a model that has what a trial has taken and nothing else, and the baseline it starts from."""
     fitter, data = trial.fitter, trial.problem.data
-    bare = replace(fitter.base, start={})
+    base = replace(fitter.base, spreads=spreads_of(trial))
+    bare = replace(base, start={})
     own = set(trial.problem.parameters.numbers)
     keys = [fitter.keys[name] for name in fitter.start if name in own]
-    every = candidates(data, config.translations)
+    every = fitter.terms
     terms = every.only(keys)
     dry = any(key.startswith(("friction.coulomb", "friction.breakaway")) for key in keys)
     forces = [key for key in keys if key.startswith(("friction.", "coupling."))]
@@ -42,9 +43,19 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     values = values_of(numbers, theta)
     if is_precise(data) and data.dof > 1 and data.u is None and variant.substeps > 1 and not dry:
         fourth = replace(of, order=4, substeps=1)  # no kernel has it: a search makes do with short steps
-        own = started(fitter.base, data, values, fourth)
+        own = started(base, data, values, fourth)
         grid = segment_grid(data, trial.length, own.model_step)
         problem = ShootingProblem(build_model(own, fourth, "none"), data, grid, sigma=trial.problem.sigma)
         if moved(trial, problem, problem.parameters.get()) <= FINER * max(trial.rms, fitter.floor / ALIKE):
             return fourth, own
-    return of, started(fitter.base, data, values, of)
+    return of, started(base, data, values, of)
+
+
+def spreads_of(trial: Trial) -> dict[str, float]:
+    """The prior deviations of the waves that a trial has taken, and of what they could stand for, by their text."""
+    numbers, fitter, prior = trial.problem.parameters.numbers, trial.fitter, trial.prior
+    return {
+        fitter.keys[name]: weight**-0.5
+        for name, weight in zip(numbers, prior.weight.tolist(), strict=True)
+        if name in fitter.centred
+    }

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 
 from herglotz.models import ContactLagrangian
+from herglotz.training.functions import Band
 from herglotz.training.named_terms import own_terms
 from herglotz.training.parameter_vector import ParameterVector
 
@@ -18,28 +20,41 @@ SIMPLE = ("potential.stiffness", "potential.tilt", "friction.input_map")  # of t
 
 
 class Offer(NamedTuple):
-    """Numbers that join a model together, by name; the first is 0 where it is not taken."""
+    """Numbers that join a model together, by name."""
 
     name: str
-    numbers: tuple[str, ...]
+    amplitudes: tuple[str, ...]  # 0 where it is not taken
+    shapes: tuple[str, ...] = ()  # what has no effect then
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """All of them."""
+        return self.amplitudes + self.shapes
 
 
-def offers_of(model: ContactLagrangian, keys: list[str]) -> tuple[tuple[str, ...], list[Offer], frozenset[str]]:
+def offers_of(
+    model: ContactLagrangian, keys: list[str], bands: Sequence[Band] = ()
+) -> tuple[tuple[str, ...], list[Offer], frozenset[str]]:
     """The numbers that every model has, all offers, and the names of those that the simplest one has taken.
 
-    `keys` (`training.dictionary.keys_of`) are what the numbers are.
+    `keys` (`training.dictionary.keys_of`) are what the numbers are; those of waves join in their `bands`.
     """
     numbers, always, found, simple = ParameterVector(model).numbers, [], [], set()
+    waves = {text: band.name for band in bands for text in band.texts}
     own = own_terms(model.config.angles)  # of one coordinate: its spring and tilt
     for number, key in zip(numbers, keys, strict=True):
         stem = re.sub(r"\[\d+\]", "", number)
         if stem in ALWAYS:
             always.append(number)
+        elif key in waves:
+            continue
         elif stem not in SHAPES.values() and not (stem == "friction.viscous" and model.dof == 1):  # that is the rate
             shape = number.replace(stem, SHAPES.get(stem, stem))
-            found.append(Offer(key, (number, shape) if shape != number and shape in numbers else (number,)))
+            found.append(Offer(key, (number,), (shape,) if shape != number and shape in numbers else ()))
             if stem in SIMPLE or key in own:
                 simple.add(key)
+    place = dict(zip(keys, numbers, strict=True))
+    found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]
     return tuple(always), found, frozenset(simple)
 
 
@@ -47,6 +62,5 @@ def without_offers(model: ContactLagrangian, offers: list[Offer]) -> None:
     """Set the amplitudes of all offers to 0."""
     every = dict(zip(ParameterVector(model).numbers, ParameterVector(model).entries, strict=True))
     with torch.no_grad():
-        for offer in offers:
-            parameter, i = every[offer.numbers[0]]
+        for parameter, i in (every[name] for offer in offers for name in offer.amplitudes):
             model.get_parameter(parameter).view(-1)[i] = 0.0

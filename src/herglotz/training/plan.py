@@ -43,6 +43,7 @@ class Plan:
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
     turning: bool = True  # angles turn; False: they are positions on a line, as of a free spring
     absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
+    spreads: dict[str, float] = field(default_factory=dict)  # prior deviations of the waves that make functions
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
     reasons: dict[str, str] = field(default_factory=dict)
 
@@ -58,7 +59,9 @@ class Plan:
         """The first look's sizes with this plan's starting values."""
         own = {name: self.start[name] for name in STARTS}
         rest = {name: values for name, values in self.start.items() if name not in STARTS}
-        return replace(base, stiffness=own["stiffness"], tilt=own["tilt"], rate=own["rate"][0], start=rest)
+        return replace(
+            base, stiffness=own["stiffness"], tilt=own["tilt"], rate=own["rate"][0], start=rest, spreads=self.spreads
+        )
 
     def _has_effect(self, name: str) -> bool:
         one_step = self.objective in ("residual", "raw")

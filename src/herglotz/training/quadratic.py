@@ -32,7 +32,8 @@ def swaps(trial: Trial) -> Iterator[tuple[float, str, str]]:
     if found is None:
         return
     H, g, at = found
-    old = {at[offer.numbers[0]]: offer.name for offer in trial.fitter.offers if offer.name in trial.taken}
+    taken = [offer for offer in trial.fitter.offers if offer.name in trial.taken and len(offer.amplitudes) == 1]
+    old = {at[offer.amplitudes[0]]: offer.name for offer in taken}
     for offer in trial.fitter.offers:
         own = [at[name] for name in offer.numbers]
         if offer.name in trial.taken or not old:
@@ -47,25 +48,31 @@ def swaps(trial: Trial) -> Iterator[tuple[float, str, str]]:
         yield float(g[free] @ C @ g[free]) / 2 - float(cost[k]), offer.name, old[int(free[k])]
 
 
-def order_of(trial: Trial) -> list[str]:
-    """The offers that are taken as they leave one after the other, the one that costs least first."""
+def order_of(trial: Trial) -> tuple[list[str], int]:
+    """The offers that are taken as they leave one after the other, the one that costs least first; how many had best.
+
+    Those had best leave without which twice the cost and the worth of the numbers that stay are least.
+    """
     numbers = trial.problem.parameters.numbers
     found = trial.curvature(numbers)
     if found is None:
-        return []
+        return [], 0
     H, x = found[0], trial.theta.clone()
-    offers = {offer.numbers[0]: offer for offer in trial.fitter.offers if offer.name in trial.taken}
-    keep, order = list(range(len(numbers))), []
-    while left := [i for i in keep if numbers[i] in offers]:
-        C = inverse_of(H[keep][:, keep])
-        place = {i: k for k, i in enumerate(keep)}
-        i = min(left, key=lambda i: float(x[i] ** 2 / C[place[i], place[i]]) - worth(trial, offers[numbers[i]]))
-        k = place[i]
-        x[keep] = x[keep] - C[:, k] / C[k, k] * x[i]
-        order.append(offers[numbers[i]].name)
-        out = {numbers.index(name) for name in offers[numbers[i]].numbers}
+    keep, order, total = list(range(len(numbers))), [], [0.0]
+    left = [offer for offer in trial.fitter.offers if offer.name in trial.taken]
+    while left:
+        C, theta, costs = inverse_of(H[keep][:, keep]), x[keep], []
+        for offer in left:  # what the others miss without it, less what its numbers are worth, and how they move
+            own = [keep.index(numbers.index(name)) for name in offer.amplitudes]
+            by = torch.linalg.lstsq(C[own][:, own], theta[own, None]).solution[:, 0]
+            costs.append((float(theta[own] @ by) - worth(trial, offer), C[:, own] @ by))
+        k = min(range(len(left)), key=lambda k: costs[k][0])
+        x[keep] = theta - costs[k][1]
+        order.append(left[k].name)
+        total.append(total[-1] + costs[k][0])
+        out = {numbers.index(name) for name in left.pop(k).numbers}
         keep = [j for j in keep if j not in out]
-    return order
+    return order, total.index(min(total))
 
 
 def worth(trial: Trial, offer: Offer) -> float:

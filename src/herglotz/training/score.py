@@ -1,8 +1,8 @@
 """The one comparison of a fit: what a model misses held-out blocks of time by, and whether a richer one is worth it.
 
-A richer model of k_r numbers out of K replaces a simpler one of k_s where
+A richer model of k_r numbers, which come in c_r of C offers, replaces a simpler one where
 
-    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > ½ (k_r − k_s) log N + log C(K, k_r) − log C(K, k_s) + the standard error of the sum,
+    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > ½ (k_r − k_s) log N + log C(C, c_r) − log C(C, c_s) + the standard error,
 
 ℓ_b being the log-loss of block b by Student's t, had its samples been left out of the fit. Of white residuals this is
 the extended Bayesian information criterion (Chen & Chen 2008). Where residuals are no noise, blocks differ, the
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,12 +36,13 @@ class Score:
 
     losses: Tensor  # (B,) sums over the samples of a block
     count: int  # N, numbers in q
-    numbers: int  # k of the model
+    numbers: float  # k of the model: of those with a prior what the data tell
+    choices: int  # c, how many offers it has taken
     rms: float  # of held-out residuals, in units of q over the balance
-    zeros: int = 0  # further numbers, which come together: zeros of sensors
+    zeros: int = 0  # further numbers, which are one choice for all: zeros of sensors
 
     def replaces(self, simple: Score, offered: int) -> bool:
-        """Whether this richer model replaces a simpler one, of so many numbers that are offered."""
+        """Whether this richer model replaces a simpler one, where there are so many offers."""
         return self.gain(simple, offered) > 0
 
     def gain(self, simple: Score, offered: int) -> float:
@@ -50,27 +52,30 @@ class Score:
         return float(by_block.sum()) - self.price(offered) + simple.price(offered) - error
 
     def price(self, offered: int) -> float:
-        """½ k log N + log C(K, k); numbers that come together are one choice."""
-        chosen = math.log(math.comb(offered, self.numbers))
+        """½ k log N + log (C over c)."""
+        chosen = math.log(math.comb(offered, self.choices))
         return (self.numbers + self.zeros) * math.log(self.count) / 2 + chosen
 
 
-def score(problem: ShootingProblem, path: Path, theta: Tensor, numbers: int, floor: float) -> Score:
+def score(
+    problem: ShootingProblem, path: Path, theta: Tensor, numbers: float, choices: int, floor: float
+) -> Score:
     """The score of a fit; misfits below `floor`, in units of q over the balance, are rounding."""
     block = blocks(problem.data).to(theta.device)
     r = held_out_residuals(problem, path, theta, block)
-    return _of_residuals(r, block, problem.data.q.numel(), numbers, floor)
+    return _of_residuals(r, block, floor, count=problem.data.q.numel(), numbers=numbers, choices=choices)
 
 
-def free_run_score(problem: ShootingProblem, path: Path, numbers: int, floor: float) -> Score:
+def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float) -> Score:
     """The score over the samples that a fit has not used, which a free run over whole trajectories foretells."""
     unseen = ~problem.used
     block = torch.where(unseen, torch.cumsum(unseen, 0) - 1, 0) * BLOCKS // max(1, int(unseen.sum()))
     block = torch.where(unseen, block, -1)
-    return _of_residuals(problem.misfit(path), block, int(unseen.sum()) * problem.n, numbers, floor)
+    count = int(unseen.sum()) * problem.n
+    return _of_residuals(problem.misfit(path), block, floor, count=count, numbers=numbers, choices=choices)
 
 
-def _of_residuals(r: Tensor, block: Tensor, count: int, numbers: int, floor: float) -> Score:
+def _of_residuals(r: Tensor, block: Tensor, floor: float, **model: Any) -> Score:
     """Of residuals (N, n) over the balance in blocks (N,); −1: in none."""
     inside = block >= 0
     losses = torch.zeros(int(block.max()) + 1, dtype=r.dtype, device=r.device)
@@ -78,7 +83,7 @@ def _of_residuals(r: Tensor, block: Tensor, count: int, numbers: int, floor: flo
         scale = max(_scale(own[inside]), floor)
         loss = math.log(scale) + (FREEDOM + 1) / 2 * torch.log1p((own / scale).square() / FREEDOM)
         losses.index_add_(0, block[inside], loss[inside].nan_to_num(nan=WORST, posinf=WORST))
-    return Score(losses, count, numbers, float(r[inside].square().mean().sqrt()))
+    return Score(losses, rms=float(r[inside].square().mean().sqrt()), **model)
 
 
 def blocks(data: Trajectories) -> Tensor:

@@ -70,11 +70,11 @@ class Search:
             return None if found is None else self.settled(self.finer(fitter.leap(found)))
         part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
-        best = self.climbed(fitter.simple, {})
+        best = self.climbed(fitter, fitter.simple, {})
         part(MORE_TERMS)
         ends = [best]
         if (best is None or not best.at_the_noise) and (start := self.linear_start(fitter)) is not None:
-            ends.append(self.climbed(*start))
+            ends.append(self.climbed(fitter, *start))
             best = self.better(best, ends[-1])
         if best is None:
             return None
@@ -86,7 +86,11 @@ class Search:
         best = self.better(best, ends[-1])
         if best is not None and best is not ends[-1]:
             ends.append(best := self.settled(best, swapped=True))
-        return self.stuck(best and self.braking(self.finalist(best, ends)))
+        ends.append(best := self.stuck(best and self.braking(best)))
+        if best is not None and not best.at_the_noise:
+            ends.append(self.functional(best))
+            best = self.better(best, ends[-1])
+        return best and self.braking(self.finalist(best, ends))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
         """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
@@ -98,12 +102,13 @@ class Search:
             return best
         fitter = best.fitter
         simple = fitter.fit(fitter.simple, best.values, best.length, best, 2 * ITERATIONS)
-        others = {end.taken: end for end in (simple, *ends) if end is not None and end.length == best.length}
+        every = (end for end in (simple, *ends) if end is not None and end.length == best.length)
+        others = {(end.fitter.variant, end.taken): end for end in every}
         scored = [(end, end.fitter.foretold(end)) for end in others.values()]
         scored = sorted(((end, x) for end, x in scored if x is not None), key=lambda pair: pair[1].numbers)
-        winner, least = best, None
+        winner, least, offered = best, None, max(end.fitter.offered for end in others.values())
         for end, found in scored:
-            if least is None or found.replaces(least, fitter.offered):
+            if least is None or found.replaces(least, offered):
                 winner, least = end, found
         return winner
 
@@ -117,11 +122,15 @@ class Search:
         base = started(self.base, self.data, start.values, fitter.settings)
         numbers = ParameterVector(build_model(base, fitter.settings, "none"))
         values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
-        return [offer.name for offer in fitter.offers if values[offer.numbers[0]] != 0], values
+        return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
 
-    def climbed(self, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
+    def functional(self, best: Trial) -> Trial | None:
+        """The simplest model with functions of the coordinates, and what named terms it has beside these."""
+        fitter = self.fitter(replace(best.fitter.variant, sticking=False, functions=True))
+        return self.climbed(fitter, fitter.simple, {})
+
+    def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
         """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
-        fitter = self.fitter(Variant(self.order))
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
         while trial is not None:
             trial = self.finer(trial)
@@ -174,15 +183,13 @@ class Search:
         return None
 
     def simpler(self, trial: Trial) -> Trial | None:
-        """With fewer offers, half of them at first, those that the quadratic model misses least; None: none go."""
-        fitter, order = trial.fitter, order_of(trial)
-        count = len(order) // 2
-        while count > 0:
-            most = 2 * self.most if count > 1 else self.most
-            less = fitter.fit(trial.taken - set(order[:count]), trial.values, trial.length, trial, most)
+        """With fewer offers, half of them at first, or as many as the quadratic model says; None: none go."""
+        fitter, (order, best) = trial.fitter, order_of(trial)
+        halves = [len(order) >> k for k in range(1, len(order).bit_length())]
+        for count in sorted({*halves, best} - {0}, reverse=True):
+            less = fitter.fit(trial.taken - set(order[:count]), trial.values, trial.length, trial, self.most)
             if less is not None and not trial.replaces(less):
                 return less
-            count //= 2
         return None
 
     def finer(self, trial: Trial) -> Trial:

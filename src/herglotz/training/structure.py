@@ -109,7 +109,7 @@ def kept_structure(
     name: str, find: Callable[[], Structure], base: Baseline, config: FitConfig, stages: Stages
 ) -> Structure:
     """What `find` finds, or what the checkpoint remembers of it under this name."""
-    numbers = ("stiffness", "tilt", "rate", "start", "model_step")
+    numbers = ("stiffness", "tilt", "rate", "start", "spreads", "model_step")
 
     def search() -> dict[str, Any]:
         found = find()

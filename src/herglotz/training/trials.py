@@ -21,6 +21,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
+from herglotz.training.functions import bands, with_functions
 from herglotz.training.named_terms import candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
@@ -28,6 +29,7 @@ from herglotz.training.problems.grid import segment_grid, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.robust import scale_of
 from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.pruning import inverse_of
 from herglotz.training.score import Score, free_run_score, score
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
@@ -50,6 +52,7 @@ class Variant:
     order: int
     substeps: int = 1
     sticking: bool = False
+    functions: bool = False  # of the coordinates, beside named terms
 
 
 class Compared(NamedTuple):
@@ -105,7 +108,7 @@ class Trial:
     @cached_property
     def score(self) -> Score:
         """Its loss over held-out blocks."""
-        found = score(self.problem, self.path, self.theta, self.problem.P, self.fitter.floor)
+        found = score(self.problem, self.path, self.theta, self.told, len(self.taken), self.fitter.floor)
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
         return found
 
@@ -117,7 +120,7 @@ class Trial:
         """By how much it does; infinite where it follows longer segments."""
         if self.length != simple.length:
             return math.inf if self.length > simple.length else -math.inf
-        return self.score.gain(simple.score, self.fitter.offered)
+        return self.score.gain(simple.score, max(self.fitter.offered, simple.fitter.offered))
 
     def with_zeros(self, count: int) -> Trial:
         """The same, scored as a model with so many zeros of sensors beside its numbers."""
@@ -138,6 +141,39 @@ class Trial:
         finite = found is not None and bool(torch.isfinite(found[0]).all()) and bool(torch.isfinite(found[1]).all())
         return (found[0] * by, found[1] * by) if finite and found is not None else None
 
+    @property
+    def prior(self) -> Gaussian:
+        """Of its numbers."""
+        assert isinstance(self.problem.prior, Gaussian)
+        return self.problem.prior
+
+    @cached_property
+    def functions(self) -> dict[str, tuple[list[int], float]]:
+        """The places of the waves of each function, and how many numbers of it the data tell (MacKay 1992)."""
+        numbers = self.problem.parameters.numbers
+        place = {name: i for i, name in enumerate(numbers)}
+        every = self.fitter.functions.items()
+        taken = {name: at for name, waves in every if (at := [place[wave] for wave in waves if wave in place])}
+        found = self.curvature(numbers) if taken else None
+        if found is None:
+            return {}
+        told = (1 - self.prior.weight * inverse_of(found[0]).diagonal()).clamp(min=0.0)
+        return {name: (at, float(told[at].sum())) for name, at in taken.items()}
+
+    @property
+    def told(self) -> float:
+        """How many of its numbers the data tell; of those without functions' priors all."""
+        return self.problem.P - sum(len(at) - told for at, told in self.functions.values())
+
+    @cached_property
+    def sizes(self) -> dict[str, float]:
+        """The variance of each function, over that of its prior, at which this fit is likeliest (MacKay 1992)."""
+        numbers, found = self.problem.parameters.numbers, {}
+        for name, (at, told) in self.functions.items():
+            weight = self.theta.new_tensor([self.fitter.weights[numbers[i]] for i in at])
+            found[name] = float((self.theta[at].square() * weight).sum()) / max(told, 1.0)
+        return {name: size for name, size in found.items() if size > 0}
+
     @cached_property
     def everything(self) -> tuple[Tensor, Tensor, dict[str, int]] | None:
         """`curvature` of the numbers of all offers, and their places."""
@@ -153,7 +189,8 @@ class Fitter:
 
     def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None):
         self.data, self.variant, self.freedom = data, variant, freedom
-        terms = candidates(data, config.translations)
+        self.bands = bands(data) if variant.functions else []
+        self.terms = terms = with_functions(candidates(data, config.translations), self.bands, data.angles)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
         base = started(base, data, first, settings)
@@ -162,30 +199,61 @@ class Fitter:
         self.model = with_sticking(model, excess=False) if variant.sticking else model
         every = ParameterVector(self.model)
         self.keys = dict(zip(every.numbers, keys_of(every.numbers, self.model.config), strict=True))
-        self.always, every_offer, self.simple = offers_of(self.model, list(self.keys.values()))
+        self.always, every_offer, self.simple = offers_of(self.model, list(self.keys.values()), self.bands)
         without_offers(self.model, every_offer)
         one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]  # is dry friction already
         self.offers = [offer for offer in every_offer if offer.name not in one_way]
         self.loads = [offer for offer in every_offer if offer.name in one_way]
         self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
-        own, self._prior = prior_of(self.model, base, None), {}
+        own, self.weights = prior_of(self.model, base, None), {}
+        self.functions: dict[str, list[str]] = {}  # the numbers of the waves of each
         for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
-            self._prior[every.numbers[i]] = spread**-2
+            self.weights[every.numbers[i]] = spread**-2
+        self.centred = self._of_waves() if self.bands else {}
+        self.weights |= self.centred
         lengths = segment_lengths(data)
         self.lengths = [*(length for length in SHORT if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
         self.floor = ALIKE * EXACT["float64"] * max(base.scale)
-        self.offered = len(self.always) + sum(len(offer.numbers) for offer in every_offer)
+        self.offered = len(every_offer)
         self.smooth, self.precision, self.spread = smoothed(data), precision(data), relative_spread(data)
         self.compared: list[Compared] = []
 
-    def prior(self, names: Collection[str]) -> Gaussian:
-        """Of these numbers, in the order of the model."""
-        own = [name for name in self.start if name in set(names)]
+    def _of_waves(self) -> dict[str, float]:
+        """1 / spread² of the coefficients of waves: forces, masses and rates of the motion's size, and continuous.
+
+        Their spreads fall with the number of the wave: of a potential a Matérn process of ν = 3/2. The lowest powers,
+        which waves could take the place of, are known to the same size.
+        """
+        base, found = self.base, {}
+        force = max(v * v / x for v, x in zip(base.speed, base.scale, strict=True))
+        rate = max(v / x for v, x in zip(base.speed, base.scale, strict=True))
+        place = {key: name for name, key in self.keys.items()}
+        for name, key in self.keys.items():
+            at = int(key.partition("[")[2].rstrip("]") or 0)
+            of_power = {"potential.stiffness": 1 / base.scale[at], "q1^2": 0.5 / base.scale[at]}
+            size = of_power.get(key.partition("[")[0])
+            if size is None and key in self.simple and key.startswith(("potential.tilt", "q1", "cos(", "sin(")):
+                size = 1.0
+            if size is not None:
+                found[name] = (force * size) ** -2
+        for band in self.bands:
+            for text, k in zip(band.texts, band.rates, strict=True):
+                size = {"V": force / k, "mass": 1.0, "damping": rate}[band.function.split("(")[0]]
+                found[place[text]] = (size * band.longest / k) ** -2
+                self.functions.setdefault(band.function, []).append(place[text])
+        return found
+
+    def prior(self, names: Collection[str], before: Trial | None = None) -> Gaussian:
+        """Of these numbers, in the order of the model; functions are as large as they are in a fit `before`."""
+        names, weights = set(names), dict(self.weights)
+        for name, scale in ({} if before is None else before.sizes).items():
+            weights |= {wave: weights[wave] / scale for wave in self.functions[name]}
+        own = [name for name in self.start if name in names]
         like = self.data.q
         return Gaussian(
             like.new_tensor([self.start[name] for name in own]),
-            like.new_tensor([self._prior.get(name, 0.0) for name in own]),
+            like.new_tensor([weights.get(name, 0.0) for name in own]),
         )
 
     def problem(self, length: int) -> ShootingProblem:
@@ -209,7 +277,7 @@ class Fitter:
         taken, every = frozenset(taken), self.problem(length)
         names = self.numbers(taken)
         sigma = every.sigma if before is None else max(before.rms, self.floor)
-        problem = every.of(names, sigma, self.prior(names))
+        problem = every.of(names, sigma, self.prior(names, before))
         names = problem.parameters.numbers
         theta = self.data.q.new_tensor([values.get(name, self.start[name]) for name in names])
         if before is None:
@@ -240,7 +308,7 @@ class Fitter:
         x = problem.pack(trial.theta, trial.path.x[:, 0, : problem.d])
         result = levenberg_marquardt(problem, x, max_iterations=2 * ITERATIONS, rtol=1e-3, patience=2, damping=NEAR)
         path = problem.solve(result.x) if math.isfinite(result.cost) else None
-        return None if path is None else free_run_score(problem, path, problem.P, self.floor)
+        return None if path is None else free_run_score(problem, path, trial.told, len(trial.taken), self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
         """Over segments of the next length; None where there is none, or the model does not follow the data so long."""

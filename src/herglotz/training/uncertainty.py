@@ -82,7 +82,8 @@ class Laplace:
             train, out, states = train.keep(~lone), out[~lone], states[~lone]
         self.freedom = FREEDOM if run.metrics.get("robust") else None
         found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
-        self.base = estimate_baseline(train, outliers=found, substeps=run.decided.substeps)
+        base = estimate_baseline(train, outliers=found, substeps=run.decided.substeps)
+        self.base = replace(base, spreads=run.metrics.get("plan", {}).get("spreads", {}))
         self.sigma = run.metrics.get("sigma") or 0.0
         if not 0 < self.sigma * self.sigma < float("inf"):
             raise InputError(f"the run's metrics have sigma {self.sigma:g}, and it must be a size > 0; fit again")

@@ -46,6 +46,10 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "forced", "alike": True, "features": ("q1", *(f"q1^{k}" for k in range(2, 7))),
         "drag": ("|v1| v1", "q1 v1", "q1^2 v1"),
     }),
+    "functions": ("l", {
+        "level": "forced", "alike": True, "drag": ("sin(0.7 q1) v1", "cos(1.4 q1) v1"),
+        "features": ("q1^2", "sin(1.3 q1 + 0.4)", "cos(2.6 q1 - 1) v1^2", "cos(q1 + 1) - cos(2 q1 - 0.5)"),
+    }),
     "one bent spring": ("l", {"alike": True, "order": 4, "features": ("|q1|^3",)}),
     "bent springs that stick": ("l", {
         "level": "forced", "alike": True, "features": ("|q1| q1", "|q1|^3", "q1^4"), "coulomb": True, "sticking": True,

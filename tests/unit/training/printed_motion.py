@@ -26,11 +26,13 @@ class Printed:
 
     def __init__(self, text, names, inputs=()):
         self.names, self.n = names, len(names)
-        joined, lines, self.words = text.replace("\n    ", " ").split("\n"), {}, ""
+        joined, lines, functions, self.words = text.replace("\n    ", " ").split("\n"), {}, {}, ""
         for line in joined:
             left, _, right = line.partition(" = ")
             if re.fullmatch(r"L|force on .*|.*″", left) and left not in lines:
                 lines[left] = right.partition(" and a network")[0]
+            elif re.fullmatch(r"f\d+\(.*\)", left):
+                functions[left] = right
             else:
                 self.words += line + " "
         symbols = {f"{name}′": f"v[{i}]" for i, name in enumerate(names)}
@@ -40,6 +42,7 @@ class Printed:
             symbols["s"] = "s"
         for distance in re.findall(r"(\S+) = √\(", self.words):
             symbols[distance] = f"np.sqrt({'+'.join(f'q[{i}]**2' for i in range(self.n))})"
+        symbols |= {name: f"({Reader(right, symbols).sum()})" for name, right in functions.items()}
         self.mass, forces = np.ones(self.n), ["0.0"] * self.n
         self.L: Any = None  # a function of q, v and s where one is printed
         of_q = list(forces)

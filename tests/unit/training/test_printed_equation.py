@@ -24,6 +24,9 @@ from herglotz.training.recorded_range import box_of
 NOISE, H = 1e-3, 0.02
 TWICE = 3**0.5  # of the misfit: a motion that is so far from the model's is twice as far from the data
 
+WAVES = tuple(f"sin({0.4 * k:.2g} q1 - {4 - 0.4 * k:.3g})" for k in range(1, 9))  # of a function
+FALLING = [0.3 / k for k in range(1, 9)]
+
 # Every kind of term: settings of the model, and the numbers of its parameters. Each number moves the motion by far more
 # than the noise, so that a text without it, or with another one in its place, fails.
 MODELS: dict[str, tuple[dict[str, Any], dict[str, list[float]]]] = {
@@ -67,6 +70,13 @@ MODELS: dict[str, tuple[dict[str, Any], dict[str, list[float]]]] = {
          "features": ("cos(q1 - q2) v1 v2",), "stiffness": (1.0, 0.7)},
         {"kinetic.base.off_diagonal": [0.2], "coupling.viscous": [-0.1], "friction.viscous": [0.2, 0.15],
          "kinetic.sum.coefficient": [0.3]},
+    ),
+    "functions": (
+        {"angles": (False,), "alike": True, "stiffness": (0.0,), "level": "forced",
+         "features": ("q1^2", *WAVES, *(f"{wave} v1^2" for wave in WAVES)),
+         "drag": tuple(f"{f}({k} q1) v1" for k in (0.5, 1.0, 1.5, 2.0) for f in ("cos", "sin"))},
+        {"potential.features.sum.coefficient": [0.5, *FALLING], "kinetic.sum.coefficient": FALLING,
+         "drag.coefficient": [0.02] * 8},
     ),
     "translations": (
         {"angles": (False, False), "alike": True, "translations": ("q1 + 3q2",), "stiffness": (1.0, 2.0)}, {},

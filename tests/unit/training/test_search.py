@@ -176,14 +176,20 @@ def test_a_start_without_a_path_is_none():
 )
 def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, replaces):
     # fails if a price is left out, or if one block alone decides
-    simple = Score(torch.tensor(gains), 400, 3, 1.0)
-    rich = Score(torch.zeros(10), 400, 3 + more, 1.0)
+    simple = Score(torch.tensor(gains), 400, 3.0, 3, 1.0)
+    rich = Score(torch.zeros(10), 400, 3.0 + more, 3 + more, 1.0)
     assert rich.replaces(simple, 80) is replaces
+
+
+def test_numbers_that_come_together_are_one_choice():
+    # fails if a function of many waves is as unlikely a choice as so many terms, or its numbers are free
+    one, band = Score(torch.zeros(10), 400, 4.0, 4, 1.0), Score(torch.zeros(10), 400, 11.0, 4, 1.0)
+    assert band.price(53) - one.price(53) == pytest.approx(3.5 * math.log(400))
 
 
 def test_zeros_are_numbers_that_come_together():
     # fails if many recordings have more zeros than there are offers, or zeros are free
-    plain = Score(torch.zeros(10), 400, 9, 1.0)
+    plain = Score(torch.zeros(10), 400, 9.0, 9, 1.0)
     with_zeros = replace(plain, zeros=100)
     assert with_zeros.price(53) - plain.price(53) == pytest.approx(50 * math.log(400))
 
@@ -218,7 +224,7 @@ def test_a_block_that_is_lost_weighs_no_more_than_it_may():
     fitter = search.fitter(Variant(2))
     found = there(fitter.fit({"q1^2"}, {}, 5, None))
     found.path.x[-1, -1, 0] = 1e12
-    assert bool(torch.isfinite(score(found.problem, found.path, found.theta, 2, 1e-9).losses).all())
+    assert bool(torch.isfinite(score(found.problem, found.path, found.theta, 2.0, 1, 1e-9).losses).all())
 
 
 def test_a_search_of_many_samples_is_made_of_some(monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
@@ -10,6 +12,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.models.jet import coordinates
 from herglotz.models.terms import AffineDamping
 from herglotz.training.baseline import Baseline
+from herglotz.training.dictionary import keys_of
 from herglotz.training.parameter_vector import ParameterVector
 
 # Parameters of order one, by the beginning of their names.
@@ -47,7 +50,7 @@ class Prior:
     * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
       friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²),
       its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their start, 0.5²).
-    * Terms by name (`herglotz.models.Term`) state their own spread.
+    * Terms by name (`herglotz.models.Term`) state their own spread, and those of functions have `spreads`, around 0.
     """
 
     def __init__(
@@ -59,9 +62,13 @@ class Prior:
         departure: float | None,
         weight: float = 10.0,
         rate_spread: float = 1.0,
+        spreads: Mapping[str, float] | None = None,
     ):
         self.parameters = ParameterVector(model)
         self.start, self.departure = self.parameters.get(), departure
+        keys = keys_of(self.parameters.numbers, model.config) if spreads else []
+        self.waves = {i: spreads[key] for i, key in enumerate(keys) if spreads and key in spreads}
+        self.start[list(self.waves)] = 0.0
         points = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True)
         unit = points.draw(min(EACH * len(low), MOST)).to(low)
         speed = low.new_tensor(model.config.speed)
@@ -115,6 +122,7 @@ class Prior:
                 for i, term in enumerate(model.named_terms)
                 if term.spread is not None
             ),
+            *((torch.tensor([i]), spread) for i, spread in self.waves.items()),
         ]
         index = torch.cat([index for index, _ in spreads]).to(self.start.device)
         return index, torch.cat([self.start.new_full((len(index),), spread) for index, spread in spreads])
@@ -146,7 +154,9 @@ class Prior:
 def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Prior:
     """The prior of every objective, sized by the data: rates are known to 0.3 of the slowest coordinate's own rate."""
     typical = min(v / s for v, s in zip(base.speed, base.scale, strict=True))
-    return Prior(model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical)
+    return Prior(
+        model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical, spreads=base.spreads
+    )
 
 
 class _Departures(torch.nn.Module):

@@ -1,0 +1,122 @@
+"""Functions of the coordinates that no named term says, as sums of waves with a Gaussian prior.
+
+A Gaussian process on an interval is a sum of the waves that vanish at its ends, each with a coefficient of its own
+(Solin & Särkkä 2020, Hilbert-space methods for reduced-rank Gaussian process regression): smooth functions need the
+longest waves alone. The interval is `REACH` times as long as what was recorded, so that its ends lie outside. On an
+angle they are whole waves, which are periodic. They join a model in bands, the longest waves first: the search takes as
+many as held-out time asks for, and every wave is a named term, which is stepped, printed and exported like any other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
+
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.models.features import parse
+from herglotz.training.named_terms import NamedTerms, own_terms
+
+REACH = 1.5  # times the recorded interval
+POTENTIAL = (8, 16, 32, 48)  # where the bands of a potential end, by the number of the wave
+MASS = (4, 8)
+DAMPING = (2, 4)
+
+
+class Band(NamedTuple):
+    """Waves that join a model together."""
+
+    function: str  # V(q1), damping(q1), mass(q1)
+    name: str  # the same with the numbers of the waves
+    texts: tuple[str, ...]
+    rates: tuple[float, ...]  # of each wave, per unit of its coordinate
+    longest: float  # that of the longest wave of the function
+
+
+def bands(data: Trajectories) -> list[Band]:
+    """All functions that these coordinates may be given beside their named terms."""
+    found: list[Band] = []
+    several = data.dof > 1
+    for i, angle in enumerate(data.angles):
+        own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], POTENTIAL[-1])
+        first = 2 if several else 4  # harmonics that are no named terms yet
+        ends = POTENTIAL[:2] if several or angle else POTENTIAL
+        found += _split(f"V(q{i + 1})", own[2 * (first - 1) :] if angle else own, ends, 2 if angle else 1)
+        around = _harmonics(i) if angle else _pairs(data, i)
+        found += _split(f"damping(q{i + 1})", [(f"{x} v{i + 1}", k) for x, k in around], DAMPING, 2)
+        if not several:
+            found += _split(f"mass(q{i + 1})", [(_moving(x, "v1^2"), k) for x, k in own], MASS, 2 if angle else 1)
+    for i, j in combinations(range(data.dof), 2):
+        if data.angles[i] or data.angles[j]:
+            continue
+        between = _waves(data, [(j, 1.0), (i, -1.0)], POTENTIAL[1])
+        found += _split(f"V(q{j + 1} - q{i + 1})", between, POTENTIAL[:2], 1)
+    return found
+
+
+def with_functions(terms: NamedTerms, every: list[Band], angles: tuple[bool, ...]) -> NamedTerms:
+    """The terms with all waves of these bands, which take the place of powers in the potential but the lowest."""
+    own = own_terms(angles)
+    kept = [
+        text for text in terms.features
+        if not every or "v" in text or text in own or parse(text, angles)[0].function in ("cos", "sin")
+    ]  # fmt: skip
+    texts = [text for band in every for text in band.texts]
+    drag = tuple(text for band in every if band.function.startswith("damping") for text in band.texts)
+    still = NamedTerms(tuple(text for text in texts if text not in drag), drag)
+    return replace(terms, features=tuple(kept)).joined(still)
+
+
+def _split(name: str, waves: list[tuple[str, float]], ends: tuple[int, ...], each: int) -> Iterator[Band]:
+    """Waves, `each` of them for one number, in bands that end at these numbers."""
+    first = 0
+    for end in ends:
+        part = waves[first : end * each]
+        if part:
+            texts, rates = zip(*part, strict=True)
+            yield Band(name, f"{name}, waves {first // each + 1}-{end}", texts, rates, min(k for _, k in waves))
+        first = end * each
+
+
+def _interval(data: Trajectories, form: list[tuple[int, float]]) -> tuple[float, float]:
+    """Middle and half length of the interval of a linear form."""
+    x = torch.stack([w * data.q[:, i] for i, w in form]).sum(0)
+    low, high = float(x.min()), float(x.max())
+    return (low + high) / 2, REACH * (high - low) / 2
+
+
+def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> list[tuple[str, float]]:
+    """sin(k (x − a)) of a linear form x that vanish at both ends of its interval, which begins at a."""
+    middle, half = _interval(data, form)
+    found = []
+    for j in range(1, count + 1):
+        k = math.pi * j / (2 * half)
+        found.append((_wave("sin", [(i, w * k) for i, w in form], -k * (middle - half)), k))
+    return found
+
+
+def _wave(function: str, form: list[tuple[int, float]], phase: float) -> str:
+    """A wave of a linear form with a phase."""
+    parts = [(w, f" q{i + 1}") for i, w in form] + [(math.remainder(phase, 2 * math.pi), "")]
+    text = " ".join(f"{'-' if w < 0 else '+'} {abs(w):.9g}{what}" for w, what in parts)
+    return f"{function}({text.removeprefix('+ ')})"
+
+
+def _pairs(data: Trajectories, i: int) -> list[tuple[str, float]]:
+    """Waves of one coordinate whose period is its interval."""
+    rates = [math.pi * j / _interval(data, [(i, 1.0)])[1] for j in range(1, DAMPING[-1] + 1)]
+    return [(f"{f}({k:.8g} q{i + 1})", k) for k in rates for f in ("cos", "sin")]
+
+
+def _harmonics(i: int) -> list[tuple[str, float]]:
+    """Waves of whole multiples of an angle."""
+    return [(f"{f}({'' if k == 1 else k}q{i + 1})", float(k)) for k in range(1, 17) for f in ("cos", "sin")]
+
+
+def _moving(text: str, speeds: str) -> str:
+    """A function of the position times speeds, product by product."""
+    return text.replace(")", f") {speeds}")
