@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
 from typing import NamedTuple
 
 import torch
@@ -49,7 +49,11 @@ def bands(data: Trajectories) -> list[Band]:
         around = _harmonics(i) if angle else _pairs(data, i)
         found += _split(f"damping(q{i + 1})", [(f"{x} v{i + 1}", k) for x, k in around], DAMPING, 2)
         if not several:
-            found += _split(f"mass(q{i + 1})", [(_moving(x, "v1^2"), k) for x, k in own], MASS, 2 if angle else 1)
+            found += _split("mass(q1)", [(_moving(x, "v1^2"), k) for x, k in own], MASS, 2 if angle else 1)
+        elif angle:  # the first waves are named terms
+            for a, b in combinations_with_replacement(range(1, data.dof + 1), 2):
+                second = [(_moving(x, f"v{a} v{b}"), k) for x, k in own[2:4]]
+                found += _split(f"mass(q{i + 1}) of v{a} v{b}", second, (2,), 1)
     for i, j in combinations(range(data.dof), 2):
         if data.angles[i] or data.angles[j]:
             continue

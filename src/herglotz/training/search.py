@@ -45,6 +45,7 @@ class Search:
         self.order = 4 if is_precise(data) and data.dof == 1 else 2
         self.fitters: dict[Variant, Fitter] = {}
         self.tried, self.most = TRIED, ITERATIONS
+        self.part: Search | None = None  # of a long recording, which a search is made of
         self.finest = max(1, min(FINEST, STEPS // data.samples))
 
     def fitter(self, variant: Variant) -> Fitter:
@@ -58,16 +59,10 @@ class Search:
         """The model that held-out time asks for; None where not even the shortest segments can be followed."""
         few = self.data.liveliest(PART)
         if few.samples < self.data.samples / 2:
-            search = Search(few, self.base, self.config, outliers=self.freedom is not None)
-            search.order = self.order
-            found = search.run()
-            if found is None:
-                return None
-            fitter = self.fitter(found.fitter.variant)
-            first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
-            found = fitter.fit(found.taken, found.values, first, None)
-            self.tried, self.most = 1, FEW
-            return None if found is None else self.settled(self.finer(fitter.leap(found)))
+            self.part = Search(few, self.base, self.config, outliers=self.freedom is not None)
+            self.part.order, self.tried, self.most = self.order, 1, FEW
+            found = self.part.run()
+            return found and self.of_all(found)
         part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
         best = self.climbed(fitter, fitter.simple, {})
@@ -86,11 +81,30 @@ class Search:
         best = self.better(best, ends[-1])
         if best is not None and best is not ends[-1]:
             ends.append(best := self.settled(best, swapped=True))
-        ends.append(best := self.stuck(best and self.braking(best)))
-        if best is not None and not best.at_the_noise:
-            ends.append(self.functional(best))
-            best = self.better(best, ends[-1])
-        return best and self.braking(self.finalist(best, ends))
+        return self.stuck(best and self.braking(self.finalist(best, ends)))
+
+    def of_all(self, found: Trial) -> Trial | None:
+        """A model that was found in a part of the data, fitted to all of them."""
+        fitter = self.fitter(found.fitter.variant)
+        first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
+        other = fitter.fit(found.taken, found.values, first, None)
+        return None if other is None else self.settled(self.finer(fitter.leap(other)))
+
+    @inside()
+    def with_functions(self, best: Trial) -> Trial:
+        """A model of functions of the coordinates in the place of one of named terms, where held-out time asks for it.
+
+        It is built up as any other, from the simplest model with the functions among its offers.
+        """
+        if best.at_the_noise or self.config.translations:
+            return best
+        part(MORE_TERMS)
+        search = self.part or self
+        fitter = search.fitter(replace(best.fitter.variant, sticking=False, functions=True))
+        other = search.climbed(fitter, fitter.simple, {})
+        other = self.of_all(other) if other is not None and self.part is not None else other
+        better = self.better(best, other)
+        return best if better is None else self.braking(self.finalist(better, (best, other)))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
         """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
@@ -123,11 +137,6 @@ class Search:
         numbers = ParameterVector(build_model(base, fitter.settings, "none"))
         values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
         return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
-
-    def functional(self, best: Trial) -> Trial | None:
-        """The simplest model with functions of the coordinates, and what named terms it has beside these."""
-        fitter = self.fitter(replace(best.fitter.variant, sticking=False, functions=True))
-        return self.climbed(fitter, fitter.simple, {})
 
     def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
         """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
@@ -187,7 +196,8 @@ class Search:
         fitter, (order, best) = trial.fitter, order_of(trial)
         halves = [len(order) >> k for k in range(1, len(order).bit_length())]
         for count in sorted({*halves, best} - {0}, reverse=True):
-            less = fitter.fit(trial.taken - set(order[:count]), trial.values, trial.length, trial, self.most)
+            most = 2 * self.most if count > 1 else self.most
+            less = fitter.fit(trial.taken - set(order[:count]), trial.values, trial.length, trial, most)
             if less is not None and not trial.replaces(less):
                 return less
         return None

@@ -134,6 +134,7 @@ def search(
     found = wanted.run()
     if wanted.better_on_a_line(found):  # which a search of its own finds again, with inputs and sizes of its own
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
+    found = found and wanted.with_functions(found)
     if found is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     noise = precision(data)

@@ -6,6 +6,7 @@ A model is a set of offers (`offers`), fitted by multiple shooting over segments
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -239,10 +240,16 @@ class Fitter:
                 found[name] = (force * size) ** -2
         for band in self.bands:
             for text, k in zip(band.texts, band.rates, strict=True):
-                size = {"V": force / k, "mass": 1.0, "damping": rate}[band.function.split("(")[0]]
+                size = {"V": force / k, "mass": self._mass_of(text), "damping": rate}[band.function.split("(")[0]]
                 found[place[text]] = (size * band.longest / k) ** -2
                 self.functions.setdefault(band.function, []).append(place[text])
         return found
+
+    def _mass_of(self, text: str) -> float:
+        """The size of a mass between the two speeds in a text, of which the first one's own is 1."""
+        balance = self.data.balance
+        speeds = [int(x) - 1 for x in re.findall(r"v(\d+)", text)]
+        return float((balance[0] / balance[speeds]).prod()) if len(speeds) == 2 else 1.0
 
     def prior(self, names: Collection[str], before: Trial | None = None) -> Gaussian:
         """Of these numbers, in the order of the model; functions are as large as they are in a fit `before`."""
