@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 AGAIN = 0.2  # seconds between two drawings of a bar whose time goes on
 # How much of a fit's time is over where a part of it begins and ends: medians of 19 systems of `zoo.py --draw 9301`.
-LOOKING, FINDING, RIVALS, STAGES = (0.0, 0.05), (0.05, 0.65), (0.65, 0.68), (0.66, 0.98)
+LOOKING, FINDING, STAGES = (0.0, 0.05), (0.05, 0.65), (0.66, 0.98)
 FIRST_TERMS, MORE_TERMS, FEWER_TERMS = (0.0, 0.65), (0.65, 0.7), (0.7, 1.0)  # of FINDING
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from herglotz.data.holds import lagrange
 from herglotz.data.trajectories import Trajectories
 
 SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
@@ -75,35 +72,3 @@ def coarse(data: Trajectories) -> bool:
 def precisions(data: Trajectories) -> Tensor:
     """`precision` of every coordinate, (n,)."""
     return torch.stack([_residuals(data, degree) for degree in DEGREES]).amin(0)
-
-
-THINNINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # tried until one misses too much
-SMOOTH = 1e-3  # of the spread: what samples left out may miss by; a sine then has 14 samples a period
-ENOUGH = 500  # samples that stay
-
-
-def sparsest(data: Trajectories) -> int:
-    """Return the largest m at which every m-th sample tells the motion.
-
-    Cubics in time through two kept samples before and two behind miss those halfway between by less than a thousandth
-    of the spread, RMS. Noise counts as motion: recordings that are noisier keep every sample.
-    """
-    spread = relative_spread(data)
-    found = 1
-    for every in THINNINGS:
-        if every * ENOUGH > data.samples or not _missed(data, every) <= SMOOTH * spread:
-            break
-        found = every
-    return found
-
-
-def _missed(data: Trajectories, every: int) -> float:
-    """By how much such cubics miss, RMS over the balance; inf where no trajectory has four kept samples."""
-    firsts = zip(data.offsets, data.lengths, strict=True)
-    rows = torch.cat([torch.arange(first, first + length - 3 * every, every) for first, length in firsts])
-    if not len(rows):
-        return math.inf
-    at, middle = rows[:, None] + every * torch.arange(4), rows + every + every // 2
-    t, q = data.t.double().cpu(), (data.q / data.balance).double().cpu()
-    weights = lagrange(t[at] - t[middle][:, None])
-    return float(((weights[..., None] * q[at]).sum(1) - q[middle]).square().mean().sqrt())

@@ -80,18 +80,6 @@ def unseen_errors(run: Run) -> list[Tensor]:
     return [error[first + trained : first + length] for first, length, trained in rows]
 
 
-def free_run_errors(task: Task, seen: Look, fitted: Fitted) -> Tensor:
-    """Errors of the free run over the unseen part, over the coordinates' balance; inf where it breaks off.
-
-    Single spikes are left out.
-    """
-    fitted = replace(fitted, states=_with_dropped(fitted, seen.train, seen.spikes))
-    states, _ = states_everywhere(fitted, seen.data, seen.train.lengths, task.base.model_step)
-    _, free = _errors(fitted, task, seen, seen.spikes, states)
-    lost = seen.data.q.new_full((1, seen.data.dof), math.inf)
-    return lost if free is None or not bool(free.isfinite().all()) else free / seen.train.balance
-
-
 def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
     """Return states at all training samples; a sample left out of the fit is reached from the sample before."""
     u, out = step_inputs(fitted.model, train), fitted.states.new_empty(train.samples, 2 * train.dof + 1)

@@ -31,7 +31,6 @@ from herglotz.training.look import look, on_a_line
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
 from herglotz.training.push import pushes
-from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages
@@ -136,8 +135,6 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
     started = time.perf_counter()
     with stages.bar:
         seen = look(data, config, stages, plan)
-        if plan is None and seen.found is not None and seen.found.doubt:
-            seen, plan = held_out_winner(data, config, stages, seen)
         plan = plan or choose(seen, config)
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)

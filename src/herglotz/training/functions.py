@@ -10,15 +10,18 @@ many as held-out time asks for, and every wave is a named term, which is stepped
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.models.features import parse
+from herglotz.training.baseline import Baseline
 from herglotz.training.named_terms import NamedTerms, own_terms
 
 REACH = 1.5  # times the recorded interval
@@ -73,6 +76,28 @@ def with_functions(terms: NamedTerms, every: list[Band], angles: tuple[bool, ...
     drag = tuple(text for band in every if band.function.startswith("damping") for text in band.texts)
     still = NamedTerms(tuple(text for text in texts if text not in drag), drag)
     return replace(terms, features=tuple(kept)).joined(still)
+
+
+def spreads_of(every: list[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
+    """Prior deviations, by what a number is: forces, masses and rates of the motion's own size, and continuous.
+
+    Deviations fall with the number of the wave: of a potential that is a Matérn process of ν = 3/2. The lowest
+    `powers`, whose place waves could take, are known to the same size.
+    """
+    found: dict[str, float] = {}
+    force = max(v * v / x for v, x in zip(base.speed, base.scale, strict=True))
+    rate = max(v / x for v, x in zip(base.speed, base.scale, strict=True))
+    for key in powers if every else ():
+        stem, _, at = key.partition("[")
+        scale = base.scale[int(at.rstrip("]") or 0)]
+        found[key] = force * {"potential.stiffness": 1 / scale, "q1^2": 0.5 / scale}.get(stem, 1.0)
+    for band in every:
+        for text, k in zip(band.texts, band.rates, strict=True):
+            speeds = [int(x) - 1 for x in re.findall(r"v(\d+)", text)]
+            mass = float((balance[0] / balance[speeds]).prod()) if len(speeds) == 2 else 1.0
+            size = {"V": force / k, "mass": mass, "damping": rate}[band.function.split("(")[0]]
+            found[text] = size * band.longest / k
+    return found
 
 
 def _split(name: str, waves: list[tuple[str, float]], ends: tuple[int, ...], each: int) -> Iterator[Band]:

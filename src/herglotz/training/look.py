@@ -92,16 +92,12 @@ class Look:
         return c.objective == "auto" and c.supervision == "q" and self.baseline_motion is None and not c.sticking
 
 
-def look(
-    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None = None, *, named: bool = True,
-    zeros: tuple[float, ...] = (),
-) -> Look:  # fmt: skip
-    """Measure what the choice of a plan, or a given plan, needs; `named`: search for a model of named terms too.
+def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None = None) -> Look:
+    """Measure what the choice of a plan, or a given plan, needs.
 
-    `zeros` are those of the sensors, where the recordings differ in them (`herglotz.training.sensor_zeros`). Raise
-    InputError if the data cannot be used, or do not suit the settings.
+    Raise InputError if the data cannot be used, or do not suit the settings.
     """
-    seen = _seen(data, user_settings, stages, plan, named, zeros)
+    seen = _seen(data, user_settings, stages, plan, ())
     found = seen.found
     if found is None or not (found.hold or found.zeros or not found.turning):
         return seen
@@ -110,7 +106,7 @@ def look(
     data = data if found.turning else on_a_line(data)
     stages = stages.labelled(stages.label + "".join(said))
     data = replace(data, hold=found.hold) if found.hold else data
-    again = _seen(data, user_settings, stages, plan, named, found.zeros or zeros)
+    again = _seen(data, user_settings, stages, plan, found.zeros)
     if found.hold:
         why = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
         again = replace(again, why_arrival=seen.why_arrival | {"hold": why})
@@ -123,9 +119,9 @@ def on_a_line(data: Trajectories) -> Trajectories:
 
 
 def _seen(
-    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None, named: bool,
-    zeros: tuple[float, ...],
-) -> Look:  # fmt: skip
+    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None, zeros: tuple[float, ...]
+) -> Look:
+    """What `look` gives of sensors with these zeros (`herglotz.training.sensor_zeros`)."""
     settings = user_settings.resolved(data)
     zeros = zeros if plan is None else plan.zeros
     said, (data, arrival, why_arrival) = data, _read(measured(data, zeros), settings)
@@ -144,7 +140,7 @@ def _seen(
         noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
     if plan is None:
-        seen = _with_terms(seen, user_settings, stages, named, _other_holds(said, arrival))
+        seen = _with_terms(seen, user_settings, stages, _other_holds(said, arrival))
     else:
         seen = replace(seen, base=plan.started(base))
         if plan.network == "covered":
@@ -172,10 +168,10 @@ def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Traje
     return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
 
 
-def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, named: bool, holds: Sequence[str]) -> Look:
+def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, holds: Sequence[str]) -> Look:
     """Named terms that follow trajectories, or terms of a dictionary of features, or those of the baseline."""
     kept, base, settings = seen.kept, seen.base, seen.settings
-    if named and terms_are_free(kept, user_settings):
+    if terms_are_free(kept, user_settings):
         # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
         plain = replace(settings, sticking=settings.sticking or user_settings.sticking)
         find = lambda: search(kept, base, plain, outliers=seen.outliers, holds=holds)  # noqa: E731

@@ -16,7 +16,7 @@ from torch import Tensor
 from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.seal import check_seal, sealed_zip
 from herglotz.errors import InputError
-from herglotz.progress import FINDING, LOOKING, RIVALS, STAGES, FitBar
+from herglotz.progress import FINDING, LOOKING, STAGES, FitBar
 from herglotz.schema import check_entries
 from herglotz.telling import tell
 from herglotz.training.distributed import is_first
@@ -109,9 +109,8 @@ class Stages:
         """Plain values that something else than an optimisation finds; those of the checkpoint where it has them."""
         name += self.label
         if name not in self.kept:
-            began, rival = time.monotonic(), name.startswith("held out")
-            told = name if rival else f"search for {name}"
-            self.bar.part(RIVALS if rival else FINDING, told)
+            began, told = time.monotonic(), f"search for {name}"
+            self.bar.part(FINDING, told)
             self.kept[name] = make()
             if self.lines:
                 tell(f"{told}: {time.monotonic() - began:.1f} s")

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import AT_THE_NOISE, precision, roughness
+from herglotz.data.roughness import precision, roughness
 from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
@@ -63,7 +63,6 @@ class Structure(NamedTuple):
     base: Baseline  # with starting values
     reason: str  # in words and numbers
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
-    doubt: bool = False  # another model may fit better: held-out free runs decide
     zeros: tuple[float, ...] = ()  # (B · n) of the sensors, which differ between recordings; found terms are without
     why_zeros: str = ""  # them in words
     turning: bool = True  # angles turn; False: these terms are those of positions on a line, as of a free spring
@@ -146,11 +145,10 @@ def search(
     miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, limit))
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
-    doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
     zeros, why, compared = (), "", wanted.compared(found)
     if (differ := wanted.zeros(found)) is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
-    return Structure(settings, base, words, found.rms, doubt, zeros, why, True, compared, wanted.held(found, holds))
+    return Structure(settings, base, words, found.rms, zeros, why, True, compared, wanted.held(found, holds))
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

@@ -6,7 +6,6 @@ A model is a set of offers (`offers`), fitted by multiple shooting over segments
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +21,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
-from herglotz.training.functions import bands, with_functions
+from herglotz.training.functions import bands, spreads_of, with_functions
 from herglotz.training.named_terms import candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
@@ -207,10 +206,14 @@ class Fitter:
         self.loads = [offer for offer in every_offer if offer.name in one_way]
         self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
         own, self.weights = prior_of(self.model, base, None), {}
+        place = {key: name for name, key in self.keys.items()}
         self.functions: dict[str, list[str]] = {}  # the numbers of the waves of each
+        for band in self.bands:
+            self.functions.setdefault(band.function, []).extend(place[text] for text in band.texts)
         for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
             self.weights[every.numbers[i]] = spread**-2
-        self.centred = self._of_waves() if self.bands else {}
+        spreads = spreads_of(self.bands, base, data.balance, [key for key in place if self._is_power(key)])
+        self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}
         self.weights |= self.centred
         lengths = segment_lengths(data)
         self.lengths = [*(length for length in SHORT if length < lengths[0]), *lengths]
@@ -220,36 +223,9 @@ class Fitter:
         self.smooth, self.precision, self.spread = smoothed(data), precision(data), relative_spread(data)
         self.compared: list[Compared] = []
 
-    def _of_waves(self) -> dict[str, float]:
-        """1 / spread² of the coefficients of waves: forces, masses and rates of the motion's size, and continuous.
-
-        Their spreads fall with the number of the wave: of a potential a Matérn process of ν = 3/2. The lowest powers,
-        which waves could take the place of, are known to the same size.
-        """
-        base, found = self.base, {}
-        force = max(v * v / x for v, x in zip(base.speed, base.scale, strict=True))
-        rate = max(v / x for v, x in zip(base.speed, base.scale, strict=True))
-        place = {key: name for name, key in self.keys.items()}
-        for name, key in self.keys.items():
-            at = int(key.partition("[")[2].rstrip("]") or 0)
-            of_power = {"potential.stiffness": 1 / base.scale[at], "q1^2": 0.5 / base.scale[at]}
-            size = of_power.get(key.partition("[")[0])
-            if size is None and key in self.simple and key.startswith(("potential.tilt", "q1", "cos(", "sin(")):
-                size = 1.0
-            if size is not None:
-                found[name] = (force * size) ** -2
-        for band in self.bands:
-            for text, k in zip(band.texts, band.rates, strict=True):
-                size = {"V": force / k, "mass": self._mass_of(text), "damping": rate}[band.function.split("(")[0]]
-                found[place[text]] = (size * band.longest / k) ** -2
-                self.functions.setdefault(band.function, []).append(place[text])
-        return found
-
-    def _mass_of(self, text: str) -> float:
-        """The size of a mass between the two speeds in a text, of which the first one's own is 1."""
-        balance = self.data.balance
-        speeds = [int(x) - 1 for x in re.findall(r"v(\d+)", text)]
-        return float((balance[0] / balance[speeds]).prod()) if len(speeds) == 2 else 1.0
+    def _is_power(self, key: str) -> bool:
+        """Whether a number is that of the lowest powers or waves of a potential, which every simplest model has."""
+        return key in self.simple and not key.startswith("friction")
 
     def prior(self, names: Collection[str], before: Trial | None = None) -> Gaussian:
         """Of these numbers, in the order of the model; functions are as large as they are in a fit `before`."""

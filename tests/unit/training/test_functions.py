@@ -41,6 +41,13 @@ def well(q):
     return 2 * np.tanh(3 * q) - 6 * (q - 0.3) * np.exp(-(((q - 0.3) / 0.2) ** 2) / 2)
 
 
+def ended(search):
+    """The model that a search ends in."""
+    named = search.run()
+    assert named is not None
+    return search.with_functions(named)
+
+
 STARTS = [(0.9, 0.0), (-0.7, 0.6), (0.5, -0.9), (-0.4, 0.2)]
 
 
@@ -49,7 +56,7 @@ def searched():
     """A search over motion in the well, which is damped by position, and the model that it ends in."""
     data = recorded(lambda q, v: -well(q) - (0.05 + 0.3 * np.exp(-4 * q * q)) * v, STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    return search, search.run()
+    return search, ended(search)
 
 
 def test_a_well_that_no_dictionary_holds_is_learned_as_a_function(searched):
@@ -113,8 +120,8 @@ def test_a_mass_that_turns_is_learned():
         return (0.2 * np.sin(q) * v * v - 1.2 * np.sin(q) - 0.1 * v) / (1 + 0.4 * np.cos(q))
 
     data = recorded(acceleration, [(2.5, 0.0), (-1.5, 1.0), (0.3, 2.2), (0.8, -1.8)], angle=True)
-    found = Search(data, estimate_baseline(data), FitConfig().resolved(data)).run()
-    assert found is not None
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    found = ended(search)
     assert found.at_the_noise
     assert any(name.startswith("mass(q1)") for name in found.taken)
 
@@ -126,8 +133,17 @@ def test_no_functions_where_named_terms_are_at_the_noise():
     found = search.run()
     assert found is not None
     assert found.taken == {"cos(q1)"}
+    assert search.with_functions(found) is found
     assert not any(variant.functions for variant in search.fitters)
     assert search.fitter(Variant(2)).functions == {}
+
+
+def test_joints_whose_masses_have_second_waves_have_these_offers():
+    # fails if the mass of a rotating pendulum, sin² of its angle, is no offer
+    q = torch.rand(60, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    every = bands(Trajectories.of(0.1 * torch.arange(60, dtype=torch.float64), q, angles=(True, True)))
+    found = {text for band in every for text in band.texts}
+    assert {"cos(2q2) v1 v1", "sin(2q1) v1 v2", "cos(2q1) v2 v2"} <= found
 
 
 def test_a_run_steps_prints_and_keeps_its_functions(tmp_path):

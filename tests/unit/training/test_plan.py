@@ -122,30 +122,6 @@ def test_a_plan_overrules_the_choice():
     assert run.metrics["plan"]["objective"] == "trajectory"
 
 
-def test_what_a_trial_decided_holds_for_the_fit(monkeypatch):
-    # fails if strengths of the prior are compared again where the trial of networks has chosen one, or if an objective
-    # that was named is looked for
-    found, config = seen(0.01)
-    assert found.found is not None
-    found = replace(found, found=found.found._replace(doubt=True))
-    decided = replace(choose(found, config), departures=(6e-3,))
-    monkeypatch.setattr(fit_module, "look", lambda *_: found)
-    monkeypatch.setattr(fit_module, "held_out_winner", lambda *_: (found, decided))
-    fitted = {}
-
-    def objective(task, *_):
-        fitted["departures"] = task.config.departures
-        raise InterruptedError
-
-    monkeypatch.setitem(fit_module.OBJECTIVES, decided.objective, objective)
-    with pytest.raises(InterruptedError):
-        fit(pendulum(0.01), config)
-    assert fitted["departures"] == (6e-3,)
-    named = replace(config, objective="trajectory")
-    other = replace(found, found=None, settings=config)
-    assert choose_objective(other, named)[0] == "trajectory"
-
-
 def test_a_wrong_plan_is_refused_in_words():
     # fails if a plan of another version ends in a TypeError
     plan = choose(*seen(0.0)).to_dict()
