@@ -22,12 +22,13 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.models.features import parse
 from herglotz.training.baseline import Baseline
+from herglotz.training.dictionary import WAVES
 from herglotz.training.named_terms import NamedTerms, own_terms
 
 REACH = 1.5  # times the recorded interval
-POTENTIAL = (8, 16, 32, 48)  # where the bands of a potential end, by the number of the wave
-MASS = (4, 8)
-DAMPING = (2, 4)
+POTENTIAL = (8, 16, 32, 48)  # the waves that bands of a potential end with; of several lengths the first two
+MASS = (4, 8)  # of the mass of one coordinate
+DAMPING = (2, 4)  # of damping, by the number of the pair of cos and sin
 
 
 class Band(NamedTuple):
@@ -46,17 +47,17 @@ def bands(data: Trajectories) -> list[Band]:
     several = data.dof > 1
     for i, angle in enumerate(data.angles):
         own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], POTENTIAL[-1])
-        first = 2 if several else 4  # harmonics that are no named terms yet
-        ends = POTENTIAL[:2] if several or angle else POTENTIAL
-        found += _split(f"V(q{i + 1})", own[2 * (first - 1) :] if angle else own, ends, 2 if angle else 1)
+        named = (1 if several else WAVES) if angle else 0  # its first waves are named terms
+        ends = (named + POTENTIAL[0], POTENTIAL[1]) if angle else POTENTIAL[: 2 if several else None]
+        found += _split(f"V(q{i + 1})", own, ends, 2 if angle else 1, named)
         around = _harmonics(i) if angle else _pairs(data, i)
         found += _split(f"damping(q{i + 1})", [(f"{x} v{i + 1}", k) for x, k in around], DAMPING, 2)
         if not several:
             found += _split("mass(q1)", [(_moving(x, "v1^2"), k) for x, k in own], MASS, 2 if angle else 1)
-        elif angle:  # the first waves are named terms
+        elif angle:
             for a, b in combinations_with_replacement(range(1, data.dof + 1), 2):
-                second = [(_moving(x, f"v{a} v{b}"), k) for x, k in own[2:4]]
-                found += _split(f"mass(q{i + 1}) of v{a} v{b}", second, (2,), 1)
+                moving = [(_moving(x, f"v{a} v{b}"), k) for x, k in own]
+                found += _split(f"mass(q{i + 1}) of v{a} v{b}", moving, (2,), 2, 1)
     for i, j in combinations(range(data.dof), 2):
         if data.angles[i] or data.angles[j]:
             continue
@@ -100,15 +101,17 @@ def spreads_of(every: list[Band], base: Baseline, balance: Tensor, powers: list[
     return found
 
 
-def _split(name: str, waves: list[tuple[str, float]], ends: tuple[int, ...], each: int) -> Iterator[Band]:
-    """Waves, `each` of them for one number, in bands that end at these numbers."""
-    first = 0
+def _split(
+    name: str, waves: list[tuple[str, float]], ends: tuple[int, ...], each: int, first: int = 0
+) -> Iterator[Band]:
+    """Waves, `each` of them for one number, in bands that end at these numbers; without the `first` ones."""
+    longest = min(k for _, k in waves[first * each :])
     for end in ends:
-        part = waves[first : end * each]
+        part = waves[first * each : end * each]
         if part:
             texts, rates = zip(*part, strict=True)
-            yield Band(name, f"{name}, waves {first // each + 1}-{end}", texts, rates, min(k for _, k in waves))
-        first = end * each
+            yield Band(name, f"{name}, waves {first + 1}-{end}", texts, rates, longest)
+        first = end
 
 
 def _interval(data: Trajectories, form: list[tuple[int, float]]) -> tuple[float, float]:

@@ -67,7 +67,8 @@ def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
     """The named terms, and which coordinate q1 is where it has a name of its own."""
     told = [f"q{i} is {name}" for i, name in enumerate(names, 1) if name != f"q{i}" and len(names) <= MOST_NAMED]
     rest = len(features) - MOST_FEATURES
-    shown = ", ".join(features[:MOST_FEATURES]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
+    named = sorted(features, key=lambda text: text.startswith(("sin", "cos")))  # waves of functions are many
+    shown = ", ".join(named[:MOST_FEATURES]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
     return shown + (f"  ({', '.join(told)})" if told else "")
 
 

@@ -24,7 +24,7 @@ def test_the_page_stands_alone(written):  # fails if a style, script, font or pi
     page, _ = written
     assert not re.findall(r"(?:src|href)=\"(?!data:image/png;base64,|#)", page)
     assert not re.findall(r"https?://|@import|url\(", page)
-    assert page.count("data:image/png;base64,") == 5  # learned, training, trajectory, prediction, bands
+    assert page.count("data:image/png;base64,") == 6  # learned, sizes, training, trajectory, prediction, bands
 
 
 def test_the_verdict_comes_first_and_everything_is_said(written, tiny_run):
