@@ -25,7 +25,7 @@ from herglotz.training.fitted_run import FittedRun
 
 WIDTH = 78  # two blanks stand before each line on screen
 BRACKETS = "in brackets: standard deviation, of the last digits or as ±, by noise alone"
-WAVE = re.compile(r"((?:sin|cos)\((?P<form>[^()]*)\))(?P<speeds>(?: [^ ()]+′²?)*)")
+WAVE = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<speeds>(?: [^ ()]+′²?)*)")
 FEW = 6  # waves of one form with the same speeds that a line has at most: more are a function that is told below
 TOGETHER = "\N{NO-BREAK SPACE}"  # inside a term: lines break between terms
 
@@ -52,9 +52,7 @@ class Term:
 
     def wave(self, digits: int = UNKNOWN) -> str:
         """The same as a part of its function, without a deviation: each of its waves alone says nothing."""
-        found = WAVE.fullmatch(self.what)
-        assert found is not None
-        return replace(self, what=found[1], deviation=None).told(digits)
+        return replace(self, what=self.what.partition(")")[0] + ")", deviation=None).told(digits)
 
 
 @dataclass(frozen=True, repr=False)

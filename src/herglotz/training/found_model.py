@@ -18,7 +18,7 @@ from herglotz.training.trials import ALIKE, FINER, Trial, is_precise, moved
 def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     """The settings of a model that has what a trial has taken and nothing else, and the baseline it starts from."""
     fitter, data = trial.fitter, trial.problem.data
-    base = replace(fitter.base, spreads=spreads_of(trial))
+    base = replace(fitter.base, spreads=_spreads(trial))
     bare = replace(base, start={})
     own = set(trial.problem.parameters.numbers)
     keys = [fitter.keys[name] for name in fitter.start if name in own]
@@ -51,7 +51,7 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     return of, started(base, data, values, of)
 
 
-def spreads_of(trial: Trial) -> dict[str, float]:
+def _spreads(trial: Trial) -> dict[str, float]:
     """The prior deviations of the waves that a trial has taken, and of what they could stand for, by their text."""
     numbers, fitter, prior = trial.problem.parameters.numbers, trial.fitter, trial.prior
     return {

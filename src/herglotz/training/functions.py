@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
 from typing import NamedTuple
@@ -28,7 +28,7 @@ from herglotz.training.named_terms import NamedTerms, own_terms
 REACH = 1.5  # times the recorded interval
 POTENTIAL = (8, 16, 32, 48)  # the waves that bands of a potential end with; of several lengths the first two
 MASS = (4, 8)  # of the mass of one coordinate
-DAMPING = (2, 4)  # of damping, by the number of the pair of cos and sin
+DAMPING = (2, 4)  # of damping: pairs of cos and sin
 
 
 class Band(NamedTuple):
@@ -50,13 +50,13 @@ def bands(data: Trajectories) -> list[Band]:
         named = (1 if several else WAVES) if angle else 0  # its first waves are named terms
         ends = (named + POTENTIAL[0], POTENTIAL[1]) if angle else POTENTIAL[: 2 if several else None]
         found += _split(f"V(q{i + 1})", own, ends, 2 if angle else 1, named)
-        around = _harmonics(i) if angle else _pairs(data, i)
+        around = own if angle else _pairs(data, i)
         found += _split(f"damping(q{i + 1})", [(f"{x} v{i + 1}", k) for x, k in around], DAMPING, 2)
         if not several:
-            found += _split("mass(q1)", [(_moving(x, "v1^2"), k) for x, k in own], MASS, 2 if angle else 1)
+            found += _split("mass(q1)", [(f"{x} v1^2", k) for x, k in own], MASS, 2 if angle else 1)
         elif angle:
             for a, b in combinations_with_replacement(range(1, data.dof + 1), 2):
-                moving = [(_moving(x, f"v{a} v{b}"), k) for x, k in own]
+                moving = [(f"{x} v{a} v{b}", k) for x, k in own]
                 found += _split(f"mass(q{i + 1}) of v{a} v{b}", moving, (2,), 2, 1)
     for i, j in combinations(range(data.dof), 2):
         if data.angles[i] or data.angles[j]:
@@ -66,12 +66,12 @@ def bands(data: Trajectories) -> list[Band]:
     return found
 
 
-def with_functions(terms: NamedTerms, every: list[Band], angles: tuple[bool, ...]) -> NamedTerms:
+def terms_with(every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
     """The terms with all waves of these bands, which take the place of powers in the potential but the lowest."""
     own = own_terms(angles)
     kept = [
         text for text in terms.features
-        if not every or "v" in text or text in own or parse(text, angles)[0].function in ("cos", "sin")
+        if "v" in text or text in own or parse(text, angles)[0].function in ("cos", "sin")
     ]  # fmt: skip
     texts = [text for band in every for text in band.texts]
     drag = tuple(text for band in every if band.function.startswith("damping") for text in band.texts)
@@ -79,7 +79,7 @@ def with_functions(terms: NamedTerms, every: list[Band], angles: tuple[bool, ...
     return replace(terms, features=tuple(kept)).joined(still)
 
 
-def spreads_of(every: list[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
+def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
     """Prior deviations, by what a number is: forces, masses and rates of the motion's own size, and continuous.
 
     Deviations fall with the number of the wave: of a potential that is a Matérn process of ν = 3/2. The lowest
@@ -88,7 +88,7 @@ def spreads_of(every: list[Band], base: Baseline, balance: Tensor, powers: list[
     found: dict[str, float] = {}
     force = max(v * v / x for v, x in zip(base.speed, base.scale, strict=True))
     rate = max(v / x for v, x in zip(base.speed, base.scale, strict=True))
-    for key in powers if every else ():
+    for key in powers:
         stem, _, at = key.partition("[")
         scale = base.scale[int(at.rstrip("]") or 0)]
         found[key] = force * {"potential.stiffness": 1 / scale, "q1^2": 0.5 / scale}.get(stem, 1.0)
@@ -104,7 +104,7 @@ def spreads_of(every: list[Band], base: Baseline, balance: Tensor, powers: list[
 def _split(
     name: str, waves: list[tuple[str, float]], ends: tuple[int, ...], each: int, first: int = 0
 ) -> Iterator[Band]:
-    """Waves, `each` of them for one number, in bands that end at these numbers; without the `first` ones."""
+    """Waves, `each` of one number, in bands that end with these numbers; the `first` numbers are left out."""
     longest = min(k for _, k in waves[first * each :])
     for end in ends:
         part = waves[first * each : end * each]
@@ -127,28 +127,20 @@ def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> lis
     found = []
     for j in range(1, count + 1):
         k = math.pi * j / (2 * half)
-        found.append((_wave("sin", [(i, w * k) for i, w in form], -k * (middle - half)), k))
+        parts = [(w * k, f" q{i + 1}") for i, w in form] + [(math.remainder(k * (half - middle), 2 * math.pi), "")]
+        text = " ".join(f"{'-' if w < 0 else '+'} {abs(w):.9g}{what}" for w, what in parts)
+        found.append((f"sin({text.removeprefix('+ ')})", k))
     return found
-
-
-def _wave(function: str, form: list[tuple[int, float]], phase: float) -> str:
-    """A wave of a linear form with a phase."""
-    parts = [(w, f" q{i + 1}") for i, w in form] + [(math.remainder(phase, 2 * math.pi), "")]
-    text = " ".join(f"{'-' if w < 0 else '+'} {abs(w):.9g}{what}" for w, what in parts)
-    return f"{function}({text.removeprefix('+ ')})"
 
 
 def _pairs(data: Trajectories, i: int) -> list[tuple[str, float]]:
     """Waves of one coordinate whose period is its interval."""
-    rates = [math.pi * j / _interval(data, [(i, 1.0)])[1] for j in range(1, DAMPING[-1] + 1)]
+    half = _interval(data, [(i, 1.0)])[1]
+    rates = [math.pi * j / half for j in range(1, DAMPING[-1] + 1)]
     return [(f"{f}({k:.8g} q{i + 1})", k) for k in rates for f in ("cos", "sin")]
 
 
 def _harmonics(i: int) -> list[tuple[str, float]]:
     """Waves of whole multiples of an angle."""
-    return [(f"{f}({'' if k == 1 else k}q{i + 1})", float(k)) for k in range(1, 17) for f in ("cos", "sin")]
-
-
-def _moving(text: str, speeds: str) -> str:
-    """A function of the position times speeds, product by product."""
-    return text.replace(")", f") {speeds}")
+    every = range(1, POTENTIAL[1] + 1)
+    return [(f"{f}({'' if k == 1 else k}q{i + 1})", float(k)) for k in every for f in ("cos", "sin")]

@@ -19,6 +19,7 @@ from herglotz.data.smoothing import local_polynomials
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.functions import bands
 from herglotz.training.linear_terms import start_of
 from herglotz.training.named_terms import DRY, candidates, special, started
 from herglotz.training.parameter_vector import ParameterVector
@@ -100,11 +101,11 @@ class Search:
             return best
         part(MORE_TERMS)
         search = self.part or self
-        fitter = search.fitter(replace(best.fitter.variant, sticking=False, functions=True))
+        fitter = search.fitter(replace(best.fitter.variant, sticking=False, functions=tuple(bands(self.data))))
         other = search.climbed(fitter, fitter.simple, {})
         other = self.of_all(other) if other is not None and self.part is not None else other
-        better = self.better(best, other)
-        return best if better is None else self.braking(self.finalist(better, (best, other)))
+        better = self.better(best, other) or best
+        return self.braking(self.finalist(better, (best, other)))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
         """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
@@ -255,7 +256,7 @@ class Search:
         if len(self.data) == 1 or not asked:
             return None
         names = trial.problem.parameters.numbers
-        problem = trial.problem.of(names, trial.problem.sigma, trial.fitter.prior(names))
+        problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
         found = differing_zeros(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
         if found is None:
             return None

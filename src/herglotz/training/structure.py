@@ -48,7 +48,6 @@ THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the 
 MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
 BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
 EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
-EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no other model to be tried
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent")  # fmt: skip
@@ -137,12 +136,12 @@ def search(
     if found is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     noise = precision(data)
-    limit = max(noise if math.isfinite(noise) else 0.0, EXACT_ENOUGH * found.fitter.spread)
     settings, found_base = settings_of_trial(found, wanted.config)
     settings = replace(settings, dtype=config.dtype, device=config.device)
     base = replace(found_base, low=base.low, high=base.high)
     named = ", ".join(("mass", "damping", *found.names))
-    miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, limit))
+    miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, noise))
+    least = least if math.isfinite(noise) else "unknown"
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
     zeros, why, compared = (), "", wanted.compared(found)

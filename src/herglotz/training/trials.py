@@ -6,8 +6,8 @@ A model is a set of offers (`offers`), fitted by multiple shooting over segments
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
-from herglotz.training.functions import bands, spreads_of, with_functions
+from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.named_terms import candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
@@ -52,7 +52,7 @@ class Variant:
     order: int
     substeps: int = 1
     sticking: bool = False
-    functions: bool = False  # of the coordinates, beside named terms
+    functions: tuple[Band, ...] = ()  # of the coordinates, beside named terms
 
 
 class Compared(NamedTuple):
@@ -73,6 +73,7 @@ class Trial:
     values: dict[str, float]  # of all numbers
     problem: ShootingProblem
     path: Path
+    scales: Mapping[str, float] = field(default_factory=dict)  # variances of its functions, over those of `Fitter`
 
     @property
     def theta(self) -> Tensor:
@@ -130,16 +131,20 @@ class Trial:
 
     def curvature(self, names: Collection[str]) -> tuple[Tensor, Tensor] | None:
         """(H, g) of these numbers at the fit, the states being eliminated, in units of its misfit."""
-        problem = self.problem.of(names, self.problem.sigma, self.fitter.prior(names))
+        found, by = self._reduced(names), (self.problem.sigma / max(self.rms, self.fitter.floor)) ** 2
+        return None if found is None else (found[0] * by, found[1] * by)
+
+    def _reduced(self, names: Collection[str]) -> tuple[Tensor, Tensor] | None:
+        """The same in units of the σ that it was fitted with; None where numbers are none."""
+        problem = self.problem.of(names, self.problem.sigma, self.fitter.prior(names, self.scales))
         problem.path = self.path
         states = self.path.x[:, 0, : problem.d]
         theta = states.new_tensor([self.values[name] for name in problem.parameters.numbers])
         x = problem.pack(theta, states)
         cost, A, b = problem.normal_equations(x)
         found = A.reduced(b) if bool(torch.isfinite(cost)) else None
-        by = (problem.sigma / max(self.rms, self.fitter.floor)) ** 2
-        finite = found is not None and bool(torch.isfinite(found[0]).all()) and bool(torch.isfinite(found[1]).all())
-        return (found[0] * by, found[1] * by) if finite and found is not None else None
+        finite = found is not None and all(bool(torch.isfinite(x).all()) for x in found[:2])
+        return found[:2] if finite and found is not None else None
 
     @property
     def prior(self) -> Gaussian:
@@ -149,12 +154,15 @@ class Trial:
 
     @cached_property
     def functions(self) -> dict[str, tuple[list[int], float]]:
-        """The places of the waves of each function, and how many numbers of it the data tell (MacKay 1992)."""
+        """The places of the waves of each function, and how many numbers of it the data tell (MacKay 1992).
+
+        Of a number with the prior deviation τ and the posterior one σ that is 1 − σ²/τ².
+        """
         numbers = self.problem.parameters.numbers
         place = {name: i for i, name in enumerate(numbers)}
         every = self.fitter.functions.items()
         taken = {name: at for name, waves in every if (at := [place[wave] for wave in waves if wave in place])}
-        found = self.curvature(numbers) if taken else None
+        found = self._reduced(numbers) if taken else None
         if found is None:
             return {}
         told = (1 - self.prior.weight * inverse_of(found[0]).diagonal()).clamp(min=0.0)
@@ -189,8 +197,8 @@ class Fitter:
 
     def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None):
         self.data, self.variant, self.freedom = data, variant, freedom
-        self.bands = bands(data) if variant.functions else []
-        self.terms = terms = with_functions(candidates(data, config.translations), self.bands, data.angles)
+        every_band, terms = variant.functions, candidates(data, config.translations)
+        self.terms = terms = terms_with(every_band, terms, data.angles) if every_band else terms
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
         base = started(base, data, first, settings)
@@ -199,7 +207,7 @@ class Fitter:
         self.model = with_sticking(model, excess=False) if variant.sticking else model
         every = ParameterVector(self.model)
         self.keys = dict(zip(every.numbers, keys_of(every.numbers, self.model.config), strict=True))
-        self.always, every_offer, self.simple = offers_of(self.model, list(self.keys.values()), self.bands)
+        self.always, every_offer, self.simple = offers_of(self.model, list(self.keys.values()), every_band)
         without_offers(self.model, every_offer)
         one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]  # is dry friction already
         self.offers = [offer for offer in every_offer if offer.name not in one_way]
@@ -208,11 +216,12 @@ class Fitter:
         own, self.weights = prior_of(self.model, base, None), {}
         place = {key: name for name, key in self.keys.items()}
         self.functions: dict[str, list[str]] = {}  # the numbers of the waves of each
-        for band in self.bands:
+        for band in every_band:
             self.functions.setdefault(band.function, []).extend(place[text] for text in band.texts)
         for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
             self.weights[every.numbers[i]] = spread**-2
-        spreads = spreads_of(self.bands, base, data.balance, [key for key in place if self._is_power(key)])
+        powers = [key for key in place if every_band and self._is_power(key)]
+        spreads = prior_spreads(every_band, base, data.balance, powers)
         self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}
         self.weights |= self.centred
         lengths = segment_lengths(data)
@@ -227,10 +236,10 @@ class Fitter:
         """Whether a number is that of the lowest powers or waves of a potential, which every simplest model has."""
         return key in self.simple and not key.startswith("friction")
 
-    def prior(self, names: Collection[str], before: Trial | None = None) -> Gaussian:
-        """Of these numbers, in the order of the model; functions are as large as they are in a fit `before`."""
+    def prior(self, names: Collection[str], scales: Mapping[str, float] | None = None) -> Gaussian:
+        """Of these numbers, in the order of the model; with `scales` of the variances of functions."""
         names, weights = set(names), dict(self.weights)
-        for name, scale in ({} if before is None else before.sizes).items():
+        for name, scale in (scales or {}).items():
             weights |= {wave: weights[wave] / scale for wave in self.functions[name]}
         own = [name for name in self.start if name in names]
         like = self.data.q
@@ -260,7 +269,8 @@ class Fitter:
         taken, every = frozenset(taken), self.problem(length)
         names = self.numbers(taken)
         sigma = every.sigma if before is None else max(before.rms, self.floor)
-        problem = every.of(names, sigma, self.prior(names, before))
+        scales = {} if before is None else before.sizes
+        problem = every.of(names, sigma, self.prior(names, scales))
         names = problem.parameters.numbers
         theta = self.data.q.new_tensor([values.get(name, self.start[name]) for name in names])
         if before is None:
@@ -279,12 +289,12 @@ class Fitter:
         if path is None:
             return None
         found = self.start | dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
-        return Trial(self, taken, found, problem, path)
+        return Trial(self, taken, found, problem, path, scales)
 
     def foretold(self, trial: Trial) -> Score | None:
         """The score of a free run over the last quarter of every trajectory, which is not fitted; None: no path."""
         names = trial.problem.parameters.numbers
-        problem = self.problem(trial.length).of(names, max(trial.rms, self.floor), self.prior(names))
+        problem = self.problem(trial.length).of(names, max(trial.rms, self.floor), trial.prior)
         part = torch.cat([torch.arange(length) < round(SEEN * length) for length in self.data.lengths])
         problem.used, problem.path = part.to(self.data.t.device), trial.path
         problem._weigh()

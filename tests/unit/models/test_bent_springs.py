@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests import runge_kutta
 
 import herglotz as hz
 from herglotz.errors import InputError
@@ -57,11 +58,7 @@ def bilinear(seed, noise=0.002, n=400, h=0.05):
     for _ in range(n):
         rows.append(y[0])
         for _ in range(parts):
-            d = h / parts
-            a = rate(y)
-            b = rate(y + d / 2 * a)
-            c = rate(y + d / 2 * b)
-            y = y + d / 6 * (a + 2 * b + 2 * c + rate(y + d * c))
+            y = runge_kutta.step(rate, y, h / parts)
     return np.arange(n) * h, np.array(rows) + noise * rng.standard_normal(n)
 
 

@@ -1,10 +1,12 @@
 """A two-link arm with motors: its mass and weight from one linear problem, where noise hides them among many terms."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from tests import runge_kutta
 
 from herglotz.data import Trajectories
 from herglotz.data.smoothing import local_polynomials
@@ -31,14 +33,11 @@ def arm(seed, noise, count=600):
     make = np.random.default_rng(seed)
     w, phase = 1 + 6 * make.random((2, 4)), 6 * make.random((2, 4))
     u = np.sin(w[None] * (STEP * np.arange(count))[:, None, None] + phase).sum(-1) * [0.8, 0.4]
-    x, rows, h = np.zeros(4), [], STEP / PARTS
+    x, rows = np.zeros(4), []
     for own in u:
         rows.append(x)
         for _ in range(PARTS):
-            a = slope(x, own)
-            b = slope(x + h / 2 * a, own)
-            c = slope(x + h / 2 * b, own)
-            x = x + h / 6 * (a + 2 * b + 2 * c + slope(x + h * c, own))
+            x = runge_kutta.step(partial(slope, u=own), x, STEP / PARTS)
     q = np.array(rows)[:, :2] + noise * make.standard_normal((count, 2))
     t = torch.arange(count, dtype=torch.float64) * STEP
     return Trajectories.of(t, torch.tensor(q), u=torch.tensor(u), angles=(True, True), hold="zero")

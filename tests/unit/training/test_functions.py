@@ -1,18 +1,24 @@
 """Functions that no named term says: sums of waves with a prior, found by the search, and the true law beside them."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from tests import runge_kutta
 
 from herglotz.data import Trajectories
+from herglotz.errors import InputError
 from herglotz.models.drag import parse_drag
 from herglotz.models.features import parse
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.functions import REACH, bands
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.search import Search
+from herglotz.training.task import build_model
 from herglotz.training.trials import Variant
 
 H, NOISE = 0.05, 0.002
@@ -25,11 +31,7 @@ def recorded(acceleration, starts, *, angle, steps=160, parts=8):
     for _ in range(steps + 1):
         out.append(x[0].copy())
         for _ in range(parts):
-            h = H / parts
-            a = rate(x)
-            b = rate(x + h / 2 * a)
-            c = rate(x + h / 2 * b)
-            x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
+            x = runge_kutta.step(rate, x, H / parts)
     q = torch.tensor(np.array(out).T.reshape(-1, 1))
     q = q + NOISE * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
     t = (H * torch.arange(steps + 1, dtype=torch.float64)).repeat(len(starts))
@@ -84,6 +86,45 @@ def test_what_a_function_costs_is_what_the_data_tell_of_it(searched):
     assert 4 < told < waves
     assert found.told == pytest.approx(found.problem.P - waves + told)
     assert all(size > 0 for size in found.sizes.values())
+
+
+def test_the_fit_to_a_part_and_the_quadratic_model_have_the_priors_of_the_fit(searched, monkeypatch):
+    # fails if a free run over held-out time, or what is said of offers, is of functions of another size
+    _, found = searched
+    assert found.scales
+    asked = []
+    of = ShootingProblem.of
+    monkeypatch.setattr(
+        ShootingProblem, "of", lambda *given: asked.append(dict(zip(given[1], given[3].weight, strict=False)))
+        or of(*given),
+    )  # fmt: skip
+    found.fitter.foretold(found)
+    found.curvature(found.problem.parameters.numbers)
+    at = {name: i for i, name in enumerate(found.problem.parameters.numbers)}
+    for waves in found.fitter.functions.values():
+        for wave in (wave for wave in waves if wave in at):
+            assert {float(own[wave]) for own in asked} == {float(found.prior.weight[at[wave]])}
+
+
+def test_waves_of_a_part_are_those_of_all(monkeypatch):
+    # fails if the waves that a search finds in a part of a long recording have another interval in the whole of it
+    monkeypatch.setattr("herglotz.training.search.PART", 170)
+    data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    ended(search)
+    assert search.part is not None
+    (whole,) = {variant.functions for variant in search.fitters if variant.functions}
+    (part,) = {variant.functions for variant in search.part.fitters if variant.functions}
+    assert whole == part == tuple(bands(data))
+
+
+@pytest.mark.parametrize("spread", [0.0, -1.0, math.nan, math.inf])
+def test_a_prior_deviation_that_is_none_is_refused(spread):
+    # fails if a plan of a file divides by it
+    data = recorded(lambda q, v: -q - 0.1 * v, STARTS[:1], angle=False)
+    base = replace(estimate_baseline(data), spreads={"q1^2": spread})
+    with pytest.raises(InputError, match=r"'q1\^2' is .*, and has to be a number above 0"):
+        prior_of(build_model(base, FitConfig(level="linear").resolved(data), "none"), base, None)
 
 
 def test_waves_vanish_beyond_what_was_recorded():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 
+from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
 from herglotz.models.jet import coordinates
 from herglotz.models.terms import AffineDamping
@@ -66,8 +68,12 @@ class Prior:
     ):
         self.parameters = ParameterVector(model)
         self.start, self.departure = self.parameters.get(), departure
-        keys = keys_of(self.parameters.numbers, model.config) if spreads else []
-        self.waves = {i: spreads[key] for i, key in enumerate(keys) if spreads and key in spreads}
+        keys, spreads = keys_of(self.parameters.numbers, model.config), spreads or {}
+        refuse({
+            f"the prior deviation of '{key}' is {spread:g}, and has to be a number above 0": not 0 < spread < math.inf
+            for key, spread in spreads.items()
+        })  # fmt: skip
+        self.waves = {i: spreads[key] for i, key in enumerate(keys) if key in spreads}
         self.start[list(self.waves)] = 0.0
         points = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True)
         unit = points.draw(min(EACH * len(low), MOST)).to(low)
