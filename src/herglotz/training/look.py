@@ -106,11 +106,14 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     data = data if found.turning else on_a_line(data)
     stages = stages.labelled(stages.label + "".join(said))
     data = replace(data, hold=found.hold) if found.hold else data
-    again = _seen(data, user_settings, stages, plan, found.zeros)
+    again, turning = _seen(data, user_settings, stages, plan, found.zeros), found.turning
+    if turning and again.found is not None and not again.found.turning:
+        turning, stages = False, stages.labelled(stages.label + ", on a line")
+        again = _seen(on_a_line(data), user_settings, stages, plan, found.zeros)
     if found.hold:
         why = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
         again = replace(again, why_arrival=seen.why_arrival | {"hold": why})
-    return replace(again, why_zeros=found.why_zeros or seen.why_zeros, turning=found.turning)
+    return replace(again, why_zeros=found.why_zeros or seen.why_zeros, turning=turning)
 
 
 def on_a_line(data: Trajectories) -> Trajectories:

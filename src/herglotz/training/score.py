@@ -12,22 +12,19 @@ standard error grows, and it decides. Lost blocks and outliers weigh little: the
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
+from herglotz.training.held_out import BLOCKS, HeldOut
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
-BLOCKS = 10  # of time, at least, over all trajectories
-STAY = 20  # first samples of a trajectory, and a tenth of it at most, that are never left out: they tell its start
-ROUNDS = 30  # of the scale of Student's t
+ROUNDS = 20  # of the scale of Student's t
 WORST = 1e3  # the loss of a residual that is no number
-RIDGE = 1e-12  # of the largest: what is added to the curvature by starts, which few samples may not tell
 
 
 @dataclass(frozen=True)
@@ -57,13 +54,16 @@ class Score:
         return (self.numbers + self.zeros) * math.log(self.count) / 2 + chosen
 
 
-def score(
-    problem: ShootingProblem, path: Path, theta: Tensor, numbers: float, choices: int, floor: float
-) -> Score:
-    """The score of a fit; misfits below `floor`, in units of q over the balance, are rounding."""
-    block = blocks(problem.data).to(theta.device)
-    r = held_out_residuals(problem, path, theta, block)
-    return _of_residuals(r, block, floor, count=problem.data.q.numel(), numbers=numbers, choices=choices)
+def scores(
+    model: HeldOut, sets: Sequence[Sequence[int]], choices: Sequence[int], count: int, floor: float
+) -> list[Score]:
+    """The scores of sets of the numbers of a fit, to first order; `choices` (C,) offers have brought them.
+
+    Misfits below `floor`, in units of q over the balance, are rounding.
+    """
+    losses, rms = _losses(model.residuals(sets), model.block, floor)
+    rest = zip(losses, model.told(sets).sum(1).tolist(), choices, rms.tolist(), strict=True)
+    return [Score(own, count, numbers, chosen, error) for own, numbers, chosen, error in rest]
 
 
 def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float) -> Score:
@@ -71,107 +71,30 @@ def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices
     unseen = ~problem.used
     block = torch.where(unseen, torch.cumsum(unseen, 0) - 1, 0) * BLOCKS // max(1, int(unseen.sum()))
     block = torch.where(unseen, block, -1)
-    count = int(unseen.sum()) * problem.n
-    return _of_residuals(problem.misfit(path), block, floor, count=count, numbers=numbers, choices=choices)
+    (losses,), (rms,) = _losses(problem.misfit(path)[None], block, floor)
+    return Score(losses, int(unseen.sum()) * problem.n, numbers, choices, float(rms))
 
 
-def _of_residuals(r: Tensor, block: Tensor, floor: float, **model: Any) -> Score:
-    """Of residuals (N, n) over the balance in blocks (N,); −1: in none."""
+def _losses(r: Tensor, block: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+    """Log-losses (C, B) and RMS (C,) of residuals (C, N, n) over the balance in blocks (N,); −1: in none."""
     inside = block >= 0
-    losses = torch.zeros(int(block.max()) + 1, dtype=r.dtype, device=r.device)
-    for own in r.T:
-        scale = max(_scale(own[inside]), floor)
-        loss = math.log(scale) + (FREEDOM + 1) / 2 * torch.log1p((own / scale).square() / FREEDOM)
-        losses.index_add_(0, block[inside], loss[inside].nan_to_num(nan=WORST, posinf=WORST))
-    return Score(losses, rms=float(r[inside].square().mean().sqrt()), **model)
+    r, block = r[:, inside], block[inside]
+    scale = _scale(r).clamp_min(floor)
+    loss = scale.log() + (FREEDOM + 1) / 2 * torch.log1p((r / scale).square() / FREEDOM)
+    loss = loss.nan_to_num(nan=WORST, posinf=WORST).sum(2)
+    losses = torch.zeros(len(r), int(block.max()) + 1, dtype=r.dtype, device=r.device).index_add_(1, block, loss)
+    return losses, r.square().mean((1, 2)).sqrt()
 
 
-def blocks(data: Trajectories) -> Tensor:
-    """The block of time of every sample, (N,); −1: it stays. Every trajectory has two at least."""
-    each, parts, first = max(2, -(-BLOCKS // len(data))), [], 0
-    for length in data.lengths:
-        part = torch.arange(length) * each // length + first
-        part[: min(STAY, length // 10)] = -1
-        parts.append(part)
-        first += each
-    return torch.cat(parts)
+def _scale(r: Tensor) -> Tensor:
+    """Scale of Student's t at which residuals (C, N, n) of each coordinate are likeliest, (C, 1, n).
 
-
-def _scale(r: Tensor) -> float:
-    """Scale of Student's t at which r is likeliest."""
-    squared, v = r.square(), FREEDOM
-    s = squared.median().clamp_min(torch.finfo(r.dtype).tiny)
-    for _ in range(ROUNDS):
-        s = ((v + 1) * squared / (v + squared / s)).mean().clamp_min(torch.finfo(r.dtype).tiny)
-    return float(s.sqrt())
-
-
-def held_out_residuals(problem: ShootingProblem, path: Path, theta: Tensor, block: Tensor) -> Tensor:
-    """Residuals (N, n) over the balance that every sample would have if its block had been left out, to first order.
-
-    The start of a segment is told by its other samples or, where all of them are left out, by its own. What joints say
-    of parameters is left out.
+    By expectation and maximisation with an expanded parameter (Liu, Rubin & Wu 1998), which takes far fewer rounds.
     """
-    grid, P = problem.grid, problem.P
-    r = problem.misfit(path) / problem.sigma
-    by = (problem.weight * problem.root_weights(problem.weight * r))[..., None]
-    plain = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
-    rows = torch.cat([plain, r[..., None]], -1)  # (N, n, P + d + 1)
-    segment = grid.node // (grid.h.shape[1] + 1)
-    piece, of = torch.unique_consecutive(torch.stack([segment, block], 1), dim=0, return_inverse=True)
-    grams = _grams(rows * by, of, len(piece))  # (Q, P + d + 1, P + d + 1)
-    S, B = grid.segments, int(block.max()) + 1
-    whole = grams.new_zeros(S, *grams.shape[1:]).index_add_(0, piece[:, 0], grams)
-    total, right = _reduced(whole, P)
-    _, A, b = problem.prior_equations(theta)
-    total, right = total.sum(0) + A, right.sum(0) + b
-    out = r.clone()
-    for k in range(B):
-        mine = (piece[:, 1] == k).nonzero()[:, 0]
-        s, own = piece[mine, 0], grams[mine]
-        kept = whole[s] - own
-        gone = torch.isin(s, piece[piece[:, 1] != k, 0], invert=True)  # nothing of the segment is left
-        left, slope = _reduced(kept, P)
-        was, its = _reduced(whole[s], P)
-        left, slope = (torch.where(gone.reshape(-1, *[1] * (x.dim() - 1)), 0.0, x) for x in (left, slope))
-        H, g = total - was.sum(0) + left.sum(0), right - its.sum(0) + slope.sum(0)
-        step = -_solved(H, g)
-        source = torch.where(gone[:, None, None], own, kept)
-        T, C, c = source[:, P:-1, P:-1], source[:, P:-1, :P], source[:, P:-1, -1]
-        by_state = -torch.linalg.solve(_ridged(T), (c + C @ step)[..., None])[..., 0]
-        at = (block == k).nonzero()[:, 0]
-        place = torch.full((len(piece),), -1, device=r.device)
-        place[mine] = torch.arange(len(mine), device=r.device)
-        moved = by_state[place[of[at]]]
-        out[at] = r[at] + plain[at][..., :P] @ step + (plain[at][..., P:] * moved[:, None]).sum(-1)
-    return out * problem.sigma
-
-
-def _grams(rows: Tensor, of: Tensor, count: int) -> Tensor:
-    """Σ row rowᵀ of each piece, (Q, w, w): pieces are runs of samples."""
-    counts = torch.bincount(of, minlength=count).tolist()
-    parts = [part.flatten(0, 1) for part in rows.split(counts)]
-    return torch.stack([part.T @ part for part in parts])
-
-
-def _reduced(grams: Tensor, P: int) -> tuple[Tensor, Tensor]:
-    """(C − Bᵀ T⁻¹ B, b_θ − Bᵀ T⁻¹ b_x) of each segment alone, its start being eliminated."""
-    T, B = _ridged(grams[:, P:-1, P:-1]), grams[:, P:-1, :P]
-    solved = torch.linalg.solve(T, torch.cat([B, grams[:, P:-1, -1:]], -1))
-    return grams[:, :P, :P] - B.mT @ solved[..., :P], grams[:, :P, -1] - (B.mT @ solved[..., -1:])[..., 0]
-
-
-def _ridged(T: Tensor) -> Tensor:
-    size = T.diagonal(dim1=-2, dim2=-1)
-    return T + torch.diag_embed(RIDGE * size + torch.finfo(T.dtype).tiny ** 0.5)
-
-
-def _solved(H: Tensor, g: Tensor) -> Tensor:
-    """H⁺ g, scaled to a unit diagonal."""
-    if not len(g):
-        return g
-    size = torch.where(H.diagonal() > 0, H.diagonal(), 1.0).sqrt()
-    scaled = H / size[:, None] / size
-    if not bool(torch.isfinite(scaled).all()):
-        return torch.full_like(g, torch.nan)  # the block counts as lost
-    return torch.linalg.pinv(scaled, hermitian=True, rtol=RIDGE) @ (g / size) / size
+    squared, v = r.square(), FREEDOM
+    tiny = torch.finfo(r.dtype).tiny
+    s = squared.median(1, keepdim=True).values.clamp_min(tiny)
+    for _ in range(ROUNDS):
+        weight = 1 / (v + squared / s)
+        s = ((weight * squared).sum(1, keepdim=True) / weight.sum(1, keepdim=True)).clamp_min(tiny)
+    return s.sqrt()

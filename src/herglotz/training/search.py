@@ -1,13 +1,13 @@
 """One search over offers, from both ends: up from the simplest model, and down from the whole dictionary.
 
 A model is a set of offers (`offers`), fitted by multiple shooting over segments that grow while it follows the data.
-The quadratic model of a fit says which offers are worth a fit; the fit is compared by the one inequality of `score`.
+Its linear motion says which offers are worth a fit (`moves`); the fit is compared by the one inequality of `score`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,18 +21,18 @@ from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.functions import bands
 from herglotz.training.linear_terms import start_of
+from herglotz.training.moves import Moves
 from herglotz.training.named_terms import DRY, candidates, special, started
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.quadratic import gains, order_of, swaps, worth
 from herglotz.training.sensor_zeros import differing_zeros
 from herglotz.training.task import LEAST_GRIP, build_model
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Compared, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
 FEW = 5  # iterations of trials on more samples than a search is made of, each for one offer
-TRIED = 3  # offers whose fits are compared, of those that the quadratic model puts first
+TRIED = 3  # changes of a kind whose fits are compared, of those that the linear motion puts first
 EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
 FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
 
@@ -69,7 +69,7 @@ class Search:
         best = self.climbed(fitter, fitter.simple, {})
         part(MORE_TERMS)
         ends = [best]
-        if (best is None or not best.at_the_noise) and (start := self.linear_start(fitter)) is not None:
+        if (start := self.linear_start(fitter)) is not None:
             ends.append(self.climbed(fitter, *start))
             best = self.better(best, ends[-1])
         if best is None:
@@ -101,7 +101,8 @@ class Search:
             return best
         part(MORE_TERMS)
         search = self.part or self
-        fitter = search.fitter(replace(best.fitter.variant, sticking=False, functions=tuple(bands(self.data))))
+        variant = Variant(search.order, functions=tuple(bands(self.data)))
+        fitter = search.fitter(variant)
         other = search.climbed(fitter, fitter.simple, {})
         other = self.of_all(other) if other is not None and self.part is not None else other
         better = self.better(best, other) or best
@@ -144,7 +145,7 @@ class Search:
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
         while trial is not None:
             trial = self.finer(trial)
-            while not trial.whole and (more := self.richer(trial)) is not None:
+            while not trial.whole and (more := self.moved(trial)) is not None:
                 trial = self.finer(more)
             if (longer := trial.fitter.longer(trial)) is None:
                 return self.settled(trial)
@@ -161,46 +162,28 @@ class Search:
     def settled(self, trial: Trial, *, swapped: bool = False) -> Trial:
         """With offers that join and leave, and take the place of others, until none does."""
         seen = {trial.taken}
-        ways = (self.richer, self.simpler, *([self.swapped] if swapped else []))
-        while other := next((x for way in ways if (x := way(trial)) is not None and x.taken not in seen), None):
+        while (other := self.moved(trial, seen, whole=True, swapped=swapped)) is not None:
             seen.add(other.taken)
             other = other.fitter.fit(other.taken, other.values, other.length, other, 2 * self.most) or other
             trial = self.finer(other.fitter.grow(other))
         return trial
 
-    def richer(self, trial: Trial) -> Trial | None:
-        """With one more offer, the first of those that the quadratic model puts first; None where none replaces it."""
-        more = ((gain - worth(trial, offer) / 2, offer) for gain, offer in gains(trial))
-        names = [offer.name for gain, offer in sorted(more, key=lambda x: -x[0])[: self.tried] if gain > 0]
-        fit = trial.fitter.fit
-        tried = (fit(trial.taken | {name}, trial.values, trial.length, trial, self.most) for name in names)
-        return next((other for other in tried if other is not None and other.replaces(trial)), None)
+    def moved(
+        self, trial: Trial, seen: Collection[frozenset[str]] = (), *, whole: bool = False, swapped: bool = False
+    ) -> Trial | None:
+        """With the offers that its linear motion asks for; None where no fit of these is better.
 
-    def swapped(self, trial: Trial) -> Trial | None:
-        """With one offer in the place of another, by the quadratic model; None where that is no better.
-
-        One that stands before the other in the dictionary, which has the usual laws first, need not be better.
+        One offer joins, but no dry friction that pushes; in `whole` models many leave, and one is `swapped`.
         """
-        place = {offer.name: i for i, offer in enumerate(trial.fitter.offers)}
-        least = -math.log(trial.score.count) / 2
-        for _, new, old in sorted((x for x in swaps(trial) if x[0] > least), reverse=True)[: self.tried]:
-            taken = trial.taken - {old} | {new}
-            other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS)
-            if other is None:
+        moves, at = Moves(trial), trial.taken
+        kinds = [moves.joining, *([moves.leaving] if whole else []), *([moves.exchanges] if swapped else [])]
+        for taken in (taken for kind in kinds for taken in kind(at)[: self.tried]):
+            if taken in seen:
                 continue
-            if not trial.replaces(other) if place[new] < place[old] else other.replaces(trial):
+            other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * self.most)
+            fair = other is not None and set(other.pushing) <= set(trial.pushing)
+            if fair and self.better(trial, other) is other:
                 return other
-        return None
-
-    def simpler(self, trial: Trial) -> Trial | None:
-        """With fewer offers, half of them at first, or as many as the quadratic model says; None: none go."""
-        fitter, (order, best) = trial.fitter, order_of(trial)
-        halves = [len(order) >> k for k in range(1, len(order).bit_length())]
-        for count in sorted({*halves, best} - {0}, reverse=True):
-            most = 2 * self.most if count > 1 else self.most
-            less = fitter.fit(trial.taken - set(order[:count]), trial.values, trial.length, trial, most)
-            if less is not None and not trial.replaces(less):
-                return less
         return None
 
     def finer(self, trial: Trial) -> Trial:
@@ -278,14 +261,14 @@ class Search:
 
     def braking(self, trial: Trial) -> Trial:
         """With a load in the place of dry friction that pushes, which would create energy, or with neither."""
-        for i in range(self.data.dof):
-            name = DRY + (f"[{i}]" if self.data.dof > 1 else "")
-            if name not in trial.taken or trial.values[name] > 0:
-                continue
+        while pushing := trial.pushing:
             every = (*trial.fitter.offers, *trial.fitter.loads)
-            loads = [offer.name for offer in every if offer.name == f"load {i + 1}"]
-            taken = trial.taken - {name} | set(loads)
-            trial = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS) or trial
+            loads = {offer.name for offer in every if offer.name in {f"load {i + 1}" for i in pushing.values()}}
+            taken = trial.taken - set(pushing) | loads
+            other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS)
+            if other is None:
+                break
+            trial = self.settled(other, swapped=True)
         return trial
 
     def stuck(self, trial: Trial | None) -> Trial | None:

@@ -6,7 +6,7 @@ A model is a set of offers (`offers`), fitted by multiple shooting over segments
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -22,15 +22,15 @@ from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.functions import Band, prior_spreads, terms_with
-from herglotz.training.named_terms import candidates, settings_of, started, turns_one_way
+from herglotz.training.held_out import HeldOut
+from herglotz.training.named_terms import DRY, candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.robust import scale_of
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.pruning import inverse_of
-from herglotz.training.score import Score, free_run_score, score
+from herglotz.training.score import Score, free_run_score, scores
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import EXACT, build_model, with_sticking
@@ -42,6 +42,7 @@ SHORT = (5, 10)  # recorded steps of the first segments: over these motion is al
 ASTRAY = 0.25  # of the spread: segments that are missed by more are not followed, whatever shorter ones miss
 FINER = 0.3  # of the misfit: a rule that changes the motion by more is worth trying
 ALIKE = 10.0  # times the σ of exact data: misfits below it are all as good
+LOG_MASS = 10.0  # prior deviation of ln of a mass from those that make all coordinates alike: none is 0
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
 
 
@@ -92,6 +93,13 @@ class Trial:
         return [offer.name for offer in (*self.fitter.offers, *self.fitter.loads) if offer.name in self.taken]
 
     @property
+    def pushing(self) -> dict[str, int]:
+        """Dry friction that would create energy, with its coordinate."""
+        several = self.fitter.data.dof > 1
+        every = {DRY + (f"[{i}]" if several else ""): i for i in range(self.fitter.data.dof)}
+        return {name: i for name, i in every.items() if name in self.taken and self.values[name] <= 0}
+
+    @property
     def length(self) -> int:
         """Recorded steps of its segments."""
         return self.problem.grid.length
@@ -107,11 +115,50 @@ class Trial:
         return self.whole and self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
 
     @cached_property
+    def _own(self) -> HeldOut:
+        """Held-out blocks of this model."""
+        return HeldOut(self.problem, self.path, self.theta, waves=self._waves(self.problem))
+
+    @property
+    def _told(self) -> Tensor:
+        """How much of each number the data tell, (P,)."""
+        return self._own.told([range(self.problem.P)])[0]
+
+    @cached_property
     def score(self) -> Score:
         """Its loss over held-out blocks."""
-        found = score(self.problem, self.path, self.theta, self.told, len(self.taken), self.fitter.floor)
+        (found,) = self._scores(self._own, [range(self.problem.P)], [len(self.taken)])
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
         return found
+
+    @cached_property
+    def linear(self) -> tuple[HeldOut, dict[str, int]]:
+        """Held-out blocks of models with any of the offers, to first order at this fit, and the places of numbers."""
+        names = set(self.fitter.numbers({*(offer.name for offer in self.fitter.offers), *self.taken}))
+        problem = self.problem.of(names, self.problem.sigma, self.fitter.prior(names, self.scales))
+        theta = self.theta.new_tensor([self.values[name] for name in problem.parameters.numbers])
+        places = {name: i for i, name in enumerate(problem.parameters.numbers)}
+        leaving, every = torch.zeros_like(theta), (*self.fitter.offers, *self.fitter.loads)
+        own = [places[name] for offer in every for name in offer.amplitudes if name in places]
+        leaving[own] = -theta[own]
+        fitted = [places[name] for name in self.problem.parameters.numbers]
+        return HeldOut(problem, self.path, theta, fitted, leaving, self._waves(problem)), places
+
+    def scored(self, sets: Sequence[frozenset[str]]) -> list[Score]:
+        """The scores of models with these offers, to first order."""
+        model, places = self.linear
+        numbers = [[places[name] for name in self.fitter.numbers(taken)] for taken in sets]
+        return self._scores(model, numbers, [len(taken) for taken in sets])
+
+    def _scores(self, model: HeldOut, sets: Sequence[Sequence[int]], choices: Sequence[int]) -> list[Score]:
+        return scores(model, sets, choices, self.problem.data.q.numel(), self.fitter.floor)
+
+    def _waves(self, problem: ShootingProblem) -> Tensor:
+        """The weights of the prior of the waves of functions, 0 of other numbers, (P,)."""
+        assert isinstance(problem.prior, Gaussian)
+        waves = {name for own in self.fitter.functions.values() for name in own}
+        ours = [name in waves for name in problem.parameters.numbers]
+        return torch.where(torch.tensor(ours, dtype=torch.bool), problem.prior.weight, 0.0)
 
     def replaces(self, simple: Trial) -> bool:
         """Whether this richer model replaces a simpler one."""
@@ -129,23 +176,6 @@ class Trial:
         other.__dict__["score"] = replace(self.score, zeros=count)
         return other
 
-    def curvature(self, names: Collection[str]) -> tuple[Tensor, Tensor] | None:
-        """(H, g) of these numbers at the fit, the states being eliminated, in units of its misfit."""
-        found, by = self._reduced(names), (self.problem.sigma / max(self.rms, self.fitter.floor)) ** 2
-        return None if found is None else (found[0] * by, found[1] * by)
-
-    def _reduced(self, names: Collection[str]) -> tuple[Tensor, Tensor] | None:
-        """The same in units of the σ that it was fitted with; None where numbers are none."""
-        problem = self.problem.of(names, self.problem.sigma, self.fitter.prior(names, self.scales))
-        problem.path = self.path
-        states = self.path.x[:, 0, : problem.d]
-        theta = states.new_tensor([self.values[name] for name in problem.parameters.numbers])
-        x = problem.pack(theta, states)
-        cost, A, b = problem.normal_equations(x)
-        found = A.reduced(b) if bool(torch.isfinite(cost)) else None
-        finite = found is not None and all(bool(torch.isfinite(x).all()) for x in found[:2])
-        return found[:2] if finite and found is not None else None
-
     @property
     def prior(self) -> Gaussian:
         """Of its numbers."""
@@ -153,43 +183,16 @@ class Trial:
         return self.problem.prior
 
     @cached_property
-    def functions(self) -> dict[str, tuple[list[int], float]]:
-        """The places of the waves of each function, and how many numbers of it the data tell (MacKay 1992).
-
-        Of a number with the prior deviation τ and the posterior one σ that is 1 − σ²/τ².
-        """
-        numbers = self.problem.parameters.numbers
-        place = {name: i for i, name in enumerate(numbers)}
-        every = self.fitter.functions.items()
-        taken = {name: at for name, waves in every if (at := [place[wave] for wave in waves if wave in place])}
-        found = self._reduced(numbers) if taken else None
-        if found is None:
-            return {}
-        told = (1 - self.prior.weight * inverse_of(found[0]).diagonal()).clamp(min=0.0)
-        return {name: (at, float(told[at].sum())) for name, at in taken.items()}
-
-    @property
-    def told(self) -> float:
-        """How many of its numbers the data tell; of those without functions' priors all."""
-        return self.problem.P - sum(len(at) - told for at, told in self.functions.values())
-
-    @cached_property
     def sizes(self) -> dict[str, float]:
         """The variance of each function, over that of its prior, at which this fit is likeliest (MacKay 1992)."""
         numbers, found = self.problem.parameters.numbers, {}
-        for name, (at, told) in self.functions.items():
-            weight = self.theta.new_tensor([self.fitter.weights[numbers[i]] for i in at])
-            found[name] = float((self.theta[at].square() * weight).sum()) / max(told, 1.0)
+        place = {name: i for i, name in enumerate(numbers)}
+        weight = self.fitter.prior(numbers).weight
+        for name, waves in self.fitter.functions.items():
+            if at := [place[wave] for wave in waves if wave in place]:
+                told = float(self._told[at].sum())
+                found[name] = float((self.theta[at].square() * weight[at]).sum()) / max(told, 1.0)
         return {name: size for name, size in found.items() if size > 0}
-
-    @cached_property
-    def everything(self) -> tuple[Tensor, Tensor, dict[str, int]] | None:
-        """`curvature` of the numbers of all offers, and their places."""
-        fitter = self.fitter
-        every = set(fitter.numbers(offer.name for offer in fitter.offers))
-        found = self.curvature(every)
-        at = {name: i for i, name in enumerate(name for name in fitter.start if name in every)}
-        return None if found is None else (*found, at)
 
 
 class Fitter:
@@ -220,6 +223,7 @@ class Fitter:
             self.functions.setdefault(band.function, []).extend(place[text] for text in band.texts)
         for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
             self.weights[every.numbers[i]] = spread**-2
+        self.weights |= {name: LOG_MASS**-2 for name in self.always if "log_diagonal" in name}
         powers = [key for key in place if every_band and self._is_power(key)]
         spreads = prior_spreads(every_band, base, data.balance, powers)
         self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}
@@ -288,8 +292,8 @@ class Fitter:
         path = problem.solve(result.x) if math.isfinite(result.cost) else None
         if path is None:
             return None
-        found = self.start | dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
-        return Trial(self, taken, found, problem, path, scales)
+        found = dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
+        return Trial(self, taken, self.start | found, problem, path, scales)
 
     def foretold(self, trial: Trial) -> Score | None:
         """The score of a free run over the last quarter of every trajectory, which is not fitted; None: no path."""
@@ -301,7 +305,8 @@ class Fitter:
         x = problem.pack(trial.theta, trial.path.x[:, 0, : problem.d])
         result = levenberg_marquardt(problem, x, max_iterations=2 * ITERATIONS, rtol=1e-3, patience=2, damping=NEAR)
         path = problem.solve(result.x) if math.isfinite(result.cost) else None
-        return None if path is None else free_run_score(problem, path, trial.told, len(trial.taken), self.floor)
+        of = trial.score
+        return None if path is None else free_run_score(problem, path, of.numbers, of.choices, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
         """Over segments of the next length; None where there is none, or the model does not follow the data so long."""

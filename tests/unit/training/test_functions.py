@@ -81,29 +81,33 @@ def test_a_well_that_no_dictionary_holds_is_learned_as_a_function(searched):
 def test_what_a_function_costs_is_what_the_data_tell_of_it(searched):
     # fails if each wave counts as a number whatever its prior says, or none does
     _, found = searched
-    waves = sum(len(at) for at, _ in found.functions.values())
-    told = sum(told for _, told in found.functions.values())
+    every = {wave for own in found.fitter.functions.values() for wave in own}
+    waves = len(every & set(found.problem.parameters.numbers))
+    told = found.score.numbers - (found.problem.P - waves)
     assert 4 < told < waves
-    assert found.told == pytest.approx(found.problem.P - waves + told)
     assert all(size > 0 for size in found.sizes.values())
 
 
-def test_the_fit_to_a_part_and_the_quadratic_model_have_the_priors_of_the_fit(searched, monkeypatch):
+def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(searched, monkeypatch):
     # fails if a free run over held-out time, or what is said of offers, is of functions of another size
     _, found = searched
     assert found.scales
-    asked = []
-    of = ShootingProblem.of
-    monkeypatch.setattr(
-        ShootingProblem, "of", lambda *given: asked.append(dict(zip(given[1], given[3].weight, strict=False)))
-        or of(*given),
-    )  # fmt: skip
+    asked, of = [], ShootingProblem.of
+
+    def watched(*given):
+        problem = of(*given)
+        asked.append(dict(zip(problem.parameters.numbers, problem.prior.weight.tolist(), strict=True)))
+        return problem
+
+    monkeypatch.setattr(ShootingProblem, "of", watched)
+    found.__dict__.pop("linear", None)
     found.fitter.foretold(found)
-    found.curvature(found.problem.parameters.numbers)
+    found.scored([found.taken])
     at = {name: i for i, name in enumerate(found.problem.parameters.numbers)}
+    assert len(asked) == 2
     for waves in found.fitter.functions.values():
         for wave in (wave for wave in waves if wave in at):
-            assert {float(own[wave]) for own in asked} == {float(found.prior.weight[at[wave]])}
+            assert {own[wave] for own in asked} == {float(found.prior.weight[at[wave]])}
 
 
 def test_waves_of_a_part_are_those_of_all(monkeypatch):

@@ -63,6 +63,7 @@ class ShootingProblem(StatesProblem):
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
         self.s, self._precise = s, None
         self.masses = JointMasses(self.parameters, data.q)  # that momenta of joints are over
+        self.jointed = bool(grid.joined.any())
         self._weigh()
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
@@ -91,10 +92,8 @@ class ShootingProblem(StatesProblem):
         other.masses = JointMasses(other.parameters, self.data.q)
         other._solved = other._at = other._slopes = other.path = None
         other._weigh()
-        if self.compiled is not None:
-            placed = kernel_of(self.parameters.model, other.parameters)
-            assert placed is not None
-            other.compiled = copy(self.compiled)
+        if other.compiled is not None and (placed := kernel_of(self.parameters.model, other.parameters)):
+            other.compiled = copy(other.compiled)
             other.compiled.placed = placed
         return other
 
@@ -198,7 +197,8 @@ class ShootingProblem(StatesProblem):
             matrix = Arrowhead(sums.corner, sums.border, sums.blocks, torch.zeros_like(sums.blocks), self._eliminate)
             return x.new_full((), torch.inf), matrix, x.new_zeros(len(x) - self.P * held)
         self.path, self._at = path, x.clone()
-        weights, slopes = self._weights(theta), None if held or not self.masses.move else self.masses.slopes(theta)
+        weights, moving = self._weights(theta), not held and self.masses.move and self.jointed
+        slopes = self.masses.slopes(theta) if moving else None
         fit, joints = self._missed_by(path.x), self._joints(path.x, weights)
         if self.compiled is None:
             root = self.root_weights(fit)
@@ -307,7 +307,7 @@ class ShootingProblem(StatesProblem):
         With a mass that is held, a fit would let it go to 0, and all defects of momenta with it.
         """
         with torch.no_grad():
-            mass = self.masses.at(theta) if self.masses.move else self.mass
+            mass = self.masses.at(theta) if self.masses.move and self.jointed else self.mass
         return torch.cat([self.joint_weight[: self.n], mass * self.joint_weight[self.n : 2 * self.n],
                           self.joint_weight[2 * self.n :]])  # fmt: skip
 

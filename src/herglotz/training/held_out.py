@@ -1,0 +1,146 @@
+"""What held-out blocks of time would be missed by, of any set of the numbers of a fit, to first order.
+
+The motion is linearised once, by all numbers that a model may have; leaving out a block, taking a number in and
+leaving one out are then linear algebra. The start of a segment is told by its other samples or, where all of them are
+left out, by its own. What joints say of parameters is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.lifted_newton import Path
+
+BLOCKS = 10  # of time, at least, over all trajectories
+STAY = 20  # first samples of a trajectory, and a tenth of it at most, that are never left out: they tell its start
+RIDGE = 1e-12  # of a unit diagonal: what is added to curvatures, directions of which no sample may tell
+
+
+class HeldOut:
+    """A fit that is linear in its numbers, with the states of segments following."""
+
+    def __init__(
+        self,
+        problem: ShootingProblem,
+        path: Path,
+        theta: Tensor,  # (P,) where the motion was linearised
+        fitted: Sequence[int] | None = None,  # numbers that have been fitted, and would stay were no block left out
+        leaving: Tensor | None = None,  # (P,) by how much numbers move that are left out; 0 without it
+        waves: Tensor | None = None,  # (P,) weights of the prior of the waves of functions; 0 of other numbers
+    ):
+        self.block, self.sigma, P = blocks(problem.data).to(theta.device), problem.sigma, problem.P
+        zero = torch.zeros_like(theta)
+        self.leaving, self.waves = (zero if x is None else x for x in (leaving, waves))
+        r = problem.misfit(path) / problem.sigma
+        by = (problem.weight * problem.root_weights(problem.weight * r))[..., None]
+        slopes = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
+        order = torch.tensor([*range(P), P + problem.d, *range(P, P + problem.d)], device=r.device)
+        rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d): numbers, residual, start
+        segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
+        piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
+        grams = _grams(rows * by, of, len(piece))  # (Q, P + 1 + d, P + 1 + d)
+        whole = grams.new_zeros(problem.grid.segments, *grams.shape[1:]).index_add_(0, piece[:, 0], grams)
+        each = _reduced(whole, P)
+        _, A, b = problem.prior_equations(theta)
+        self.equations = (each.sum(0) + torch.cat([A, b[:, None]], 1)).repeat(int(self.block.max()) + 2, 1, 1)
+        if problem.grid.segments == len(problem.data):  # no joints: what is left of the gradient is no fit's end
+            self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
+        self.rows = rows[..., : P + 1].clone()  # [J, r] where a block is left out and the states follow
+        for k in range(len(self.equations) - 1):
+            mine = (piece[:, 1] == k).nonzero()[:, 0]
+            s, own = piece[mine, 0], grams[mine]
+            kept = whole[s] - own
+            gone = torch.isin(s, piece[piece[:, 1] != k, 0], invert=True)[:, None, None]  # nothing of it is left
+            self.equations[k] += torch.where(gone, 0.0, _reduced(kept, P)).sum(0) - each[s].sum(0)
+            at, place = (self.block == k).nonzero()[:, 0], torch.zeros(len(piece), dtype=torch.long, device=r.device)
+            place[mine] = torch.arange(len(mine), device=r.device)
+            self.rows[at] -= rows[at][..., P + 1 :] @ _following(torch.where(gone, own, kept), P)[place[of[at]]]
+
+    def residuals(self, sets: Sequence[Sequence[int]]) -> Tensor:
+        """(C, N, n) over the balance, of C sets of numbers; NaN where a set has no solution.
+
+        Samples that are in no block have their own residuals.
+        """
+        P, index = self.rows.shape[-1] - 1, self._index(sets)
+        inside = torch.zeros(len(sets), P + 1, dtype=torch.bool, device=index.device).scatter_(1, index, True)[:, :P]
+        equations, moved = self.equations[:-1], torch.where(inside, 0.0, self.leaving)  # (C, P)
+        factor, size, at = _factors(equations, index)
+        b = (equations[..., P, None] + equations[..., :P] @ moved.T).mT.gather(2, at)  # (B, C, k)
+        x = -torch.cholesky_solve((b / size)[..., None], factor)[..., 0] / size
+        step = moved.repeat(len(equations), 1, 1).scatter_add(2, at, torch.where(index < P, x, 0.0))
+        out = self.rows[..., P].repeat(len(sets), 1, 1)
+        for k, by in enumerate(step):
+            own = (self.block == k).nonzero()[:, 0]
+            out[:, own] += (self.rows[own][..., :P] @ by.T).permute(2, 0, 1)
+        return out * self.sigma
+
+    def told(self, sets: Sequence[Sequence[int]]) -> Tensor:
+        """How much of each number the data tell, (C, P); 0 of those that are in no set, 1 of those that are no waves.
+
+        Of a number with the prior deviation τ and the posterior one σ that is 1 − σ²/τ² (MacKay 1992).
+        """
+        P, index = self.rows.shape[-1] - 1, self._index(sets)
+        found = torch.zeros(len(sets), P + 1, dtype=self.rows.dtype, device=index.device).scatter_(1, index, 1.0)[:, :P]
+        if bool(self.waves.any()):
+            (factor,), (size,), (at,) = _factors(self.equations[-1:], index)
+            variance = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1) / size.square()
+            untold = (self.waves[at] * variance).clamp(max=1.0) * (index < P)
+            found = found.scatter_add(1, at, -untold)
+        return found
+
+    def _index(self, sets: Sequence[Sequence[int]]) -> Tensor:
+        """(C, k) numbers of each set, and behind the last one P, which is none."""
+        P, width = self.rows.shape[-1] - 1, max(len(own) for own in sets)
+        padded = [[*own, *[P] * (width - len(own))] for own in sets]
+        return torch.tensor(padded, device=self.rows.device).reshape(len(sets), width)
+
+
+def _factors(equations: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cholesky factors (B, C, k, k) of the curvatures of sets scaled to a unit diagonal, the scales, and places.
+
+    Of a curvature that is none the factor is NaN.
+    """
+    P = equations.shape[1]
+    there, i = index < P, index.clamp(max=P - 1)
+    A = equations[:, i[:, :, None], i[:, None, :]] * there[:, :, None] * there[:, None, :]
+    size = A.diagonal(dim1=-2, dim2=-1)
+    size = torch.where(size > 0, size, 1.0).sqrt()
+    A = A / size[..., None] / size[..., None, :] + torch.diag_embed(torch.where(there, RIDGE, 1.0))
+    factor, info = torch.linalg.cholesky_ex(A.nan_to_num(nan=-1.0))
+    return torch.where((info == 0)[..., None, None], factor, torch.nan), size, i.expand(len(A), *i.shape)
+
+
+def blocks(data: Trajectories) -> Tensor:
+    """The block of time of every sample, (N,); −1: it stays. Every trajectory has two at least."""
+    each, parts, first = max(2, -(-BLOCKS // len(data))), [], 0
+    for length in data.lengths:
+        part = torch.arange(length) * each // length + first
+        part[: min(STAY, length // 10)] = -1
+        parts.append(part)
+        first += each
+    return torch.cat(parts)
+
+
+def _grams(rows: Tensor, of: Tensor, count: int) -> Tensor:
+    """Σ row rowᵀ of each piece, (Q, w, w): pieces are runs of samples."""
+    counts = torch.bincount(of, minlength=count).tolist()
+    parts = [part.flatten(0, 1) for part in rows.split(counts)]
+    return torch.stack([part.T @ part for part in parts])
+
+
+def _following(grams: Tensor, P: int) -> Tensor:
+    """T⁻¹ [B, b_x] of each segment alone, (S, d, P + 1): by how much its start moves with a number, and by itself."""
+    T = grams[:, P + 1 :, P + 1 :]
+    size = T.diagonal(dim1=-2, dim2=-1)
+    T = T + torch.diag_embed(RIDGE * size + torch.finfo(T.dtype).tiny ** 0.5)
+    return torch.linalg.solve(T, grams[:, P + 1 :, : P + 1])
+
+
+def _reduced(grams: Tensor, P: int) -> Tensor:
+    """[C − Bᵀ T⁻¹ B, b_θ − Bᵀ T⁻¹ b_x] of each segment alone, its start being eliminated, (S, P, P + 1)."""
+    return grams[:, :P, : P + 1] - grams[:, :P, P + 1 :] @ _following(grams, P)
