@@ -16,6 +16,7 @@ from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.functions import REACH, bands
 from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.prior import Gaussian
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.search import Search
 from herglotz.training.task import build_model
@@ -96,6 +97,7 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
 
     def watched(*given):
         problem = of(*given)
+        assert isinstance(problem.prior, Gaussian)
         asked.append(dict(zip(problem.parameters.numbers, problem.prior.weight.tolist(), strict=True)))
         return problem
 
