@@ -15,8 +15,7 @@ from herglotz.models.features import parse
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.functions import REACH, bands
-from herglotz.training.problems.prior import prior_of
-from herglotz.training.problems.prior import Gaussian
+from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.search import Search
 from herglotz.training.task import build_model
