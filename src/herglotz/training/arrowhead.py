@@ -54,34 +54,19 @@ class Arrowhead:
         T[k[1:], :, k[:-1]] = self.upper[:-1].mT
         return A
 
-    def reduced(self, b: Tensor, damping: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor] | None:
-        """(C − Bᵀ T⁻¹ B, b_θ − Bᵀ T⁻¹ b_x, T⁻¹ [B, b_x]): the parameters' own equations, the states being eliminated.
-
-        None where T is not positive definite.
-        """
+    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
+        """(matrix + diag(damping))⁻¹ b, the states being eliminated first; None where there is no finite one."""
         P, (S, d) = len(self.corner), self.border.shape[:2]
-        corner, blocks = self.corner, self.blocks
-        if damping is not None:
-            corner = corner + torch.diag(damping[:P])
-            blocks = blocks + torch.diag_embed(damping[P:].reshape(S, d))
-        columns = torch.cat([self.border, b[P:].reshape(S, d, 1)], -1)
-        solved = self.eliminate(blocks, self.upper, columns)
+        blocks = self.blocks + torch.diag_embed(damping[P:].reshape(S, d))
+        solved = self.eliminate(blocks, self.upper, torch.cat([self.border, b[P:].reshape(S, d, 1)], -1))
         if solved is None:
             return None
         taken = self.border.flatten(0, 1).T @ solved.flatten(0, 1)
-        reduced = corner - taken[:, :P]
-        return (reduced + reduced.T) / 2, b[:P] - taken[:, P], solved
-
-    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(matrix + diag(damping))⁻¹ b, or None where there is no finite one."""
-        found = self.reduced(b, damping)
-        if found is None:
-            return None
-        matrix, right, solved = found
-        factor, info = torch.linalg.cholesky_ex(matrix)
+        reduced = self.corner + torch.diag(damping[:P]) - taken[:, :P]
+        factor, info = torch.linalg.cholesky_ex((reduced + reduced.T) / 2)
         if int(info) != 0:
             return None
-        top = torch.cholesky_solve(right[:, None], factor)[:, 0]
+        top = torch.cholesky_solve((b[:P] - taken[:, P])[:, None], factor)[:, 0]
         step = torch.cat([top, (solved[..., -1] - solved[..., :-1] @ top).flatten()])
         return step if bool(torch.isfinite(step).all()) else None
 

@@ -29,7 +29,7 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     between = any(key in keys for key in ("kinetic.off_diagonal", "coupling.viscous"))
     terms = replace(terms, dry=dry, apart=not between, one_rate=every.one_rate or not forces)
     variant = trial.fitter.variant
-    of = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
+    of = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking and dry)
     names = ParameterVector(build_model(bare, of, "none"))
     absent = [
         name for name, key in zip(names.numbers, keys_of(names.numbers, names.model.config), strict=True)

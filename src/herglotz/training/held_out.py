@@ -48,7 +48,7 @@ class HeldOut:
         each = _reduced(whole, P)
         _, A, b = problem.prior_equations(theta)
         self.equations = (each.sum(0) + torch.cat([A, b[:, None]], 1)).repeat(int(self.block.max()) + 2, 1, 1)
-        if problem.grid.segments == len(problem.data):  # no joints: what is left of the gradient is no fit's end
+        if not problem.jointed:  # else joints hold a fit whose samples alone would send it on
             self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
         self.rows = rows[..., : P + 1].clone()  # [J, r] where a block is left out and the states follow
         for k in range(len(self.equations) - 1):
@@ -89,7 +89,7 @@ class HeldOut:
         if bool(self.waves.any()):
             (factor,), (size,), (at,) = _factors(self.equations[-1:], index)
             variance = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1) / size.square()
-            untold = (self.waves[at] * variance).clamp(max=1.0) * (index < P)
+            untold = (self.waves[at] * variance).clamp(max=1.0).nan_to_num(nan=0.0) * (index < P)
             found = found.scatter_add(1, at, -untold)
         return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -97,23 +98,21 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
 
     Raise InputError if the data cannot be used, or do not suit the settings.
     """
-    seen = _seen(data, user_settings, stages, plan, ())
-    found = seen.found
-    if found is None or not (found.hold or found.zeros or not found.turning):
-        return seen
-    said = [f", hold {found.hold}"] * bool(found.hold) + [f", zeros {found.zeros}"] * bool(found.zeros)
-    said += [] if found.turning else [", on a line"]
-    data = data if found.turning else on_a_line(data)
-    stages = stages.labelled(stages.label + "".join(said))
-    data = replace(data, hold=found.hold) if found.hold else data
-    again, turning = _seen(data, user_settings, stages, plan, found.zeros), found.turning
-    if turning and again.found is not None and not again.found.turning:
-        turning, stages = False, stages.labelled(stages.label + ", on a line")
-        again = _seen(on_a_line(data), user_settings, stages, plan, found.zeros)
-    if found.hold:
-        why = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
-        again = replace(again, why_arrival=seen.why_arrival | {"hold": why})
-    return replace(again, why_zeros=found.why_zeros or seen.why_zeros, turning=turning)
+    seen, zeros = _seen(data, user_settings, stages, plan, ()), ()
+    changed: dict[str, Any] = {}  # what a look again does not say
+    while (found := seen.found) is not None and (found.hold or not found.turning or (found.zeros and not zeros)):
+        label = stages.label
+        if found.hold:
+            told = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
+            data, label = replace(data, hold=found.hold), label + f", hold {found.hold}"
+            changed["why_arrival"] = seen.why_arrival | {"hold": told}
+        if found.zeros and not zeros:
+            zeros, label, changed["why_zeros"] = found.zeros, label + f", zeros {found.zeros}", found.why_zeros
+        if not found.turning:
+            data, label, changed["turning"] = on_a_line(data), label + ", on a line", False
+        stages = stages.labelled(label)
+        seen = _seen(data, user_settings, stages, plan, zeros)
+    return replace(seen, **changed)
 
 
 def on_a_line(data: Trajectories) -> Trajectories:

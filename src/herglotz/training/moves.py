@@ -12,7 +12,7 @@ from herglotz.training.held_out import BLOCKS
 from herglotz.training.score import Score
 from herglotz.training.trials import Trial
 
-AT_ONCE = 8  # an eighth of the offers may leave at once
+AT_ONCE = 8  # offers of which one leaves at once: of 80 ten, of fewer than 16 one
 MEMORY = 10_000_000  # numbers in the curvatures of sets that are compared at once: 80 MB
 
 Offers = frozenset[str]

@@ -31,7 +31,7 @@ from herglotz.training.task import LEAST_GRIP, build_model
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Compared, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
-FEW = 5  # iterations of trials on more samples than a search is made of, each for one offer
+FEW = 5  # the same as `ITERATIONS`, on more samples than a search is made of
 TRIED = 3  # changes of a kind whose fits are compared, of those that the linear motion puts first
 EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
 FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
@@ -260,15 +260,24 @@ class Search:
         return found
 
     def braking(self, trial: Trial) -> Trial:
-        """With a load in the place of dry friction that pushes, which would create energy, or with neither."""
+        """With a load in the place of dry friction that pushes, which would create energy, or with neither.
+
+        What made up for it leaves then, and what it stood for joins.
+        """
+        braked = self._braked(trial)
+        return trial if braked is trial else self._braked(self.settled(braked, swapped=True))
+
+    @staticmethod
+    def _braked(trial: Trial) -> Trial:
+        """The same before other offers leave and join."""
         while pushing := trial.pushing:
-            every = (*trial.fitter.offers, *trial.fitter.loads)
-            loads = {offer.name for offer in every if offer.name in {f"load {i + 1}" for i in pushing.values()}}
+            every = {offer.name for offer in (*trial.fitter.offers, *trial.fitter.loads)}
+            loads = every & {f"load {i + 1}" for i in pushing.values()}
             taken = trial.taken - set(pushing) | loads
             other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS)
             if other is None:
                 break
-            trial = self.settled(other, swapped=True)
+            trial = other
         return trial
 
     def stuck(self, trial: Trial | None) -> Trial | None:

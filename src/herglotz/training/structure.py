@@ -130,10 +130,10 @@ def search(
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
     found = wanted.run()
-    differ = None if found is None else wanted.zeros(found)  # with zeros `look` searches again
-    if differ is None and wanted.better_on_a_line(found):  # which a search with sizes of its own finds again
+    # A search of positions on a line, with inputs and sizes of its own, finds them again. Zeros would do as well.
+    if wanted.better_on_a_line(found) and (found is None or wanted.zeros(found) is None):
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
-    found = wanted.with_functions(found) if found is not None and differ is None else found
+    found = found and wanted.with_functions(found)
     if found is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     noise = precision(data)
@@ -146,8 +146,7 @@ def search(
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
     zeros, why, compared = (), "", wanted.compared(found)
-    differ = wanted.zeros(found) if differ is None else differ
-    if differ is not None:
+    if (differ := wanted.zeros(found)) is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     return Structure(settings, base, words, found.rms, zeros, why, True, compared, wanted.held(found, holds))
 

@@ -42,7 +42,6 @@ SHORT = (5, 10)  # recorded steps of the first segments: over these motion is al
 ASTRAY = 0.25  # of the spread: segments that are missed by more are not followed, whatever shorter ones miss
 FINER = 0.3  # of the misfit: a rule that changes the motion by more is worth trying
 ALIKE = 10.0  # times the σ of exact data: misfits below it are all as good
-LOG_MASS = 10.0  # prior deviation of ln of a mass from those that make all coordinates alike: none is 0
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
 
 
@@ -107,7 +106,7 @@ class Trial:
     @property
     def whole(self) -> bool:
         """Whether it follows whole trajectories."""
-        return self.problem.grid.segments == len(self.problem.data)
+        return not self.problem.jointed
 
     @property
     def at_the_noise(self) -> bool:
@@ -117,9 +116,10 @@ class Trial:
     @cached_property
     def _own(self) -> HeldOut:
         """Held-out blocks of this model."""
-        return HeldOut(self.problem, self.path, self.theta, waves=self._waves(self.problem))
+        waves = self._waves(self.prior, self.problem.parameters.numbers)
+        return HeldOut(self.problem, self.path, self.theta, waves=waves)
 
-    @property
+    @cached_property
     def _told(self) -> Tensor:
         """How much of each number the data tell, (P,)."""
         return self._own.told([range(self.problem.P)])[0]
@@ -135,14 +135,16 @@ class Trial:
     def linear(self) -> tuple[HeldOut, dict[str, int]]:
         """Held-out blocks of models with any of the offers, to first order at this fit, and the places of numbers."""
         names = set(self.fitter.numbers({*(offer.name for offer in self.fitter.offers), *self.taken}))
-        problem = self.problem.of(names, self.problem.sigma, self.fitter.prior(names, self.scales))
-        theta = self.theta.new_tensor([self.values[name] for name in problem.parameters.numbers])
-        places = {name: i for i, name in enumerate(problem.parameters.numbers)}
+        prior = self.fitter.prior(names, self.scales)
+        problem = self.problem.of(names, self.problem.sigma, prior)
+        numbers = problem.parameters.numbers
+        theta = self.theta.new_tensor([self.values[name] for name in numbers])
+        places = {name: i for i, name in enumerate(numbers)}
         leaving, every = torch.zeros_like(theta), (*self.fitter.offers, *self.fitter.loads)
         own = [places[name] for offer in every for name in offer.amplitudes if name in places]
         leaving[own] = -theta[own]
         fitted = [places[name] for name in self.problem.parameters.numbers]
-        return HeldOut(problem, self.path, theta, fitted, leaving, self._waves(problem)), places
+        return HeldOut(problem, self.path, theta, fitted, leaving, self._waves(prior, numbers)), places
 
     def scored(self, sets: Sequence[frozenset[str]]) -> list[Score]:
         """The scores of models with these offers, to first order."""
@@ -153,12 +155,10 @@ class Trial:
     def _scores(self, model: HeldOut, sets: Sequence[Sequence[int]], choices: Sequence[int]) -> list[Score]:
         return scores(model, sets, choices, self.problem.data.q.numel(), self.fitter.floor)
 
-    def _waves(self, problem: ShootingProblem) -> Tensor:
+    def _waves(self, prior: Gaussian, numbers: Sequence[str]) -> Tensor:
         """The weights of the prior of the waves of functions, 0 of other numbers, (P,)."""
-        assert isinstance(problem.prior, Gaussian)
         waves = {name for own in self.fitter.functions.values() for name in own}
-        ours = [name in waves for name in problem.parameters.numbers]
-        return torch.where(torch.tensor(ours, dtype=torch.bool), problem.prior.weight, 0.0)
+        return torch.where(torch.tensor([name in waves for name in numbers], dtype=torch.bool), prior.weight, 0.0)
 
     def replaces(self, simple: Trial) -> bool:
         """Whether this richer model replaces a simpler one."""
@@ -223,7 +223,6 @@ class Fitter:
             self.functions.setdefault(band.function, []).extend(place[text] for text in band.texts)
         for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
             self.weights[every.numbers[i]] = spread**-2
-        self.weights |= {name: LOG_MASS**-2 for name in self.always if "log_diagonal" in name}
         powers = [key for key in place if every_band and self._is_power(key)]
         spreads = prior_spreads(every_band, base, data.balance, powers)
         self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}

@@ -103,7 +103,7 @@ class ShootingProblem(StatesProblem):
         Where the model misses more than the noise, states fitted to what it misses would make up for forces: parameters
         with the least misfit would then not be those of the least error of a free run from the recorded start.
         """
-        if self.grid.segments > len(self.data):
+        if self.jointed:
             return torch.ones_like(self.data.q)
         if self._precise is None:
             self._precise = precisions(self.data).to(self.data.q)
