@@ -45,7 +45,7 @@ class HeldOut:
         piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
         grams = _grams(rows * by, of, len(piece))  # (Q, P + 1 + d, P + 1 + d)
         whole = grams.new_zeros(problem.grid.segments, *grams.shape[1:]).index_add_(0, piece[:, 0], grams)
-        each = _reduced(whole, P)
+        self.following, each = _following(whole, P), _reduced(whole, P)
         _, A, b = problem.prior_equations(theta)
         self.equations = (each.sum(0) + torch.cat([A, b[:, None]], 1)).repeat(int(self.block.max()) + 2, 1, 1)
         if not problem.jointed:  # else joints hold a fit whose samples alone would send it on
@@ -66,18 +66,27 @@ class HeldOut:
 
         Samples that are in no block have their own residuals.
         """
-        P, index = self.rows.shape[-1] - 1, self._index(sets)
-        inside = torch.zeros(len(sets), P + 1, dtype=torch.bool, device=index.device).scatter_(1, index, True)[:, :P]
-        equations, moved = self.equations[:-1], torch.where(inside, 0.0, self.leaving)  # (C, P)
-        factor, size, at = _factors(equations, index)
-        b = (equations[..., P, None] + equations[..., :P] @ moved.T).mT.gather(2, at)  # (B, C, k)
-        x = -torch.cholesky_solve((b / size)[..., None], factor)[..., 0] / size
-        step = moved.repeat(len(equations), 1, 1).scatter_add(2, at, torch.where(index < P, x, 0.0))
+        P = self.rows.shape[-1] - 1
         out = self.rows[..., P].repeat(len(sets), 1, 1)
-        for k, by in enumerate(step):
+        for k, by in enumerate(self._steps(self.equations[:-1], sets)):
             own = (self.block == k).nonzero()[:, 0]
             out[:, own] += (self.rows[own][..., :P] @ by.T).permute(2, 0, 1)
         return out * self.sigma
+
+    def steps(self, own: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """By how much numbers (P,) and starts of segments (S, d) move in a model of these numbers; NaN: no solution."""
+        ((step,),) = self._steps(self.equations[-1:], [own])
+        return step, -self.following @ torch.cat([step, step.new_ones(1)])
+
+    def _steps(self, equations: Tensor, sets: Sequence[Sequence[int]]) -> Tensor:
+        """By how much all numbers move by each of these equations (B, P, P + 1) with each of C sets, (B, C, P)."""
+        P, index = self.rows.shape[-1] - 1, self._index(sets)
+        inside = torch.zeros(len(sets), P + 1, dtype=torch.bool, device=index.device).scatter_(1, index, True)[:, :P]
+        moved = torch.where(inside, 0.0, self.leaving)  # (C, P)
+        factor, size, at = _factors(equations, index)
+        b = (equations[..., P, None] + equations[..., :P] @ moved.T).mT.gather(2, at)  # (B, C, k)
+        x = -torch.cholesky_solve((b / size)[..., None], factor)[..., 0] / size
+        return moved.repeat(len(equations), 1, 1).scatter_add(2, at, torch.where(index < P, x, 0.0))
 
     def told(self, sets: Sequence[Sequence[int]]) -> Tensor:
         """How much of each number the data tell, (C, P); 0 of those that are in no set, 1 of those that are no waves.

@@ -6,10 +6,14 @@ fit (`held_out`): that is a matter of milliseconds for all offers, where fits ta
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import cached_property
 
-from herglotz.training.held_out import BLOCKS
-from herglotz.training.score import Score
+import torch
+from torch import Tensor
+
+from herglotz.training.held_out import BLOCKS, HeldOut
+from herglotz.training.score import Score, scores
 from herglotz.training.trials import Trial
 
 AT_ONCE = 8  # offers of which one leaves at once: of 80 ten, of fewer than 16 one
@@ -22,19 +26,53 @@ class Moves:
     """Models with the offers of one fit, by their scores to first order."""
 
     def __init__(self, trial: Trial):
-        self.trial, self.offered = trial, trial.fitter.offered
-        self.names = [offer.name for offer in trial.fitter.offers]
+        self.trial, self.fitter, self.offered = trial, trial.fitter, trial.fitter.offered
+        self.names = [offer.name for offer in self.fitter.offers]
         self.known: dict[Offers, Score] = {}
 
+    @cached_property
+    def _linear(self) -> tuple[HeldOut, dict[str, int]]:
+        """The motion, linear in the numbers of all offers, and the places of these."""
+        trial, fitter = self.trial, self.fitter
+        names = fitter.numbers({*self.names, *trial.taken})
+        prior = fitter.prior(names, trial.scales)
+        problem = trial.problem.of(names, trial.problem.sigma, prior)
+        numbers = problem.parameters.numbers
+        theta = trial.theta.new_tensor([trial.values[name] for name in numbers])
+        places = {name: i for i, name in enumerate(numbers)}
+        leaving, every = torch.zeros_like(theta), (*fitter.offers, *fitter.loads)
+        own = [places[name] for offer in every for name in offer.amplitudes if name in places]
+        leaving[own] = -theta[own]
+        fitted = [places[name] for name in trial.problem.parameters.numbers]
+        return HeldOut(problem, trial.path, theta, fitted, leaving, fitter.waves(prior, numbers)), places
+
     def scores(self, sets: Iterable[Offers]) -> list[Score]:
-        """Of these sets of offers."""
+        """Of models with these sets of offers."""
         sets = list(sets)
         new = [own for own in dict.fromkeys(sets) if own not in self.known]
         many = max(1, MEMORY // (BLOCKS * (1 + max(map(len, new), default=0)) ** 2))
         for k in range(0, len(new), many):
             part = new[k : k + many]
-            self.known.update(zip(part, self.trial.scored(part), strict=True))
+            self.known.update(zip(part, self.foretold(part), strict=True))
         return [self.known[own] for own in sets]
+
+    def foretold(self, sets: Sequence[Offers]) -> list[Score]:
+        """The same without a memory."""
+        (model, places), count = self._linear, self.trial.problem.data.q.numel()
+        numbers = [[places[name] for name in self.fitter.numbers(own)] for own in sets]
+        return scores(model, numbers, [len(own) for own in sets], count, self.fitter.floor)
+
+    def start(self, offers: Offers) -> tuple[dict[str, float], Tensor | None]:
+        """The values of all numbers and the starts (S, d) of a model with these offers.
+
+        Over segments with joints, which this motion knows nothing of, they are those of the fit (None).
+        """
+        trial, (model, places) = self.trial, self._linear
+        numbers, starts = model.steps([places[name] for name in self.fitter.numbers(offers)])
+        if trial.problem.jointed or not bool(torch.isfinite(numbers).all() and torch.isfinite(starts).all()):
+            return trial.values, None
+        values = {name: trial.values[name] + float(numbers[i]) for name, i in places.items()}
+        return trial.values | values, trial.path.x[:, 0, : trial.problem.d] + starts
 
     def joining(self, at: Offers) -> list[Offers]:
         """With one more offer, the best first; none that is not better."""

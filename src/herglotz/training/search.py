@@ -180,9 +180,11 @@ class Search:
         for taken in (taken for kind in kinds for taken in kind(at)[: self.tried]):
             if taken in seen:
                 continue
-            other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * self.most)
-            fair = other is not None and set(other.pushing) <= set(trial.pushing)
-            if fair and self.better(trial, other) is other:
+            values, states = moves.start(taken)
+            other = trial.fitter.fit(taken, values, trial.length, trial, 2 * self.most, states)
+            if other is None or not set(other.pushing) <= set(trial.pushing):
+                continue
+            if self.better(trial, other) is other:
                 return other
         return None
 

@@ -116,7 +116,7 @@ class Trial:
     @cached_property
     def _own(self) -> HeldOut:
         """Held-out blocks of this model."""
-        waves = self._waves(self.prior, self.problem.parameters.numbers)
+        waves = self.fitter.waves(self.prior, self.problem.parameters.numbers)
         return HeldOut(self.problem, self.path, self.theta, waves=waves)
 
     @cached_property
@@ -127,38 +127,10 @@ class Trial:
     @cached_property
     def score(self) -> Score:
         """Its loss over held-out blocks."""
-        (found,) = self._scores(self._own, [range(self.problem.P)], [len(self.taken)])
+        count, choices = self.problem.data.q.numel(), [len(self.taken)]
+        (found,) = scores(self._own, [range(self.problem.P)], choices, count, self.fitter.floor)
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
         return found
-
-    @cached_property
-    def linear(self) -> tuple[HeldOut, dict[str, int]]:
-        """Held-out blocks of models with any of the offers, to first order at this fit, and the places of numbers."""
-        names = set(self.fitter.numbers({*(offer.name for offer in self.fitter.offers), *self.taken}))
-        prior = self.fitter.prior(names, self.scales)
-        problem = self.problem.of(names, self.problem.sigma, prior)
-        numbers = problem.parameters.numbers
-        theta = self.theta.new_tensor([self.values[name] for name in numbers])
-        places = {name: i for i, name in enumerate(numbers)}
-        leaving, every = torch.zeros_like(theta), (*self.fitter.offers, *self.fitter.loads)
-        own = [places[name] for offer in every for name in offer.amplitudes if name in places]
-        leaving[own] = -theta[own]
-        fitted = [places[name] for name in self.problem.parameters.numbers]
-        return HeldOut(problem, self.path, theta, fitted, leaving, self._waves(prior, numbers)), places
-
-    def scored(self, sets: Sequence[frozenset[str]]) -> list[Score]:
-        """The scores of models with these offers, to first order."""
-        model, places = self.linear
-        numbers = [[places[name] for name in self.fitter.numbers(taken)] for taken in sets]
-        return self._scores(model, numbers, [len(taken) for taken in sets])
-
-    def _scores(self, model: HeldOut, sets: Sequence[Sequence[int]], choices: Sequence[int]) -> list[Score]:
-        return scores(model, sets, choices, self.problem.data.q.numel(), self.fitter.floor)
-
-    def _waves(self, prior: Gaussian, numbers: Sequence[str]) -> Tensor:
-        """The weights of the prior of the waves of functions, 0 of other numbers, (P,)."""
-        waves = {name for own in self.fitter.functions.values() for name in own}
-        return torch.where(torch.tensor([name in waves for name in numbers], dtype=torch.bool), prior.weight, 0.0)
 
     def replaces(self, simple: Trial) -> bool:
         """Whether this richer model replaces a simpler one."""
@@ -251,6 +223,11 @@ class Fitter:
             like.new_tensor([weights.get(name, 0.0) for name in own]),
         )
 
+    def waves(self, prior: Gaussian, numbers: Sequence[str]) -> Tensor:
+        """The weights of a prior of these numbers that are waves of functions, 0 of the others, (P,)."""
+        waves = {name for own in self.functions.values() for name in own}
+        return torch.where(torch.tensor([name in waves for name in numbers], dtype=torch.bool), prior.weight, 0.0)
+
     def problem(self, length: int) -> ShootingProblem:
         """Of all numbers."""
         if length not in self.problems:
@@ -266,9 +243,10 @@ class Fitter:
         return [*self.always, *(name for offer in every if offer.name in taken for name in offer.numbers)]
 
     def fit(
-        self, taken: Iterable[str], values: dict[str, float], length: int, before: Trial | None, most: int = ITERATIONS
-    ) -> Trial | None:
-        """From these values, and from the states of a fit before or smoothed samples; None where no path is found."""
+        self, taken: Iterable[str], values: dict[str, float], length: int, before: Trial | None, most: int = ITERATIONS,
+        states: Tensor | None = None,
+    ) -> Trial | None:  # fmt: skip
+        """From these values and states, or those of a fit before or of smoothed samples; None: no path is found."""
         taken, every = frozenset(taken), self.problem(length)
         names = self.numbers(taken)
         sigma = every.sigma if before is None else max(before.rms, self.floor)
@@ -281,7 +259,8 @@ class Fitter:
             if problem.compiled is None:
                 problem.guess_from_states(states_of_pairs(self.model, self.smooth))
         else:
-            states = before.problem.states_at(before.path, problem.grid.start_sample)
+            if states is None:
+                states = before.problem.states_at(before.path, problem.grid.start_sample)
             if problem.compiled is None:
                 problem.guess_from(before.problem, before.path)
         x = problem.pack(theta, states)

@@ -15,6 +15,7 @@ from herglotz.models.features import parse
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.functions import REACH, bands
+from herglotz.training.moves import Moves
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.search import Search
@@ -102,9 +103,8 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
         return problem
 
     monkeypatch.setattr(ShootingProblem, "of", watched)
-    found.__dict__.pop("linear", None)
     found.fitter.foretold(found)
-    found.scored([found.taken])
+    Moves(found).scores([found.taken])
     at = {name: i for i, name in enumerate(found.problem.parameters.numbers)}
     assert len(asked) == 2
     for waves in found.fitter.functions.values():
