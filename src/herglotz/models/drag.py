@@ -118,9 +118,7 @@ def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) 
     return DragFeature(on - 1, at - 1, a, 0, 0, dry=True, wave=wave, rate=rate)
 
 
-def _position(
-    text: str, found: dict[str, str | None], on: int, angles: Sequence[bool]
-) -> tuple[int, int, str, float]:
+def _position(text: str, found: dict[str, str | None], on: int, angles: Sequence[bool]) -> tuple[int, int, str, float]:
     """The number of the coordinate whose position a force depends on, `on` without one, its power, wave and rate."""
     at, wave, rate = int(found["angle"] or found["q"] or on), found["wave"] or "", float(found["rate"] or 1)
     a = int(found["a"] or 1) if found["q"] else 0

@@ -100,18 +100,19 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     """
     seen, zeros = _seen(data, user_settings, stages, plan, ()), ()
     changed: dict[str, Any] = {}  # what a look again does not say
-    while (found := seen.found) is not None and (found.hold or not found.turning or (found.zeros and not zeros)):
+    while (found := seen.found) is not None and (found.hold or found.zeros or not found.turning):
+        known = found._replace(hold="", zeros=(), why_zeros="") if found.turning else None
         label = stages.label
         if found.hold:
             told = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
             data, label = replace(data, hold=found.hold), label + f", hold {found.hold}"
             changed["why_arrival"] = seen.why_arrival | {"hold": told}
-        if found.zeros and not zeros:
+        if found.zeros:
             zeros, label, changed["why_zeros"] = found.zeros, label + f", zeros {found.zeros}", found.why_zeros
         if not found.turning:
             data, label, changed["turning"] = on_a_line(data), label + ", on a line", False
         stages = stages.labelled(label)
-        seen = _seen(data, user_settings, stages, plan, zeros)
+        seen = _seen(data, user_settings, stages, plan, zeros, known)
     return replace(seen, **changed)
 
 
@@ -121,9 +122,10 @@ def on_a_line(data: Trajectories) -> Trajectories:
 
 
 def _seen(
-    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None, zeros: tuple[float, ...]
-) -> Look:
-    """What `look` gives of sensors with these zeros (`herglotz.training.sensor_zeros`)."""
+    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None, zeros: tuple[float, ...],
+    known: Structure | None = None,
+) -> Look:  # fmt: skip
+    """What `look` gives of sensors with these zeros (`herglotz.training.sensor_zeros`), or of terms that are known."""
     settings = user_settings.resolved(data)
     zeros = zeros if plan is None else plan.zeros
     said, (data, arrival, why_arrival) = data, _read(measured(data, zeros), settings)
@@ -142,7 +144,7 @@ def _seen(
         noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
     if plan is None:
-        seen = _with_terms(seen, user_settings, stages, _other_holds(said, arrival))
+        seen = _with_terms(seen, user_settings, stages, _other_holds(said, arrival), known)
     else:
         seen = replace(seen, base=plan.started(base))
         if plan.network == "covered":
@@ -170,13 +172,15 @@ def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Traje
     return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
 
 
-def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, holds: Sequence[str]) -> Look:
+def _with_terms(
+    seen: Look, user_settings: FitConfig, stages: Stages, holds: Sequence[str], known: Structure | None
+) -> Look:
     """Named terms that follow trajectories, or terms of a dictionary of features, or those of the baseline."""
     kept, base, settings = seen.kept, seen.base, seen.settings
     if terms_are_free(kept, user_settings):
         # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
         plain = replace(settings, sticking=settings.sticking or user_settings.sticking)
-        find = lambda: search(kept, base, plain, outliers=seen.outliers, holds=holds)  # noqa: E731
+        find = lambda: known or search(kept, base, plain, outliers=seen.outliers, holds=holds)  # noqa: E731
         found = kept_structure("terms", find, base, settings, stages)
         seen = replace(seen, structure=found.reason, found=found)
         if found.sigma is not None or not found.turning:  # else `look` looks again

@@ -6,13 +6,14 @@ fit (`held_out`): that is a matter of milliseconds for all offers, where fits ta
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from herglotz.training.held_out import BLOCKS, HeldOut
+from herglotz.training.offers import standing
 from herglotz.training.score import Score, scores
 from herglotz.training.trials import Trial
 
@@ -75,13 +76,18 @@ class Moves:
         return trial.values | values, trial.path.x[:, 0, : trial.problem.d] + starts
 
     def joining(self, at: Offers) -> list[Offers]:
-        """With one more offer, the best first; none that is not better."""
-        return self._better(at, [at | {name} for name in self.names if name not in at])
+        """With one more offer, and what it is of, the best first; none that is not better."""
+        own = [offer for offer in self.fitter.offers if offer.name not in at]
+        return self._better(at, [at | {offer.name, offer.on or offer.name} for offer in own])
 
     def exchanges(self, at: Offers) -> list[Offers]:
         """With one offer in the place of another, the best first; none that is not better."""
         pairs = [(new, old) for old in self.names if old in at for new in self.names if new not in at]
-        return self._better(at, [at - {old} | {new} for new, old in pairs])
+        return self._better(at, [self._without(at | {new}, {old}) for new, old in pairs])
+
+    def _without(self, at: Offers, gone: Collection[str]) -> Offers:
+        """What is left where some offers leave."""
+        return standing(self.fitter.offers, at - set(gone))
 
     def _better(self, at: Offers, sets: list[Offers]) -> list[Offers]:
         """Those that replace `at`, the best first."""
@@ -93,10 +99,12 @@ class Moves:
         """The fewest offers that are as good, and some on the way: the one that is missed least leaves first."""
         (best,), now, way, most = self.scores([at]), at, [], 0
         while names := [name for name in self.names if name in now]:
-            gains = [best.gain(score, self.offered) for score in self.scores([now - {name} for name in names])]
+            gains = [
+                best.gain(score, self.offered) for score in self.scores([self._without(now, {name}) for name in names])
+            ]
             order = [name for _, name in sorted(zip(gains, names, strict=True))]
             many = max(1, min(len(names) // AT_ONCE, sum(gain <= 0 for gain in gains)))
-            parts = [now - set(order[: many >> k]) for k in range(many.bit_length())]  # all of these, half …
+            parts = [self._without(now, order[: many >> k]) for k in range(many.bit_length())]  # all of these, half …
             scores = dict(zip(parts, self.scores(parts), strict=True))
             now = next((own for own in parts if best.gain(scores[own], self.offered) <= 0), parts[-1])
             way.append(now)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,6 +16,7 @@ from herglotz.training.parameter_vector import ParameterVector
 ALWAYS = ("kinetic.log_diagonal", "kinetic.base.log_diagonal", "damping.rate")
 # Amplitudes with the numbers that shape them, which have no effect where the amplitude is 0.
 SHAPES = {"friction.coulomb": "friction.log_smooth", "friction.breakaway": "friction.log_stribeck"}
+ON = {"friction.breakaway": "friction.coulomb"}  # what is an excess of another offer is none without it
 SIMPLE = ("potential.stiffness", "potential.tilt", "friction.input_map")  # of the simplest model, beside `ALWAYS`
 
 
@@ -25,6 +26,7 @@ class Offer(NamedTuple):
     name: str
     amplitudes: tuple[str, ...]  # 0 where it is not taken
     shapes: tuple[str, ...] = ()  # what has no effect then
+    on: str = ""  # the offer without which this one is none
 
     @property
     def numbers(self) -> tuple[str, ...]:
@@ -50,12 +52,19 @@ def offers_of(
             continue
         elif stem not in SHAPES.values() and not (stem == "friction.viscous" and model.dof == 1):  # that is the rate
             shape = number.replace(stem, SHAPES.get(stem, stem))
-            found.append(Offer(key, (number,), (shape,) if shape != number and shape in numbers else ()))
+            on = key.replace(stem, ON[stem]) if stem in ON else ""
+            found.append(Offer(key, (number,), (shape,) if shape != number and shape in numbers else (), on))
             if stem in SIMPLE or key in own:
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
     found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]
     return tuple(always), found, frozenset(simple)
+
+
+def standing(offers: Iterable[Offer], taken: Collection[str]) -> frozenset[str]:
+    """What is left of these offers where some have lost the offer that they are of."""
+    on = {offer.name: offer.on for offer in offers}
+    return frozenset(name for name in taken if not on.get(name) or on[name] in taken)
 
 
 def without_offers(model: ContactLagrangian, offers: list[Offer]) -> None:

@@ -23,6 +23,7 @@ from herglotz.training.functions import bands
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import DRY, candidates, special, started
+from herglotz.training.offers import standing
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
@@ -36,34 +37,40 @@ TRIED = 3  # changes of a kind whose fits are compared, of those that the linear
 EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
 FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
 
+Zeroed = tuple["Search", Trial | None, tuple[Tensor, Tensor] | None]
+
 
 class Search:
     """See the head of this module."""
 
     def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False):
         self.data, self.base, self.config = data, base, config
+        self.over = data  # what functions are made for: of a part of long recordings all of them
         self.freedom = FREEDOM if outliers else None
         self.order = 4 if is_precise(data) and data.dof == 1 else 2
         self.fitters: dict[Variant, Fitter] = {}
-        self.tried, self.most = TRIED, ITERATIONS
-        self.part: Search | None = None  # of a long recording, which a search is made of
         self.finest = max(1, min(FINEST, STEPS // data.samples))
+        self.tried, self.most, self.part = TRIED, ITERATIONS, self
+        few = data.liveliest(PART)
+        if few.samples < data.samples / 2:
+            self.part, self.tried, self.most = self.of(few), 1, FEW
+
+    def of(self, data: Trajectories) -> Search:
+        """The same of other data."""
+        other = Search(data, self.base, self.config, outliers=self.freedom is not None)
+        other.order, other.over = self.order, self.over
+        return other
 
     def fitter(self, variant: Variant) -> Fitter:
         """Of one variant."""
         if variant not in self.fitters:
-            self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom)
+            like = next(iter(self.fitters.values()), None)
+            self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom, like)
         return self.fitters[variant]
 
     @inside()
     def run(self) -> Trial | None:
         """The model that held-out time asks for; None where not even the shortest segments can be followed."""
-        few = self.data.liveliest(PART)
-        if few.samples < self.data.samples / 2:
-            self.part = Search(few, self.base, self.config, outliers=self.freedom is not None)
-            self.part.order, self.tried, self.most = self.order, 1, FEW
-            found = self.part.run()
-            return found and self.of_all(found)
         part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
         best = self.climbed(fitter, fitter.simple, {})
@@ -84,12 +91,24 @@ class Search:
             ends.append(best := self.settled(best, swapped=True))
         return self.stuck(best and self.braking(self.finalist(best, ends)))
 
-    def of_all(self, found: Trial) -> Trial | None:
-        """A model that was found in a part of the data, fitted to all of them."""
+    def of_part(self, found: Trial | None, differ: bool) -> Zeroed:
+        """A model that was found in `part`, fitted to all data, with what more these ask for.
+
+        `differ`: recordings of the part were found to have zeros of sensors of their own.
+        """
+        read, best, zeros = self.with_zeros(found and self.again(found), sure=differ)
+        return read, best and read.settled(best), zeros
+
+    def again(self, found: Trial) -> Trial | None:
+        """The model of a trial fitted to these data, from its values; None where it does not follow them."""
+        if found.fitter.data is self.data:
+            return found
         fitter = self.fitter(found.fitter.variant)
+        if found.fitter.data.lengths == self.data.lengths:
+            return fitter.fit(found.taken, found.values, found.length, found, 2 * ITERATIONS)
         first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
         other = fitter.fit(found.taken, found.values, first, None)
-        return None if other is None else self.settled(self.finer(fitter.leap(other)))
+        return None if other is None else self.finer(fitter.leap(other))
 
     @inside()
     def with_functions(self, best: Trial) -> Trial:
@@ -100,13 +119,13 @@ class Search:
         if best.at_the_noise or self.config.translations:
             return best
         part(MORE_TERMS)
-        search = self.part or self
-        variant = Variant(search.order, functions=tuple(bands(self.data)))
-        fitter = search.fitter(variant)
-        other = search.climbed(fitter, fitter.simple, {})
-        other = self.of_all(other) if other is not None and self.part is not None else other
+        fitter = self.fitter(Variant(self.order, functions=tuple(bands(self.over))))
+        other = self.climbed(fitter, fitter.simple, {})
+        if other is not None and not other.taken & {band.name for band in fitter.variant.functions}:
+            plain = self.fitter(replace(other.fitter.variant, functions=()))
+            other = plain.fit(other.taken, other.values, other.length, other, 2 * ITERATIONS)
         better = self.better(best, other) or best
-        return self.braking(self.finalist(better, (best, other)))
+        return best if other is None else self.braking(self.finalist(better, (best, other)))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
         """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
@@ -164,7 +183,6 @@ class Search:
         seen = {trial.taken}
         while (other := self.moved(trial, seen, whole=True, swapped=swapped)) is not None:
             seen.add(other.taken)
-            other = other.fitter.fit(other.taken, other.values, other.length, other, 2 * self.most) or other
             trial = self.finer(other.fitter.grow(other))
         return trial
 
@@ -235,27 +253,40 @@ class Search:
         ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
         return ahead is not None and (its is None or ahead.replaces(its, trial.fitter.offered))
 
-    def zeros(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
-        """Zeros of sensors (B, n) that recordings differ in, and their deviations; None: the score asks for none."""
+    def zeros(self, trial: Trial, sure: bool = False) -> tuple[Tensor, Tensor] | None:
+        """Zeros of sensors (B, n) that recordings differ in, and their deviations; None: the score asks for none.
+
+        `sure`: a part of these recordings has been found to differ.
+        """
         asked = self.config.find_zeros or (self.config.find_zeros is None and not trial.at_the_noise)
         if len(self.data) == 1 or not asked:
             return None
         names = trial.problem.parameters.numbers
         problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
         found = differing_zeros(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
-        if found is None:
-            return None
+        if found is None or sure:
+            return found
         data = measured(self.data, found[0].flatten().tolist())
         other = Fitter(data, self.base, self.config, trial.fitter.variant, self.freedom)
         fit = other.fit(trial.taken, trial.values, trial.length, trial, 2 * ITERATIONS)
         more = (len(data) - 1) * data.dof
         return found if fit is not None and fit.with_zeros(more).gain(trial) > 0 else None
 
+    def with_zeros(self, best: Trial | None, sure: bool = False) -> Zeroed:
+        """The search of sensors with the zeros that held-out time asks for (`zeros`), the model in it, and these."""
+        differ = None if best is None else self.zeros(best, sure)
+        if best is None or differ is None:
+            return self, best, None
+        read = self.of(measured(self.data, differ[0].flatten().tolist()))
+        return read, read.again(best), differ
+
     def held(self, trial: Trial, holds: Sequence[str]) -> str:
         """The hold of the inputs that the same model asks for; "" where none of these is better."""
         best, found = trial, ""
         for hold in [] if trial.at_the_noise else holds:
-            fitter = Fitter(replace(self.data, hold=hold), self.base, self.config, trial.fitter.variant, self.freedom)
+            fitter = Fitter(
+                replace(self.data, hold=hold), self.base, self.config, trial.fitter.variant, self.freedom, trial.fitter
+            )
             other = fitter.fit(trial.taken, trial.values, trial.length, trial, 2 * ITERATIONS)
             if other is not None and other.replaces(best):
                 best, found = other, hold
@@ -275,7 +306,7 @@ class Search:
         while pushing := trial.pushing:
             every = {offer.name for offer in (*trial.fitter.offers, *trial.fitter.loads)}
             loads = every & {f"load {i + 1}" for i in pushing.values()}
-            taken = trial.taken - set(pushing) | loads
+            taken = standing(trial.fitter.offers, trial.taken - set(pushing)) | loads
             other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS)
             if other is None:
                 break

@@ -129,13 +129,27 @@ def search(
     data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
-    found = wanted.run()
-    # A search of positions on a line, with inputs and sizes of its own, finds them again. Zeros would do as well.
-    if wanted.better_on_a_line(found) and (found is None or wanted.zeros(found) is None):
+    found = wanted.part.run()
+    read, best, differ = wanted.part.with_zeros(found)
+    if differ is not None:  # what made up for zeros may stay where terms stand already, and has bent the zeros
+        best = read.run() or best
+        read, best, differ = wanted.part.with_zeros(best and wanted.part.again(best), sure=True)
+    if read.better_on_a_line(best):  # whose search, with inputs and sizes of its own, finds them again
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
-    found = found and wanted.with_functions(found)
-    if found is None:
+    if best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
+    if hold := read.held(best, holds):
+        wanted = wanted.of(replace(data, hold=hold))
+        read = read.of(replace(read.data, hold=hold))
+        best = read.run() or best
+    found = read.with_functions(best)
+    if found is not best:  # functions may be what recordings seemed to differ by, or have stood for what they do
+        read, found, differ = wanted.part.with_zeros(wanted.part.again(found))
+        found = found and read.settled(found, swapped=True)
+    if wanted.part is not wanted:
+        read, found, differ = wanted.of_part(found, differ is not None)
+    if found is None:
+        return Structure(config, base, "no dictionary of terms: what follows a part of the data does not follow all")
     noise = precision(data)
     settings, found_base = settings_of_trial(found, wanted.config)
     settings = replace(settings, dtype=config.dtype, device=config.device)
@@ -145,10 +159,10 @@ def search(
     least = least if math.isfinite(noise) else "unknown"
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
-    zeros, why, compared = (), "", wanted.compared(found)
-    if (differ := wanted.zeros(found)) is not None:
+    zeros, why, compared = (), "", read.compared(found)
+    if differ is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
-    return Structure(settings, base, words, found.rms, zeros, why, True, compared, wanted.held(found, holds))
+    return Structure(settings, base, words, found.rms, zeros, why, True, compared, hold)
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

@@ -170,7 +170,10 @@ class Trial:
 class Fitter:
     """Fits of subsets of a dictionary's numbers to recordings, by one variant of its model."""
 
-    def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None):
+    def __init__(
+        self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None,
+        like: Fitter | None = None,
+    ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
         every_band, terms = variant.functions, candidates(data, config.translations)
         self.terms = terms = terms_with(every_band, terms, data.angles) if every_band else terms
@@ -204,7 +207,8 @@ class Fitter:
         self.problems: dict[int, ShootingProblem] = {}
         self.floor = ALIKE * EXACT["float64"] * max(base.scale)
         self.offered = len(every_offer)
-        self.smooth, self.precision, self.spread = smoothed(data), precision(data), relative_spread(data)
+        known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
+        self.known = self.smooth, self.precision, self.spread = known  # of the data, whatever the variant
         self.compared: list[Compared] = []
 
     def _is_power(self, key: str) -> bool:

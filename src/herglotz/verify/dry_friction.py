@@ -64,4 +64,3 @@ def on_sliding(X: Tensor, slides: Tensor, rest: float) -> Tensor:
     """X (..., n, n) between coordinates that slide (..., n); of the others `rest` on the diagonal, and 0 beside it."""
     both = slides[..., :, None] & slides[..., None, :]
     return torch.where(both, X, torch.diag_embed(torch.where(slides, 0.0, rest).to(X)))
-

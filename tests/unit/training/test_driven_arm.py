@@ -84,5 +84,3 @@ def test_chains_that_hang_from_a_slide():
     assert set(absolute.features) == {f"{f}({w}) v{i} v{j}" for f in ("cos", "sin") for (i, j), w in pairs.items()}
     assert absolute.apart
     assert not between.apart
-
-

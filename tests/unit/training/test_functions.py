@@ -117,11 +117,20 @@ def test_waves_of_a_part_are_those_of_all(monkeypatch):
     monkeypatch.setattr("herglotz.training.search.PART", 170)
     data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    ended(search)
-    assert search.part is not None
-    (whole,) = {variant.functions for variant in search.fitters if variant.functions}
-    (part,) = {variant.functions for variant in search.part.fitters if variant.functions}
-    assert whole == part == tuple(bands(data))
+    named = search.part.run()
+    assert named is not None
+    monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
+    search.part.with_functions(named)
+    of = next(variant for variant in search.part.fitters if variant.functions)
+    assert {variant.functions for variant in search.part.fitters} == {(), of.functions}
+    assert of.functions == tuple(bands(data))
+    fitter = search.part.fitter(of)
+    found = fitter.fit({*fitter.simple, "V(q1), waves 1-8"}, {}, fitter.lengths[0], None)
+    assert found is not None
+    whole = search.again(found)
+    assert whole is not None
+    assert whole.fitter.variant.functions == of.functions
+    assert whole.fitter.data.samples > found.fitter.data.samples
 
 
 @pytest.mark.parametrize("spread", [0.0, -1.0, math.nan, math.inf])

@@ -19,8 +19,6 @@ from herglotz.training.trajectory_fit import TrajectoryFit
 CART = ("mass", "mass", "mass", MOVING)  # a cart, a pole, and a mass of both that turns with the pole's angle
 
 
-
-
 @pytest.mark.parametrize("coupling", [0.5, 0.99, -1.5])
 def test_masses_of_a_start_are_regular_at_all_samples(coupling):
     # fails if a pole that smoothing couples to its cart as strongly as to itself stays so: no step is solved there
