@@ -30,24 +30,33 @@ def plot_phase_portrait(run: Run) -> Figure:
     each trajectory otherwise (or with more than one coordinate, where a start needs all of them). A model with inputs
     has no flow of its own, and none is drawn.
     """
-    data = run.data
-    panels = min(data.dof, MOST_PANELS)
+    panels = min(run.data.dof, MOST_PANELS)
+    driven = run.model.inputs > 0  # the flow changes with the input: no one flow is the model's
     with styled():
         figure = new_figure(5.6 if panels == 1 else 4.2 * panels, 4.6, _title(run))
-        for i in range(panels):
+        limits = [_panel_limits(run, i) for i in range(panels)]
+        lines = np.empty((0, 0, 2, panels)) if driven else _background(run, *limits[0])
+        for i, ranges in enumerate(limits):
             ax = figure.add_subplot(1, panels, i + 1)
-            _draw_panel(run, i, ax)
+            _draw_panel(run, i, ax, lines[:, :, :, i], *ranges)
     return figure
 
 
-def _draw_panel(run: Run, i: int, ax: Axes) -> None:
-    data, unit = run.data, momentum_unit(run)
+def _panel_limits(run: Run, i: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The positions and the momenta that the panel of a coordinate shows."""
     q, p = (x[:, i].detach().double().cpu().numpy() for x in (run.states.q, run.states.p))
     fine = np.isfinite(q) & np.isfinite(p)
-    (q_low, q_high), (p_low, p_high) = _limits(q[fine], data.angles[i]), _limits(p[fine])
-    driven = run.model.inputs > 0  # the flow changes with the input: no one flow is the model's
-    for line in [] if driven else _background(run, (q_low, q_high), (p_low, p_high)):
-        _draw_line(ax, line[:, 0, i], line[:, 1, i])
+    return _limits(q[fine], run.data.angles[i]), _limits(p[fine])
+
+
+def _draw_panel(
+    run: Run, i: int, ax: Axes, lines: np.ndarray, q_range: tuple[float, float], p_range: tuple[float, float]
+) -> None:
+    data, unit, (q_low, q_high), (p_low, p_high) = run.data, momentum_unit(run), q_range, p_range
+    q, p = (x[:, i].detach().double().cpu().numpy() for x in (run.states.q, run.states.p))
+    fine = np.isfinite(q) & np.isfinite(p)
+    for line in lines:
+        _draw_line(ax, line[:, 0], line[:, 1])
     seen = trained_mask(run).numpy()
     for mask, color in ((fine & seen, MODEL), (fine & ~seen, UNSEEN)):
         ax.plot(q[mask], p[mask], ".", ms=3.2, color=color, zorder=3)
@@ -59,7 +68,7 @@ def _draw_panel(run: Run, i: int, ax: Axes) -> None:
     position_axis(ax, data, i)
     if i == 0:
         unseen = [("● unseen", UNSEEN)] if bool((~seen).any()) else []
-        flow = [] if driven else [("→ flow of the model", "#666666")]
+        flow = [] if run.model.inputs else [("→ flow of the model", "#666666")]
         captions(ax, [("○ start", INK), ("● trained", MODEL), *unseen, *flow])
 
 

@@ -139,11 +139,12 @@ def search(
     if best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     if hold := read.held(best, holds):
-        wanted = wanted.of(replace(data, hold=hold))
-        read = read.of(replace(read.data, hold=hold))
+        wanted, read = (of.of(replace(of.data, hold=hold)) for of in (wanted, read))
         best = read.run() or best
     found = read.with_functions(best)
     if found is not best:  # functions may be what recordings seemed to differ by, or have stood for what they do
+        if later := read.held(found, [other for other in holds if other != hold]):  # than a poorer model would see
+            hold, wanted = later, wanted.of(replace(data, hold=later))
         read, found, differ = wanted.part.with_zeros(wanted.part.again(found))
         found = found and read.settled(found, swapped=True)
     if wanted.part is not wanted:
