@@ -59,9 +59,13 @@ def states_of(n, batch, dtype=torch.float64, seed=0):
 TERMS: dict[str, tuple[int, dict[str, Any]]] = {
     "order 4": (1, {"order": 4}),
     "m(q), coupled": (2, {"mass_width": 3, "level": "forced", "coupled": True}),
-    "drag": (3, {
-        "level": "forced", "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "|v| v", "load 1", "cos(1.5 q1) v1"),
-    }),
+    "drag": (
+        3,
+        {
+            "level": "forced",
+            "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "|v| v", "load 1", "cos(1.5 q1) v1"),
+        },
+    ),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
 }
 

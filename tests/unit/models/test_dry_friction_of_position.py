@@ -116,8 +116,6 @@ def test_dry_terms_need_dry_friction():
         )  # fmt: skip
 
 
-
-
 def test_dry_terms_bring_dry_friction():
     # fails if a user has to name dry friction twice
     data = hz.simulate("damped_oscillator", trajectories=1, steps=30, h=0.1)
