@@ -1,5 +1,7 @@
-"""Where a search for terms starts, which of its fits stands in for another, and when its steps are halved again."""
+"""Where a search for terms starts, what it is asked in turn, and when its steps are halved again."""
 
+import sys
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +16,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.linear_terms import SINGULAR, LinearStart, LinearTerms, start_of
 from herglotz.training.named_terms import MOVING, NamedTerms, candidates
+from herglotz.training.structure import search
 from herglotz.training.trajectory_fit import TrajectoryFit
 
 CART = ("mass", "mass", "mass", MOVING)  # a cart, a pole, and a mass of both that turns with the pole's angle
@@ -106,3 +109,90 @@ def test_least_squares_stay_where_no_robust_fit_is_found(monkeypatch):
     task: Any = trajectory_fit.Task(stub(), stub(), FitConfig(), stub())
     found = trajectory_fit._longest(task, stub(potential=stub(network=None)), 1.0, known=True)
     assert found[1] is plain
+
+
+class Asked:
+    """A search that writes down what it is asked, and answers from a table."""
+
+    def __init__(self, data, base, config, *, told, seen, name="whole", **_):
+        self.data, self.base, self.config, self.told, self.seen, self.name = data, base, config, told, seen, name
+        self.part = self if name != "whole" or not told.get("long") else self.of(data, "part")
+
+    def of(self, data, name=None):
+        return Asked(data, self.base, self.config, told=self.told, seen=self.seen, name=name or self.name + "'")
+
+    def answer(self, question, default=None):
+        self.seen.append((self.name, question))
+        return self.told.get(question, default)
+
+    def run(self):
+        self.seen.append((self.name, "run"))
+        return SimpleNamespace(names=["cos(q1)"], rms=0.1, whole=True, at=self.name)
+
+    def again(self, found):
+        return found
+
+    def settled(self, found, **_):
+        return found
+
+    def with_zeros(self, best, sure=False):
+        differ = self.answer("zeros") if not sure else self.told["zeros"]
+        return (self, best, None) if differ is None else (self.of(self.data), best, differ)
+
+    def of_part(self, found, differ):
+        self.seen.append((self.name, f"of_part, {differ}"))
+        return self.with_zeros(found, sure=differ)
+
+    def better_on_a_line(self, _):
+        return self.answer("line", False)
+
+    def with_functions(self, best):
+        return SimpleNamespace(names=["f1"], rms=0.1, whole=True, at=self.name) if self.answer("functions") else best
+
+    def held(self, best, holds):
+        wanted = self.answer(f"hold of {best.names[0]}", "")
+        return wanted if wanted in holds else ""
+
+    def compared(self, _):
+        return ()
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    module = sys.modules["herglotz.training.structure"]
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=2)
+    base, config = estimate_baseline(data), FitConfig().resolved(data)
+    monkeypatch.setattr(module, "settings_of_trial", lambda _, config: (config, base))
+
+    def ask(**told):
+        seen = []
+        monkeypatch.setattr(module, "Search", partial(Asked, told=told, seen=seen))
+        return search(data, base, config, outliers=False, holds=["first", "smooth"]), seen
+
+    return ask
+
+
+def test_the_zeros_of_a_part_are_those_of_all(asked):
+    # fails if all data are asked again whether recordings differ, if terms that were found without zeros stay, or if
+    # terms on a line are not asked for where zeros are
+    zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
+    found, seen = asked(long=True, zeros=zeros)
+    assert found.zeros == pytest.approx((0.0, 0.1))
+    assert seen == [
+        ("part", "run"), ("part", "zeros"), ("part'", "run"), ("part'", "line"), ("part'", "hold of cos(q1)"),
+        ("part'", "functions"), ("whole", "of_part, True"),
+    ]  # fmt: skip
+    on_a_line, seen = asked(zeros=zeros, line=True)
+    assert not on_a_line.turning
+    assert on_a_line.zeros == ()
+
+
+def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(asked):
+    # fails if a hold that the first model does not ask for is given up; if another one is asked for twice; if terms
+    # found with the wrong hold stay
+    found, seen = asked(**{"functions": True, "hold of f1": "first"})
+    assert found.hold == "first"
+    assert [question for _, question in seen if "hold" in question] == ["hold of cos(q1)", "hold of f1"]
+    found, seen = asked(**{"hold of cos(q1)": "smooth"})
+    assert found.hold == "smooth"
+    assert [name for name, question in seen if question == "run"] == ["whole", "whole'"]
