@@ -183,6 +183,8 @@ class Search:
         seen = {trial.taken}
         while (other := self.moved(trial, seen, whole=True, swapped=swapped)) is not None:
             seen.add(other.taken)
+            if other.sizes:  # of functions, by which the prior of the next fit is
+                other = other.fitter.fit(other.taken, other.values, other.length, other, 2 * self.most) or other
             trial = self.finer(other.fitter.grow(other))
         return trial
 
