@@ -31,30 +31,22 @@ def plot_phase_portrait(run: Run) -> Figure:
     has no flow of its own, and none is drawn.
     """
     panels = min(run.data.dof, MOST_PANELS)
-    driven = run.model.inputs > 0  # the flow changes with the input: no one flow is the model's
     with styled():
-        figure = new_figure(5.6 if panels == 1 else 4.2 * panels, 4.6, _title(run))
-        limits = [_panel_limits(run, i) for i in range(panels)]
-        lines = np.empty((0, 0, 2, panels)) if driven else _background(run, *limits[0])
-        for i, ranges in enumerate(limits):
-            ax = figure.add_subplot(1, panels, i + 1)
-            _draw_panel(run, i, ax, lines[:, :, :, i], *ranges)
+        figure, lines = new_figure(5.6 if panels == 1 else 4.2 * panels, 4.6, _title(run)), _background(run)
+        for i in range(panels):
+            _draw_panel(run, i, figure.add_subplot(1, panels, i + 1), lines[..., i])
     return figure
 
 
-def _panel_limits(run: Run, i: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The positions and the momenta that the panel of a coordinate shows."""
+def _points(run: Run, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions and momenta of a coordinate at the samples, and which of them are numbers."""
     q, p = (x[:, i].detach().double().cpu().numpy() for x in (run.states.q, run.states.p))
-    fine = np.isfinite(q) & np.isfinite(p)
-    return _limits(q[fine], run.data.angles[i]), _limits(p[fine])
+    return q, p, np.isfinite(q) & np.isfinite(p)
 
 
-def _draw_panel(
-    run: Run, i: int, ax: Axes, lines: np.ndarray, q_range: tuple[float, float], p_range: tuple[float, float]
-) -> None:
-    data, unit, (q_low, q_high), (p_low, p_high) = run.data, momentum_unit(run), q_range, p_range
-    q, p = (x[:, i].detach().double().cpu().numpy() for x in (run.states.q, run.states.p))
-    fine = np.isfinite(q) & np.isfinite(p)
+def _draw_panel(run: Run, i: int, ax: Axes, lines: np.ndarray) -> None:
+    data, unit, (q, p, fine) = run.data, momentum_unit(run), _points(run, i)
+    (q_low, q_high), (p_low, p_high) = _limits(q[fine], data.angles[i]), _limits(p[fine])
     for line in lines:
         _draw_line(ax, line[:, 0], line[:, 1])
     seen = trained_mask(run).numpy()
@@ -72,17 +64,18 @@ def _draw_panel(
         captions(ax, [("○ start", INK), ("● trained", MODEL), *unseen, *flow])
 
 
-def _background(run: Run, q_range: tuple[float, float], p_range: tuple[float, float]) -> np.ndarray:
-    """Return positions and momenta of rollouts, (lines, K + 1, 2, n); NaN after a step that failed."""
+def _background(run: Run) -> np.ndarray:
+    """Return positions and momenta of rollouts, (lines, K + 1, 2, n), NaN after a failed step; none with inputs."""
     model, data = run.model, run.data
-    typical = (q_range[1] - q_range[0]) / (p_range[1] - p_range[0])
+    if model.inputs:  # the flow changes with the input: no one flow is the model's
+        return np.empty((0, 0, 2, data.dof))
     duration = max(float(one.t[-1] - one.t[0]) for one in data)
     starts = [x[list(data.offsets)].detach() for x in run.states]
     if data.dof == 1 and not model.s_enters_motion:
-        like = run.states.q
-        q = torch.linspace(*q_range, LINES, dtype=like.dtype, device=like.device)
-        p = torch.linspace(*p_range, LINES, dtype=like.dtype, device=like.device)
-        grid = torch.cartesian_prod(q, p)
+        like, (q, p, fine) = run.states.q, _points(run, 0)
+        q_range, p_range = _limits(q[fine], data.angles[0]), _limits(p[fine])
+        q, p = (torch.linspace(*of, LINES, dtype=like.dtype, device=like.device) for of in (q_range, p_range))
+        grid, typical = torch.cartesian_prod(q, p), (q_range[1] - q_range[0]) / (p_range[1] - p_range[0])
         starts, duration = [grid[:, :1], grid[:, 1:], torch.zeros_like(grid[:, 0])], SHORT * typical
     steps = max(3, min(MOST_STEPS, round(duration / run.h)))
     h = min(run.h, duration / steps)

@@ -32,11 +32,12 @@ from herglotz.training.task import LEAST_GRIP, build_model
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Compared, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
-FEW = 5  # the same as `ITERATIONS`, on more samples than a search is made of
+FEW = 5  # iterations of a trial's fit, in the place of `ITERATIONS`, on more samples than a search is made of
 TRIED = 3  # changes of a kind whose fits are compared, of those that the linear motion puts first
 EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
 FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
 
+# A search, its model, and the zeros (B, n) that have been taken off its readings, with their deviations.
 Zeroed = tuple["Search", Trial | None, tuple[Tensor, Tensor] | None]
 
 
@@ -183,7 +184,7 @@ class Search:
         seen = {trial.taken}
         while (other := self.moved(trial, seen, whole=True, swapped=swapped)) is not None:
             seen.add(other.taken)
-            if other.sizes:  # of functions, by which the prior of the next fit is
+            if other.sizes:  # functions have a prior, whose strength follows from the fit
                 other = other.fitter.fit(other.taken, other.values, other.length, other, 2 * self.most) or other
             trial = self.finer(other.fitter.grow(other))
         return trial
@@ -255,41 +256,37 @@ class Search:
         ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
         return ahead is not None and (its is None or ahead.replaces(its, trial.fitter.offered))
 
-    def zeros(self, trial: Trial, sure: bool = False) -> tuple[Tensor, Tensor] | None:
-        """Zeros of sensors (B, n) that recordings differ in, and their deviations; None: the score asks for none.
+    def zeros(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
+        """Zeros of sensors (B, n), fitted together with the numbers and states of a model, and their deviations.
 
-        `sure`: a part of these recordings has been found to differ.
+        None where the model is at the noise, unless the settings ask for zeros, or where the fit leads nowhere.
         """
         asked = self.config.find_zeros or (self.config.find_zeros is None and not trial.at_the_noise)
         if len(self.data) == 1 or not asked:
             return None
         names = trial.problem.parameters.numbers
         problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
-        found = differing_zeros(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
-        if found is None or sure:
-            return found
-        data = measured(self.data, found[0].flatten().tolist())
-        other = Fitter(data, self.base, self.config, trial.fitter.variant, self.freedom)
-        fit = other.fit(trial.taken, trial.values, trial.length, trial, 2 * ITERATIONS)
-        more = (len(data) - 1) * data.dof
-        return found if fit is not None and fit.with_zeros(more).gain(trial) > 0 else None
+        return differing_zeros(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
 
     def with_zeros(self, best: Trial | None, sure: bool = False) -> Zeroed:
-        """The search of sensors with the zeros that held-out time asks for (`zeros`), the model in it, and these."""
-        differ = None if best is None else self.zeros(best, sure)
+        """The search of the sensors' readings less their zeros, and the model in it, where the score asks for them.
+
+        `sure`: a part of these recordings has been found to have them, and the score is not asked.
+        """
+        differ = best and self.zeros(best)
         if best is None or differ is None:
             return self, best, None
         read = self.of(measured(self.data, differ[0].flatten().tolist()))
-        return read, read.again(best), differ
+        other, more = read.again(best), (len(self.data) - 1) * self.data.dof
+        if other is None or not (sure or other.with_zeros(more).gain(best) > 0):
+            return self, best, None
+        return read, other, differ
 
     def held(self, trial: Trial, holds: Sequence[str]) -> str:
         """The hold of the inputs that the same model asks for; "" where none of these is better."""
         best, found = trial, ""
         for hold in [] if trial.at_the_noise else holds:
-            fitter = Fitter(
-                replace(self.data, hold=hold), self.base, self.config, trial.fitter.variant, self.freedom, trial.fitter
-            )
-            other = fitter.fit(trial.taken, trial.values, trial.length, trial, 2 * ITERATIONS)
+            other = self.of(replace(self.data, hold=hold)).again(trial)
             if other is not None and other.replaces(best):
                 best, found = other, hold
         return found

@@ -129,24 +129,26 @@ def search(
     data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
-    found = wanted.part.run()
-    read, best, differ = wanted.part.with_zeros(found)
-    if differ is not None:  # what made up for zeros may stay where terms stand already, and has bent the zeros
+    read, best, differ = wanted.part.with_zeros(wanted.part.run())
+    if differ is not None:  # terms that made up for zeros may stay where others stand already, and have bent the zeros
         best = read.run() or best
-        read, best, differ = wanted.part.with_zeros(best and wanted.part.again(best), sure=True)
-    if read.better_on_a_line(best):  # whose search, with inputs and sizes of its own, finds them again
+        once_more = wanted.part.with_zeros(best and wanted.part.again(best), sure=True)
+        read, best, differ = (read, best, differ) if once_more[1] is None else once_more
+    if read.better_on_a_line(best):  # whose search, with inputs and sizes of its own, finds the terms again
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     if hold := read.held(best, holds):
-        wanted, read = (of.of(replace(of.data, hold=hold)) for of in (wanted, read))
+        wanted, read = (each.of(replace(each.data, hold=hold)) for each in (wanted, read))
         best = read.run() or best
     found = read.with_functions(best)
-    if found is not best:  # functions may be what recordings seemed to differ by, or have stood for what they do
-        if later := read.held(found, [other for other in holds if other != hold]):  # than a poorer model would see
-            hold, wanted = later, wanted.of(replace(data, hold=later))
-        read, found, differ = wanted.part.with_zeros(wanted.part.again(found))
-        found = found and read.settled(found, swapped=True)
+    if found is not best:  # functions may be what recordings seemed to differ by, and tell a hold that terms did not
+        later = read.held(found, [other for other in holds if other != hold])
+        other = wanted.of(replace(data, hold=later)) if later else wanted
+        if (again := other.part.again(found)) is not None:
+            wanted, hold = other, later or hold
+            read, found, differ = wanted.part.with_zeros(again)
+            found = found and read.settled(found, swapped=True)
     if wanted.part is not wanted:
         read, found, differ = wanted.of_part(found, differ is not None)
     if found is None:

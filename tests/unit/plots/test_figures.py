@@ -241,7 +241,7 @@ def test_the_first_of_several_motions_says_what_is_what():  # fails if captions 
 
 def test_lines_of_the_flow_last_as_long_as_the_longest_motion():  # fails if they end after a sample
     run = run_of("plane")
-    assert _background(run, (-1.0, 1.0), (-1.0, 1.0)).shape == (1, 31, 2, 2)
+    assert _background(run).shape == (1, 31, 2, 2)
 
 
 def test_residuals_are_data_minus_model():  # fails if the lower panel shows something else

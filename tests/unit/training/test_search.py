@@ -325,8 +325,8 @@ def test_of_many_offers_some_leave_at_once_but_not_those_that_stand_for_one_anot
 
 
 def test_an_excess_comes_and_goes_with_what_it_is_of():
-    # fails if friction at breakaway is taken without the dry friction whose excess it is: it is none by itself, and a
-    # fit made it a bump of the force at rest (a motor axis ran away by eight times as much with it)
+    # fails if friction at breakaway is taken without the dry friction whose excess it is: by itself a fit made it a
+    # force that is there near rest alone
     dry, excess = Offer("dry", ("dry",)), Offer("excess", ("excess",), on="dry")
 
     class Friction(Moves):

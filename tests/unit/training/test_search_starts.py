@@ -130,7 +130,7 @@ class Asked:
         return SimpleNamespace(names=["cos(q1)"], rms=0.1, whole=True, at=self.name)
 
     def again(self, found):
-        return found
+        return None if self.told.get("lost") else found
 
     def settled(self, found, **_):
         return found
@@ -185,6 +185,15 @@ def test_the_zeros_of_a_part_are_those_of_all(asked):
     on_a_line, seen = asked(zeros=zeros, line=True)
     assert not on_a_line.turning
     assert on_a_line.zeros == ()
+
+
+def test_a_model_that_is_lost_on_the_way_is_not_the_end(asked):
+    # fails if terms are given up where the readings, with their zeros, cannot be followed with them
+    zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
+    found, _ = asked(zeros=zeros, functions=True, lost=True)
+    assert found.sigma == 0.1
+    assert found.zeros == pytest.approx((0.0, 0.1))
+    assert "f1" in found.reason
 
 
 def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(asked):
