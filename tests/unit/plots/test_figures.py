@@ -239,9 +239,13 @@ def test_the_first_of_several_motions_says_what_is_what():  # fails if captions 
     assert said == [True, False, False, False]
 
 
-def test_lines_of_the_flow_last_as_long_as_the_longest_motion():  # fails if they end after a sample
+def test_lines_of_the_flow_last_as_long_as_the_longest_motion():
+    # fails if they end after a sample, or if a panel shows the flow of another coordinate
     run = run_of("plane")
-    assert _background(run).shape == (1, 31, 2, 2)
+    flow = _background(run)
+    assert flow.shape == (1, 31, 2, 2)
+    for i, ax in enumerate(plot_phase_portrait(run).axes):
+        assert np.allclose(np.asarray(ax.lines[0].get_xydata()), flow[0, :, :, i])
 
 
 def test_residuals_are_data_minus_model():  # fails if the lower panel shows something else

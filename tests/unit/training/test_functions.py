@@ -114,6 +114,8 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
 
 def test_waves_of_a_part_are_those_of_all(monkeypatch):
     # fails if the waves that a search finds in a part of a long recording have another interval in the whole of it
+    asked = []
+    monkeypatch.setattr("herglotz.training.search.bands", lambda data: asked.append(data) or bands(data))
     monkeypatch.setattr("herglotz.training.search.PART", 170)
     data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
@@ -121,6 +123,8 @@ def test_waves_of_a_part_are_those_of_all(monkeypatch):
     assert named is not None
     monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
     search.part.with_functions(named)
+    search.part.of(search.part.data).with_functions(named)
+    assert all(over is data for over in asked)
     of = next(variant for variant in search.part.fitters if variant.functions)
     assert {variant.functions for variant in search.part.fitters} == {(), of.functions}
     assert of.functions == tuple(bands(data))

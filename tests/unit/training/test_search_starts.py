@@ -202,6 +202,9 @@ def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(ask
     found, seen = asked(**{"functions": True, "hold of f1": "first"})
     assert found.hold == "first"
     assert [question for _, question in seen if "hold" in question] == ["hold of cos(q1)", "hold of f1"]
+    assert seen[-1] == ("whole'", "zeros")
+    found, seen = asked(**{"functions": True, "hold of cos(q1)": "smooth"})
+    assert found.hold == "smooth"
     found, seen = asked(**{"hold of cos(q1)": "smooth"})
     assert found.hold == "smooth"
     assert [name for name, question in seen if question == "run"] == ["whole", "whole'"]
