@@ -426,7 +426,7 @@ def test_a_search_gives_the_same_twice():
 
 
 def test_zeros_that_say_nothing_are_not_taken_off():
-    # fails if zeros are taken off that the score does not ask for, unless a part of the recordings is known to have them
+    # fails if zeros are taken off that the score does not ask for, unless a part of the recordings has them
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
     search = searched(replace(data, p=None, s=None), find_zeros=True)
     fitter = search.fitter(Variant(2))
