@@ -11,14 +11,11 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from herglotz.errors import InputError
-
-if TYPE_CHECKING:
-    from herglotz.codegen.angles import Angles
 
 LOOP = 8  # results from which on a loop is written; shorter rows are faster and no longer as scalars
 # Computed in one loop, of which compilers make one call: networks read both, side by side.
@@ -63,7 +60,7 @@ class Program:
     known: dict[Any, Atom] = field(default_factory=dict)
     operations: dict[Ref, tuple[Any, ...]] = field(default_factory=dict)  # the form and the operands of scalars
     loop: float = LOOP  # results from which on a loop is written; infinite: none is
-    angles: Angles | None = None  # by which sines and cosines follow from one another
+    angles: Any = None  # `herglotz.codegen.angles.Angles`, where sines and cosines follow from one another
 
     def given(self, name: str, size: int) -> list[Ref]:
         """An input of the function: a row of `size`, or a scalar where that is 0."""
