@@ -7,7 +7,7 @@ IdentiBench, https://github.com/daniel-om-weber/identibench (robot_forward, and 
 
 Files are known by their name: those of the benchmark itself (DATA_EMPS.mat and DATA_EMPS_PULSES.mat, SNLS80mV.mat or
 .csv), folders that IdentiBench prepared (emps/train_valid/*.hdf5, emps/test/*.hdf5), or csv files with a header
-(emps_estimation.csv and emps_test.csv; silverbox_estimation.csv, silverbox_multisine.csv, silverbox_arrow_full.csv).
+(emps_estimation.csv, and emps_test.csv or another emps_*.csv; silverbox_estimation.csv, silverbox_multisine.csv, silverbox_arrow_full.csv).
 .mat and .hdf5 ask for pip install 'herglotz[tables]'. A set whose test is absent is skipped; --validation instead fits
 the first part of the training part, as IdentiBench cuts it, and predicts the rest.
 
@@ -70,7 +70,7 @@ PROTOCOLS = {
     "emps": Protocol(
         unit="mm", scale=1000, warmup=20, cut=18_000,
         train=(Part("DATA_EMPS.mat"), Part("emps/train_valid/*.hdf5"), Part("emps_estimation.csv")),
-        tests={"pulses": (Part("DATA_EMPS_PULSES.mat"), Part("emps/test/*.hdf5"), Part("emps_test.csv"))},
+        tests={"pulses": (Part("DATA_EMPS_PULSES.mat"), Part("emps/test/*.hdf5"), Part("emps_[!e]*.csv"))},
     ),
     "silverbox": Protocol(
         unit="mV", scale=1000, warmup=50, cut=50_000,

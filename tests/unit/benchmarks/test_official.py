@@ -182,7 +182,7 @@ def test_nothing_to_measure(tmp_path, monkeypatch, capsys):
     assert official.main([str(tmp_path), "--only", "emps", "--out", str(tmp_path)]) == 1
     assert not made
     assert (
-        "emps: skipped, none of DATA_EMPS_PULSES.mat, emps/test/*.hdf5, emps_test.csv, its test"
+        "emps: skipped, none of DATA_EMPS_PULSES.mat, emps/test/*.hdf5, emps_[!e]*.csv, its test"
         in capsys.readouterr().out
     )
     assert not (tmp_path / "official.json").exists()
@@ -209,7 +209,7 @@ def test_a_real_fit(tmp_path):
             x += h / 50 * v
         q.append(x)
     csv(tmp_path / "emps_estimation.csv", q[:100], u[:100])
-    csv(tmp_path / "emps_test.csv", q[100:], u[100:])
+    csv(tmp_path / "emps_pulses.csv", q[100:], u[100:])
     assert official.main([str(tmp_path), "--only", "emps", "--out", str(tmp_path)]) == 0
     (row,) = json.loads((tmp_path / "official.json").read_text())["rows"]["emps"]["seeds"]
     assert row["named_terms"]
