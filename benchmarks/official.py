@@ -8,7 +8,7 @@ IdentiBench, https://github.com/daniel-om-weber/identibench (robot_forward, and 
 Files are known by their name: those of the benchmark itself (DATA_EMPS.mat and DATA_EMPS_PULSES.mat, SNLS80mV.mat or
 .csv), folders that IdentiBench prepared (emps/train_valid/*.hdf5, emps/test/*.hdf5), or csv files with a header
 (emps_estimation.csv, and emps_test.csv or another emps_*.csv; silverbox_estimation.csv, silverbox_multisine.csv,
-silverbox_arrow_full.csv). .mat and .hdf5 ask for pip install 'herglotz[tables]'. A set whose tests are absent is skipped;
+silverbox_arrow_full.csv). .mat and .hdf5 ask for pip install 'herglotz[tables]'. A set without its tests is skipped;
 --validation instead fits the first part of the training part, as IdentiBench cuts it, and predicts the rest.
 
 Writes results/official.json and .md. A fit of named terms draws nothing and is made once; one with networks
