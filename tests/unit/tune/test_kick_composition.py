@@ -161,7 +161,7 @@ def test_a_kick_in_c_takes_one_sine_and_one_cosine():
 
 @needs_c
 def test_what_is_not_finite_says_so():
-    # fails if a motion that overflows is reported as converged, or poisons the next one of its batch
+    # fails if a motion that overflows is reported as converged, has a σ, or poisons the next one of its batch
     d = torch.full((2,), 0.5, dtype=torch.float64)
     wild = KickStepper(H, 0.0, False, 0.0, 1.0, d, torch.full((1, 4), 1.0, dtype=torch.float64), torch.zeros(1, 0))
     x = State(*(torch.tensor(y, dtype=torch.float64) for y in ([[50.0], [1e-3]], [[0.0], [0.0]], [0.0, 0.0])))
@@ -169,6 +169,7 @@ def test_what_is_not_finite_says_so():
         out = stepper.rollout(*x, h=H, steps=8)
         assert out.status[0, -1] == Status.DIVERGED
         assert bool(out.q[0, -1].isnan().all())
+        assert bool(out.sigma[0, -1].isnan())
         assert bool(out.ok[1])
 
 
