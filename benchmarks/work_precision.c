@@ -13,7 +13,7 @@ static real input;      /* the torque of a driven scene, held */
 static long evaluations; /* of f, or of the force */
 
 #if FAST_SINE
-/* The polynomials that the learned kicks are given: of the angle less whole turns, to about 1e-9. */
+/* Polynomials of the angle less whole turns, to about 1e-9. */
 static inline void sine_cosine(real q, real *s, real *c) {
   const real turns = rint(q * (real)0.3183098861837907), r = q - turns * (real)3.141592653589793, r2 = r * r;
   const real sign = 1 - 2 * (turns - 2 * floor((real)0.5 * turns)), r4 = r2 * r2;

@@ -24,7 +24,7 @@ from herglotz.training import FitConfig, Run, fit
 from herglotz.tune.cost import Timed as Timing, measure_costs, timed_stepping
 from herglotz.tune.distil import distil, pairs_of, widened
 from herglotz.tune.kick_composition import can_kick, fit_kicks
-from herglotz.tune.kick_composition_c import CompiledKicks
+from herglotz.tune.kick_header import CompiledKicks
 from herglotz.tune.reference import JITTER, draw_starts, record
 
 CHECKS = 4  # times at which errors are taken

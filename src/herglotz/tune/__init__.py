@@ -3,7 +3,7 @@
 from herglotz.tune.config import TuneConfig as TuneConfig
 from herglotz.tune.distil import distil as distil
 from herglotz.tune.kick_composition import KickStepper as KickStepper, fit_kicks as fit_kicks
-from herglotz.tune.kick_composition_c import CompiledKicks as CompiledKicks, export_kicks_c as export_kicks_c
+from herglotz.tune.kick_header import CompiledKicks as CompiledKicks, export_kicks_c as export_kicks_c
 from herglotz.tune.local_error import flag_unresolved as flag_unresolved
 from herglotz.tune.result import Candidate as Candidate, Setting as Setting, Tuning as Tuning, pareto as pareto
 from herglotz.tune.search import tune as tune

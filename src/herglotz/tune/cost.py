@@ -14,7 +14,7 @@ import torch
 
 from herglotz.export.c_stepper import CLibrary
 from herglotz.stepping import State
-from herglotz.tune.kick_composition_c import CompiledKicks
+from herglotz.tune.kick_header import CompiledKicks
 
 # One timing takes enough steps that the call around them is small beside them.
 EAGER_STEPS, EAGER_STARTS = 48, 2  # steps of each motion, and motions
@@ -82,11 +82,11 @@ def _repeated(calls: list[Callable[[], None]], times: int) -> Callable[[], None]
 
 def _native(stepper: Any, few: State, h: float, steps: int) -> list[Callable[[], None]]:
     """Return calls of the C loop with arguments made beforehand: checks in Python would take longer than the steps."""
-    if isinstance(stepper, CompiledKicks):
-        return [stepper.prepared(few, steps)[0]]
-    library: CLibrary = stepper.loop
-    h_all = torch.full((1, 1), h, dtype=library.dtype).expand(1, steps)
+    library: CLibrary | CompiledKicks = getattr(stepper, "loop", stepper)
     singles = [State(*(x[i : i + 1].to(library.dtype) for x in few)) for i in range(len(few.s))]
+    if isinstance(library, CompiledKicks):
+        return [library.prepared(start, steps)[0] for start in singles]
+    h_all = torch.full((1, 1), h, dtype=library.dtype).expand(1, steps)
     return [library.prepared(*start, h=h_all)[0] for start in singles]
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -48,7 +49,7 @@ class KickStepper(OneStepMethod):
     cosines: Tensor  # (K, N) a_in
     sines: Tensor  # (K, N) b_in
     offset: float = 0.0  # added to s after a step: the sum of the constants of the V_i, which do not move q or p
-    error: float = 0.0  # RMS error of q after one step, in units of q; the sines of the C form are made as accurate
+    error: float = 0.0  # RMS error of q after one step, in units of q
 
     dof = 1
 
@@ -67,10 +68,12 @@ class KickStepper(OneStepMethod):
         a, b = self.cosines[i], self.sines[i]
         n = torch.arange(1, len(a) + 1, dtype=q.dtype, device=q.device)
         if not self.angle:
-            x = (q[..., None] - self.middle) / self.half
-            return (a * x**n).sum(-1), (n * a * x ** (n - 1)).sum(-1) / self.half
-        cos, sin = torch.cos(n * q[..., None]), torch.sin(n * q[..., None])
-        return (a * cos + b * sin).sum(-1), (n * (b * cos - a * sin)).sum(-1)
+            x = (q - self.middle) / self.half
+            return x * _polynomial(a, x), _polynomial(n * a, x) / self.half
+        c, sine = torch.cos(q), torch.sin(q)  # one of each, which is most of the work in C
+        T, U = (x.to(q) for x in _multiple_angles(len(a)))
+        V = _polynomial(a @ T, c) + sine * _polynomial(b @ U, c)
+        return V, _polynomial((n * b) @ T, c) - sine * _polynomial((n * a) @ U, c)
 
     def map(self, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (q, p, s) after one step; q, p and s have shape (...)."""
@@ -83,15 +86,18 @@ class KickStepper(OneStepMethod):
             q, s = q + self.drifts[i + 1] * p, s + 0.5 * self.drifts[i + 1] * p * p
         return q, root * p, root * s + self.offset
 
+    def check_h(self, h: Tensor) -> None:
+        """Raise InputError if a step is not the stepper's own."""
+        wrong = h[~((h - self.h).abs() <= 1e-6 * self.h)]
+        if len(wrong):
+            raise InputError(f"this stepper was fitted to h = {self.h:g}, got {float(wrong[0]):g}")
+
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
         """Take one step; NaN and `Status.DIVERGED` where the result is not finite.
 
         Raise InputError if h is not the stepper's own, or there is more than one coordinate.
         """
-        h = torch.as_tensor(h, dtype=state.q.dtype)
-        wrong = h[~((h - self.h).abs() <= 1e-6 * self.h)]
-        if len(wrong):
-            raise InputError(f"this stepper was fitted to h = {self.h:g}, got {float(wrong[0]):g}")
+        self.check_h(torch.as_tensor(h, dtype=state.q.dtype))
         if state.q.shape[-1] != 1:
             raise InputError(f"kicks step one coordinate, got {state.q.shape[-1]}")
         q, p, s = self.map(state.q[..., 0], state.p[..., 0], state.s)
@@ -100,6 +106,24 @@ class KickStepper(OneStepMethod):
         c = torch.exp(-self.rate * self.h + nan)
         status = torch.where(bad, Status.DIVERGED, Status.CONVERGED).to(torch.uint8)
         return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
+
+
+def _polynomial(coefficients: Tensor, x: Tensor) -> Tensor:
+    """Σ_k c_k x^k by Horner's scheme, of the shape of x."""
+    total = coefficients[-1] + 0 * x
+    for c in reversed(coefficients[:-1].unbind()):
+        total = c + x * total
+    return total
+
+
+@cache
+def _multiple_angles(count: int) -> tuple[Tensor, Tensor]:
+    """T and U of cos nq = Σ_k T_nk cos^k q and sin nq = sin q Σ_k U_nk cos^k q for n = 1 … count (Chebyshev)."""
+    powers = torch.zeros(2, count + 2, count + 2, dtype=torch.float64)  # n = 0, 1, … of each kind
+    powers[:, 0, 0], powers[0, 1, 1], powers[1, 1, 1] = 1.0, 1.0, 2.0
+    for n in range(2, count + 1):
+        powers[:, n] = 2 * powers[:, n - 1].roll(1, -1) - powers[:, n - 2]
+    return powers[0, 1 : count + 1, : count + 1], powers[1, :count, :count]
 
 
 def can_kick(model: ContactLagrangian) -> bool:

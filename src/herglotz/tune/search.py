@@ -21,7 +21,7 @@ from herglotz.tune.config import TuneConfig, allowed_failures
 from herglotz.tune.cost import Cost, measure_costs, timed_stepping
 from herglotz.tune.distil import distil, pairs_of, widened
 from herglotz.tune.kick_composition import KickStepper, can_kick, fit_kicks
-from herglotz.tune.kick_composition_c import CompiledKicks
+from herglotz.tune.kick_header import CompiledKicks
 from herglotz.tune.reference import Motions, draw_starts, frozen_double, record
 from herglotz.tune.result import Candidate, Setting, Tuning
 

@@ -15,7 +15,7 @@ from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
 from herglotz.tune import CompiledKicks, KickStepper, export_kicks_c, fit_kicks
 from herglotz.tune.kick_composition import _Flow, _leapfrog
-from herglotz.tune.kick_composition_c import kicks_c
+from herglotz.tune.kick_header import kicks_c
 
 try:
     compiler()
@@ -33,11 +33,11 @@ def states(count, seed=0, dtype=torch.float64):
     return State(q.to(dtype), p.to(dtype), s.to(dtype))
 
 
-def random_kicks(angle, seed=0, error=0.0):
+def random_kicks(angle, seed=0):
     make = torch.Generator().manual_seed(seed)
     d, a, b = (torch.randn(n, generator=make, dtype=torch.float64) for n in (4, 12, 12))
     b = b.reshape(3, 4) if angle else torch.zeros(3, 0, dtype=torch.float64)
-    return KickStepper(H, 0.3, angle, 0.2, 1.7, 0.3 + 0.1 * d, 0.2 * a.reshape(3, 4), 0.2 * b, 0.07, error)
+    return KickStepper(H, 0.3, angle, 0.2, 1.7, 0.3 + 0.1 * d, 0.2 * a.reshape(3, 4), 0.2 * b, 0.07)
 
 
 @pytest.mark.parametrize("angle", [True, False], ids=["angle", "length"])
@@ -128,10 +128,11 @@ def test_the_normal_equations_of_kicks_are_the_derivatives_of_the_cost():
 
 
 @needs_c
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-11), ("float32", 1e-4)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-13), ("float32", 1e-4)])
 @pytest.mark.parametrize("angle", [True, False], ids=["angle", "length"])
 def test_c_is_the_same_step(angle, dtype, tolerance):
-    # fails if a polynomial, a sign of a half turn or the order of kicks differs; angles of many turns among them
+    # fails if an operation of the map is lowered wrongly, or the loop reads another motion's state; angles of many
+    # turns are among them. Measured in float64: 3e-15.
     stepper, number = random_kicks(angle), getattr(torch, dtype)
     x = states(50, dtype=number)
     if angle:
@@ -152,19 +153,15 @@ def test_c_is_the_same_step(angle, dtype, tolerance):
 
 
 @needs_c
-def test_c_is_no_more_exact_than_the_fit():
-    # fails if the sine is not cut to the error of the fit, or cut below it
-    long, short = (kicks_c(random_kicks(True, error=e)) for e in (0.0, 1e-3))
-    assert len(short) < len(long)
-    x = states(20)
-    a = random_kicks(True).rollout(*x, h=H, steps=1).q
-    b = CompiledKicks(random_kicks(True, error=1e-3)).rollout(*x, h=H, steps=1).q
-    assert 1e-12 < float((a - b).abs().max()) < 1e-3
+def test_a_kick_in_c_takes_one_sine_and_one_cosine():
+    # fails if multiple angles are functions of their own: they are most of the work of a step
+    text = kicks_c(random_kicks(True))
+    assert [text.count(f" {name}(") for name in ("sin", "cos")] == [3, 3]
 
 
 @needs_c
 def test_what_is_not_finite_says_so():
-    # fails if a motion that overflows is reported as converged, or poisons the next one of its batch
+    # fails if a motion that overflows is reported as converged, has a σ, or poisons the next one of its batch
     d = torch.full((2,), 0.5, dtype=torch.float64)
     wild = KickStepper(H, 0.0, False, 0.0, 1.0, d, torch.full((1, 4), 1.0, dtype=torch.float64), torch.zeros(1, 0))
     x = State(*(torch.tensor(y, dtype=torch.float64) for y in ([[50.0], [1e-3]], [[0.0], [0.0]], [0.0, 0.0])))
@@ -172,6 +169,7 @@ def test_what_is_not_finite_says_so():
         out = stepper.rollout(*x, h=H, steps=8)
         assert out.status[0, -1] == Status.DIVERGED
         assert bool(out.q[0, -1].isnan().all())
+        assert bool(out.sigma[0, -1].isnan())
         assert bool(out.ok[1])
 
 
