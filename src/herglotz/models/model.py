@@ -197,7 +197,7 @@ class ContactLagrangian(nn.Module):
         v: Tensor,  # (..., n)
         s: Tensor,  # (...)
     ) -> tuple[Tensor, Tensor]:
-        """p = L_v (..., n) and L_vv (..., n, n) of the model's own Lagrangian L(q, v, s) = lim L_d(q, q + hv, s, h)/h.
+        """Return p = L_v (..., n) and L_vv (..., n, n) of the model's L(q, v, s) = lim L_d(q, q + hv, s, h)/h, h → 0.
 
         They are D2 L_d and h D22 L_d at an h whose square is below rounding: jets divide by h, and subtract nothing.
         """

@@ -46,13 +46,13 @@ class Legendre(NamedTuple):
 
 
 def momentum(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Tensor:
-    """p (..., n) of a motion through q at the velocity v, (..., n), with s (...) and steps h, () or (...)."""
+    """The momentum p (..., n) of a motion through q at v, (..., n), with s (...) and steps h, () or (...)."""
     there = legendre(L_d, q, v, s, h)
     return there.p if there.grip is None else there.p + there.grip * v.sign()
 
 
 def velocity(L_d: DiscreteLagrangian, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
-    """v (..., n) of states with steps h, () or (...), and how each was found, (...) of `Status`; NaN where it was not.
+    """The v (..., n) of states with steps h, () or (...), and the `Status` of each, (...); NaN where none was found.
 
     Differentiable once, by the implicit-function theorem.
     """
@@ -64,8 +64,20 @@ def velocity(L_d: DiscreteLagrangian, state: State, h: Tensor) -> tuple[Tensor, 
     return torch.cat(v).reshape(state.q.shape), torch.cat(status).reshape(batch)
 
 
+def velocities(L_d: DiscreteLagrangian, state: State, h: Tensor) -> Tensor:
+    """The v (..., n) of states with steps h, () or (...); NaN where a rollout has not come, or there is none.
+
+    A state that a step of h has made comes with that h.
+    """
+    reached = state.finite
+    v = torch.full_like(state.q, torch.nan)
+    if bool(reached.any()):
+        v[reached] = velocity(L_d, State(*(x[reached] for x in state)), h.to(state.s).expand(state.s.shape)[reached])[0]
+    return v
+
+
 def legendre(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Legendre:
-    """p and its derivatives by v; see the head of this module."""
+    """The momentum and its derivatives by v; see the head of this module."""
     model = L_d.model if isinstance(L_d, DrivenLagrangian) else L_d
     if not isinstance(model, ContactLagrangian):
         return _symmetric(L_d, q, v, s, h)
@@ -103,7 +115,7 @@ class _AtVelocity:
         self.L_d, self.state, self.h = L_d, state, h
         self.q0, self.p0 = torch.zeros_like(state.q), state.p
 
-    def __call__(self, x: Tensor, second: bool) -> Point:
+    def __call__(self, x: Tensor, second: bool) -> Point:  # noqa: ARG002  one signature for all
         """F and ∂F/∂v at v = x."""
         q, _, s = self.state
         found, zero = legendre(self.L_d, q, x, s, self.h), torch.zeros_like(s)

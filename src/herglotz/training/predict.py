@@ -18,6 +18,7 @@ from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper, state_of
+from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
@@ -44,6 +45,7 @@ class Prediction:
     outside: float  # share of model steps that are shorter or longer than those of the training data
     zeros: tuple[float, ...] = ()  # of the sensors, (n,), that were taken off the recording; empty: 0
     beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit, farthest first: the model extrapolates there
+    v: Tensor | None = None  # (N, n) velocities of the states, in units of q over that of t
 
     def __repr__(self) -> str:
         rms = "failed" if self.rms is None else f"{self.rms:.3g}"
@@ -89,7 +91,8 @@ class Prediction:
         counts = [k if k >= 3 else 0 for k in counts]
         if not any(counts):
             return None
-        whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None)
+        v = None if self.v is None else self.v.nan_to_num()
+        whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None, v=v)
         return whole.rows(leading_rows(self.data.lengths, counts), tuple(filter(None, counts)))
 
     def metrics(self) -> dict[str, Any]:
@@ -176,7 +179,11 @@ def predict(
     h = grid.h[inside]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
-    found = Prediction(data, state_of(states), warmup, every, most, outside, zeros)
+    model, x = run.model, state_of(states)
+    # Where a recorded step is crossed in several, p is that of the last of them.
+    step = run.h if most == 1 else float(h.median())
+    v = velocities(model, x, torch.tensor(step))
+    found = Prediction(data, x, warmup, every, most, outside, zeros, v=v)
     return replace(found, beyond=_beyond(run.box, found))
 
 
@@ -212,10 +219,10 @@ def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
             raise InputError(f"{where}: {name} is in {data.units[i]}, the run was fitted in {unit}; convert the column")
     data = with_waves(data, run.config.frequencies)
     u = data.u if run.model.inputs else None
-    p = None if data.p is None else data.p[:, at]
+    p, v = (None if x is None else x[:, at] for x in (data.p, data.v))
     called = {data.names[i]: name for i, name in zip(at, wanted.names, strict=True)}
     data = replace(
-        data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
+        data, q=data.q[:, at], p=p, v=v, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
         columns=tuple((called.get(name, name), role, unit) for name, role, unit in data.columns),
     )  # fmt: skip
     return acting(data, run.arrival)  # other recordings that say nothing are like those of the fit
