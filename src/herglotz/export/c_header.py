@@ -170,19 +170,23 @@ def export_c(
 def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, derivatives: bool = True) -> str:
     """The text of the header.
 
-    Without `derivatives`, and beyond 8 coordinates, NAME_step_jacobian is left out: it is most of the work.
+    Without `derivatives` NAME_step_jacobian, NAME_init_qv and NAME_velocity are left out. Beyond 8 coordinates the
+    first one is: it is most of the work.
     """
+    velocities = derivatives
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
     step = StepInC(equations)
-    emitted = model_source(step, equations, derivatives)
+    emitted = model_source(step, equations, derivatives, velocities)
     types, number_tests, functions, products, checks, one_step, run, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
     parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests, functions, products]
     parts += [emitted.tables, _inputs(model, dtype), checks, as_scalars(emitted.step + one_step + run)]
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
-    parts += [as_scalars(emitted.slopes), api, "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+    parts += [as_scalars(emitted.slopes), api]
+    parts += [as_scalars(emitted.momentum), runtime("velocity.h")] if velocities else []
+    parts += ["#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     last = {

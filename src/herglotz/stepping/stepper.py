@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -22,7 +24,7 @@ from herglotz.stepping.state import (
     check_state,
     throw_failure,
 )
-from herglotz.stepping.velocity import momentum, velocity
+from herglotz.stepping.velocity import legendre, momentum, velocity
 
 
 class Stepper(OneStepMethod):
@@ -125,7 +127,7 @@ class Stepper(OneStepMethod):
         """
         s = torch.zeros_like(q[..., 0]) if s is None else s
         check_state(State(q, v, s), self.L_d, ("q", "v", "s"), finite=True)
-        return check_started(State(q, momentum(self.L_d, q, v, s, check_h(h, q)), s))
+        return check_started(State(q, momentum(partial(legendre, self.L_d), q, v, s, check_h(h, q)), s))
 
     def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:
         """The velocity v (..., n) of states: L_v(q, v, s) = p solved for v, the inverse of `init_qv`.
@@ -152,7 +154,7 @@ class Stepper(OneStepMethod):
             If no velocity of a sample has this p; the message names the sample.
         """
         check_state(state, self.L_d, finite=True)
-        v, status = velocity(self.L_d, state, check_h(h, state.q))
+        v, status = velocity(partial(legendre, self.L_d), state, check_h(h, state.q))
         return check_moving(v, status)
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:

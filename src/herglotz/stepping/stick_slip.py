@@ -24,7 +24,6 @@ from torch import Tensor
 
 from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
 from herglotz.mechanics.newton import Point
-from herglotz.models import capabilities
 from herglotz.stepping.partials_equation import StepEquation
 
 SWEEPS = 8  # of Gauss–Seidel: they find which coordinates stick, Newton's iteration finds by how much the others move
@@ -35,6 +34,7 @@ class PartialsAtHand(StepEquation, Protocol):
 
     p0: Tensor  # (..., n)
     order: int  # of the derivatives, unless `second` are asked for
+    sticking: bool
 
 
 class Rest(NamedTuple):
@@ -98,5 +98,4 @@ class StickSlip:
 
 def sticks(equation: StepEquation) -> TypeGuard[PartialsAtHand]:
     """Whether dry friction can hold a coordinate of this step: its partials then are at hand."""
-    made_of = capabilities(getattr(equation, "L_d", None))
-    return made_of is not None and made_of.sticking
+    return getattr(equation, "sticking", False)

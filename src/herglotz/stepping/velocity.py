@@ -17,6 +17,8 @@ section 1.6: the exact L_d has FL⁻ and FL⁺ of L; section 1 of `docs/mathemat
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -45,13 +47,17 @@ class Legendre(NamedTuple):
     grip_by_v: Tensor | None = None  # (..., n) its slope
 
 
-def momentum(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Tensor:
+# (q, v, s, h) → `Legendre`: that of an L_d, `partial(legendre, L_d)`, or of a file
+Transform = Callable[[Tensor, Tensor, Tensor, Tensor], Legendre]
+
+
+def momentum(transform: Transform, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Tensor:
     """The momentum p (..., n) of a motion through q at v, (..., n), with s (...) and steps h, () or (...)."""
-    there = legendre(L_d, q, v, s, h)
+    there = transform(q, v, s, h)
     return there.p if there.grip is None else there.p + there.grip * v.sign()
 
 
-def velocity(L_d: DiscreteLagrangian, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
+def velocity(transform: Transform, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
     """The v (..., n) of states with steps h, () or (...), and the `Status` of each, (...); NaN where none was found.
 
     Differentiable once, by the implicit-function theorem.
@@ -60,7 +66,7 @@ def velocity(L_d: DiscreteLagrangian, state: State, h: Tensor) -> tuple[Tensor, 
     flat = State(state.q.reshape(-1, n), state.p.reshape(-1, n), state.s.reshape(-1))
     h = h.expand(batch).reshape(-1)
     parts = zip(*(x.split(AT_ONCE) for x in (*flat, h)), strict=True)
-    v, status = zip(*(_velocity(L_d, State(*x), h) for *x, h in parts), strict=True)
+    v, status = zip(*(_velocity(transform, State(*x), h) for *x, h in parts), strict=True)
     return torch.cat(v).reshape(state.q.shape), torch.cat(status).reshape(batch)
 
 
@@ -72,7 +78,9 @@ def velocities(L_d: DiscreteLagrangian, state: State, h: Tensor) -> Tensor:
     reached = state.finite
     v = torch.full_like(state.q, torch.nan)
     if bool(reached.any()):
-        v[reached] = velocity(L_d, State(*(x[reached] for x in state)), h.to(state.s).expand(state.s.shape)[reached])[0]
+        v[reached] = velocity(
+            partial(legendre, L_d), State(*(x[reached] for x in state)), h.to(state.s).expand(state.s.shape)[reached]
+        )[0]
     return v
 
 
@@ -111,14 +119,15 @@ class _AtVelocity:
 
     increments, order = True, 2
 
-    def __init__(self, L_d: DiscreteLagrangian, state: State, h: Tensor):
-        self.L_d, self.state, self.h = L_d, state, h
+    def __init__(self, transform: Transform, state: State, h: Tensor):
+        self.transform, self.state, self.h = transform, state, h
         self.q0, self.p0 = torch.zeros_like(state.q), state.p
+        self.sticking = transform(state.q, self.q0, state.s, h).grip is not None
 
     def __call__(self, x: Tensor, second: bool) -> Point:  # noqa: ARG002  one signature for all
         """F and ∂F/∂v at v = x."""
         q, _, s = self.state
-        found, zero = legendre(self.L_d, q, x, s, self.h), torch.zeros_like(s)
+        found, zero = self.transform(q, x, s, self.h), torch.zeros_like(s)
         force = None
         if found.grip is not None and found.grip_by_v is not None:
             held = torch.where(x.abs() > 0, 0.0, found.grip)
@@ -141,9 +150,9 @@ class _AtVelocity:
         return torch.zeros_like(self.state.s)
 
 
-def _velocity(L_d: DiscreteLagrangian, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
+def _velocity(transform: Transform, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
     """The same of one batch (B, n)."""
-    equation = _AtVelocity(L_d, state, h)
+    equation = _AtVelocity(transform, state, h)
     with torch.no_grad():
         tol = TOL * torch.finfo(state.q.dtype).eps
         found = find_root(equation, equation.q0, tol, MAX_ITERATIONS, 2)
