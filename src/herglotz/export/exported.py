@@ -27,9 +27,9 @@ class ExportedStepper(OneStepMethod):
     """The flow Φ̃ of an exported model; results are those of `Stepper`. `load_exported` makes it of a file.
 
     The programs are what the file can run, each a function of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) →
-    K steps, and where the format has them `model`, one differentiable step, `linearise`, `init`, and `legendre` (or `momentum` and
-    `velocity`). A format without
-    the program `rollout` gives the loop of K steps instead, which needs no inputs where none act.
+    K steps, and where the format has them `model`, one differentiable step, `linearise`, `init`, and `legendre` (or
+    `momentum` and `velocity`). A format without the program `rollout` gives the loop of K steps instead, which needs no
+    inputs where none act.
     """
 
     def __init__(
