@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.driving import driven, even_times, input_recording
 from herglotz.data.waves import waves
-from herglotz.errors import InputError, refuse
+from herglotz.errors import InputError, check_start
 from herglotz.stepping import State
 from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
@@ -85,7 +85,7 @@ def free_motion(
     check_start(q0 is not None, v0 is not None, p0 is not None)
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise InputError(f"steps must be a whole number >= 1, got {steps!r}")
-    fitted, time = run.last_fitted(trajectory)
+    fitted, time = run.last_fitted(trajectory if q0 is None else 0)
     time = t0 if t0 is not None else time if q0 is None else 0.0
     dtype = fitted.q.dtype
     u, times = _inputs(run, inputs, (time, steps, h), (trajectory, q0 is not None and t0 is None))
@@ -100,16 +100,6 @@ def free_motion(
     arrays = [x.detach().cpu().numpy() for x in (times, found.q, v, found.p, found.s, found.status)]
     left = tuple(quantities_outside(run.box, run.data, times, found.q, found.p))
     return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit, beyond=left)
-
-
-def check_start(q0: bool, v0: bool, p0: bool, dash: str = "") -> None:
-    """Raise InputError unless a start is given whole, a position and one of velocity and momentum, or not at all."""
-    q, v, p = (f"{dash}{name}" for name in ("q0", "v0", "p0"))
-    refuse({
-        f"{v} and {p} both say how fast the start is; leave one out": v0 and p0,
-        f"{q} needs {v}, the velocity (or {p}, the momentum), and these need {q}; give both, or none of them to start "
-        "from the last fitted state": q0 != (v0 or p0),
-    })  # fmt: skip
 
 
 def _given(

@@ -20,7 +20,7 @@ def test_a_rollout_is_numpy_without_gradients():
     run = fake_run(trajectories=2)
     first = run.data.offsets[1] + run.train_lengths[1] - 1
     found = run.rollout(5, trajectory=1)
-    assert all(isinstance(x, np.ndarray) for x in (found.t, found.q, found.p, found.s, found.status))
+    assert all(isinstance(x, np.ndarray) for x in (found.t, found.q, found.v, found.p, found.s, found.status))
     np.testing.assert_allclose(found.q, run.prediction[first : first + 6].detach().numpy(), atol=1e-10)
     np.testing.assert_allclose(found.t, run.data.t[first : first + 6], atol=1e-12)
     assert found.ok
@@ -33,7 +33,7 @@ def test_a_start_may_be_numbers_or_a_batch():  # fails if a number, a list or an
     many = run.rollout(4, q0=np.array([[1.0], [0.3]]), p0=[[0.2], [0.0]], h=0.2)
     assert (one.s[0], one.t[-1], many.q.shape) == (0.5, 3.8, (2, 5, 1))
     np.testing.assert_allclose(one.q, many.q[0], atol=1e-12)
-    with pytest.raises(InputError, match="q0 and p0 go together"):
+    with pytest.raises(InputError, match=r"q0 and v0 .* go together"):
         run.rollout(4, q0=1.0)
     with pytest.raises(InputError, match="q0 and p0 need 1 numbers each"):
         run.rollout(4, q0=[1.0, 2.0], p0=[0.0, 0.0])
