@@ -88,8 +88,8 @@ static const char hz_dtype[] = {dtype};
 static const char hz_versions[] = {versions};
 static const char *const hz_units[] = {{{units}}};
 static const int hz_is_angle[hz_N] = {{{angles}}};
-static const hz_real hz_h = {h}; /* typical step: recorded, not imposed */
-static const hz_real hz_h_low = {h_low}, hz_h_high = {h_high}; /* steps it was fitted for */
+static const hz_real hz_h = {h}; /* typical step{in_unit}: recorded, not imposed */
+static const hz_real hz_h_low = {h_low}, hz_h_high = {h_high}; /* steps of the fit and of the recording{in_unit} */
 static const hz_real hz_tolerance = {tolerance}; /* of Newton, relative to the size of q */
 static const hz_real hz_floor = {floor}; /* rounding that no iteration removes */
 static const hz_real hz_top_speed = {top_speed}; /* the networks' rounding is relative to h times this, even at rest */
@@ -238,12 +238,17 @@ def _identifier(stem: str) -> str:
     return name if re.match("[A-Za-z]", name) else f"model_{name}"[:41]
 
 
+def _time_unit(entries: Mapping[str, Any]) -> str:
+    """That of h, without what would end the comment."""
+    return entries.get("time_unit", "s").replace("*", "")
+
+
 def _arrival(entries: Mapping[str, Any]) -> str:
     """What to do with recorded inputs before a step takes them; nothing where they act at once."""
     delay, lag = Arrival(**entries.get("arrival", {})).late
     if not delay and not lag:
         return ""
-    unit = entries.get("time_unit", "s").replace("*", "")  # "*/" would end the comment
+    unit = _time_unit(entries)
     late = f"u(t - {delay:.6g} {unit})" if delay else "u(t)"
     formula = f"T u_f' = {late} - u_f with T = {lag:.6g} {unit}" if lag else f"u_f(t) = {late}"
     return f"   Inputs u act late: give each step the mean over it of u_f,\n   {formula}.\n\n"
@@ -286,6 +291,7 @@ def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
         units="@UNITS@",
         angles=", ".join(str(int(a)) for a in entries["angles"]),
         h=number(entries["h"], dtype),
+        in_unit=f" in {_time_unit(entries)}" if "time_unit" in entries else "",
         h_low=number(span[0], dtype),
         h_high=number(span[-1], dtype),
         tolerance=number(entries["newton_tolerance"], dtype),
