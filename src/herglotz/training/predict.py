@@ -165,13 +165,7 @@ def predict(
         data = data.thinned(every)
     if windows is not None or horizon is not None:
         data = _windows(data, warmup, windows, horizon)
-    for b, length in enumerate(data.lengths):
-        if length < warmup + 2:
-            thinned = f", every {every} of the recording" if every > 1 else ""
-            raise InputError(
-                f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs "
-                f"at least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
-            )
+    _check_lengths(data, warmup, every)
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)
     grid = _free_run(run.stepper, data, states, warmup, high)
@@ -228,6 +222,19 @@ def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
     return acting(data, run.arrival)  # other recordings that say nothing are like those of the fit
 
 
+def _check_lengths(data: Trajectories, warmup: int, every: int) -> None:
+    """Raise unless every trajectory goes on for two samples after its warm-up."""
+    length = min(data.lengths)
+    if length >= warmup + 2:
+        return
+    thinned = f", every {every} of the recording" if every > 1 else ""
+    shorter = f"use --warmup {max(3, length // 2)} or a longer recording"
+    raise InputError(
+        f"{data.source or 'data'}: trajectory {data.lengths.index(length)} has {length} samples{thinned}; a warm-up of "
+        f"{warmup} needs at least {warmup + 2}: {shorter if length >= 5 else 'leave it out, for none is short enough'}"
+    )
+
+
 def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:
     """`count` windows of `warmup` samples and the time `horizon` after them, spread evenly over all possible starts."""
     if count is None or horizon is None:
@@ -244,12 +251,25 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
     if not found:
         raise InputError(
             f"{data.source or 'data'}: no trajectory holds {warmup} samples and a time of {horizon:g} after them (at "
-            "least two samples there); use a shorter --horizon or --warmup"
+            f"least two samples there); {_shorter(data, warmup, horizon)}"
         )
     chosen = torch.linspace(0, len(found) - 1, min(count, len(found))).round().long().tolist()
     spans = [found[k] for k in chosen]
     rows = torch.cat([torch.arange(a, b) for a, b in spans])
     return data.rows(rows, tuple(b - a for a, b in spans))
+
+
+def _shorter(data: Trajectories, warmup: int, horizon: float) -> str:
+    """The largest warm-up and the longest time that the recording has room for, as a remedy."""
+    times = [data.t[a : a + k] for a, k in zip(data.offsets, data.lengths, strict=True)]
+    most = max(min(int((t + horizon * (1 - 1e-9) <= t[-1]).sum()), len(t) - 2) for t in times)
+    left = max((float(t[-1] - t[warmup - 1]) for t in times if len(t) >= warmup + 2), default=0.0)
+    shortest = min(float((t[2:] - t[:-2]).min()) for t in times)
+    words = [f"--warmup {most}"] if 3 <= most < warmup and horizon >= shortest else []
+    if left > 0 and not shortest <= horizon <= left:
+        digits = 10.0 ** (3 - math.floor(math.log10(left)))
+        words.append(f"--horizon {math.floor(left * digits * (1 + 1e-9)) / digits:g}")
+    return f"use {' or '.join(words)}" if words else "use a longer recording"
 
 
 def _started(

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from herglotz.cli import main
+from herglotz.training.run_folder import FORMAT
 
 GOOD = "t[s],theta[rad]\n" + "".join(f"{k / 10},{1 - k / 50}\n" for k in range(30))
 BAD_FILES = {
@@ -213,3 +214,12 @@ def test_wrong_entries_of_a_run(tmp_path, capsys, tiny_run, where, value, messag
     manifest["files"]["metrics.json"] = hashlib.sha256((run / "metrics.json").read_bytes()).hexdigest()
     (run / "manifest.json").write_text(json.dumps(manifest))
     assert message in mistake(capsys, tmp_path, "trust", run)
+
+
+def test_a_run_of_a_newer_format_is_refused(tmp_path, capsys, tiny_run):
+    # fails if a folder that this version does not understand is read, or called damaged
+    run = shutil.copytree(tiny_run, tmp_path / "run")
+    manifest = json.loads((run / "manifest.json").read_text())
+    (run / "manifest.json").write_text(json.dumps(manifest | {"format": FORMAT + 1, "herglotz": "9.1", "files": {}}))
+    said = mistake(capsys, tmp_path, "trust", run)
+    assert f"is of format {FORMAT + 1}, written by herglotz 9.1; this version reads formats up to {FORMAT}" in said
