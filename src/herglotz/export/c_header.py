@@ -42,7 +42,7 @@ TOP = """\
 {arrival}   #include "{file}"  // cc -O3 -march=native -std=c99 -ffp-contract=fast example.c -lm
 
    int main(void) {{
-     hz_state x = hz_start;  // or your own: hz_init makes a state from two measured positions
+     hz_state x = hz_start;  // or your own: hz_init_qv makes a state of a position and a velocity
      hz_real left;
      int k, status = 0;
      for (k = 0; k < 100 && !(status & 15); k++) {{
@@ -115,8 +115,8 @@ def export_c(
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
 
-    Its functions are `NAME_init` (state from two positions), `NAME_step`, `NAME_step_jacobian`, `NAME_rollout` and
-    the `_batch`es; an example stands at the top of the file. Compile with `-O3 -march=native` for speed; `docs/c.md`
+    Its functions are `NAME_init` (state from two positions), `NAME_init_qv` (from a position and a velocity),
+    `NAME_velocity`, `NAME_step`, `NAME_step_jacobian`, `NAME_rollout` and the `_batch`es; an example stands at the top of the file. Compile with `-O3 -march=native` for speed; `docs/c.md`
     has the rest.
 
     Parameters

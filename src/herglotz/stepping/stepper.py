@@ -101,7 +101,9 @@ class Stepper(OneStepMethod):
         return check_started(State(*legendre_plus(driven_by(self.L_d, u), q0, q1, s0, h)))
 
     def init_qv(self, q: Tensor, v: Tensor, s: Tensor | None = None, h: Tensor | float = 1.0) -> State:
-        """The state (q, p, s) of a position and a velocity: p = L_v(q, v, s) (`herglotz.stepping.velocity`).
+        """The state (q, p, s) of a position and a velocity: p = L_v(q, v, s) of the model's L = lim L_d/h, h → 0.
+
+        Source: section 9 of `docs/trajectory.md`; `herglotz.stepping.velocity` has what stands for it elsewhere.
 
         Parameters
         ----------
@@ -132,14 +134,14 @@ class Stepper(OneStepMethod):
     def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:
         """The velocity v (..., n) of states: L_v(q, v, s) = p solved for v, the inverse of `init_qv`.
 
-        Differentiable once with respect to the state, by the implicit-function theorem.
+        Source: section 9 of `docs/trajectory.md`. Differentiable once with respect to the state, by the implicit-function theorem.
 
         Parameters
         ----------
         state
             (q, p, s) with shapes (..., n), (..., n), (...).
         h
-            () or (...) step of the motion that the states are of, as of `init_qv`.
+            () or (...) step of the motion that the states are of, in the unit of time; see `init_qv`.
 
         Returns
         -------

@@ -35,7 +35,8 @@ class Motion:
         (K+1,) time; (..., K+1, n) position and velocity, in the units of the data and these over that of t. v is NaN
         where p belongs to no velocity (`Stepper.velocity`).
     p, s
-        (..., K+1, n) momentum, of which the first mass is 1, and (..., K+1) action, as of `herglotz.State`.
+        (..., K+1, n) momentum, of which the first mass is 1, and (..., K+1) action, in the units of
+        `herglotz.State`.
     status
         (..., K) of every step, dimensionless, 0 where it was solved (`herglotz.Status`).
     names, units, time_unit
