@@ -116,8 +116,8 @@ def export_c(
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
 
     Its functions are `NAME_init` (state from two positions), `NAME_init_qv` (from a position and a velocity),
-    `NAME_velocity`, `NAME_step`, `NAME_step_jacobian`, `NAME_rollout` and the `_batch`es; an example stands at the top of the file. Compile with `-O3 -march=native` for speed; `docs/c.md`
-    has the rest.
+    `NAME_velocity`, `NAME_step`, `NAME_step_jacobian`, `NAME_rollout` and the `_batch`es; an example stands at the top
+    of the file. Compile with `-O3 -march=native` for speed; `docs/c.md` has the rest.
 
     Parameters
     ----------

@@ -134,7 +134,8 @@ class Stepper(OneStepMethod):
     def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:
         """The velocity v (..., n) of states: L_v(q, v, s) = p solved for v, the inverse of `init_qv`.
 
-        Source: section 9 of `docs/trajectory.md`. Differentiable once with respect to the state, by the implicit-function theorem.
+        Source: section 9 of `docs/trajectory.md`. Differentiable once with respect to the state, by the
+        implicit-function theorem.
 
         Parameters
         ----------

@@ -4,7 +4,7 @@
 
 #define hz_VELOCITIES
 
-/* hz_momentum with zeros where nothing is set-valued. */
+/* What hz_momentum gives, with zeros where nothing is set-valued. */
 typedef struct {
   hz_real p[hz_N], by_v[hz_N * hz_N], grip[hz_N], grip_by_v[hz_N];
 } hz_legendre;
@@ -87,7 +87,7 @@ static inline int hz_velocity(const hz_state *state, hz_real h, hz_real v[hz_N])
   hz_legendre at;
   hz_real z[hz_N], base[hz_N], move[hz_N], own[hz_N], bound[hz_N], G[hz_N], A[hz_N * hz_N], now[hz_N];
   hz_real scale = hz_R(0.0), merit, before = hz_R(0.0), last = hz_R(0.0), part = hz_R(1.0);
-  int i, j, sweep, iteration;
+  int i, j, sweep, iteration, better;
   const int status = hz_before(state, h);
   if (status) return status;
   for (i = 0; i < hz_N; i++) z[i] = move[i] = base[i] = now[i] = hz_R(0.0);
@@ -115,9 +115,10 @@ static inline int hz_velocity(const hz_state *state, hz_real h, hz_real v[hz_N])
       A[i * hz_N + i] += slides ? sign * at.grip_by_v[i] : own[i];
     }
     merit = hz_largest(G);
+    better = !iteration || merit <= (hz_R(1.0) - hz_R(1e-4) * part) * before;
     if (!hz_all_finite(G)) {
       if (!iteration) return hz_DIVERGED;
-    } else if (!iteration || merit <= (hz_R(1.0) - hz_R(1e-4) * part) * before || merit <= hz_floor * hz_largest(state->p)) {
+    } else if (better || merit <= hz_floor * hz_largest(state->p)) { /* the last digits need not lessen */
       hz_eliminate(A, G);
       if (!hz_all_finite(G)) return hz_SINGULAR;
       last = hz_largest(G);
