@@ -112,3 +112,20 @@ def test_settings_by_name():
     assert hz.FitConfig().changed({"features": "cos(q1)", "departures": 0.5}).features == ("cos(q1)",)
     assert torch.get_num_threads() >= 1
     assert isinstance(fake_run().rollout(2), Motion)
+
+
+def test_velocities_in_and_out():
+    # fails if v0 is taken for a momentum, v is not the slope of the motion, or what a rollout lost has one
+    run = fake_run(level="affine")
+    with torch.no_grad():
+        run.model.damping.drag.fill_(0.3)  # pyright: ignore[reportAttributeAccessIssue]
+    one = run.rollout(40, q0=1.0, v0=0.2, s0=0.5)
+    assert one.v[0] == pytest.approx(0.2, rel=1e-12)
+    assert abs(one.p[0] - 0.2) > 0.1
+    np.testing.assert_allclose(one.v[1:-1], (one.q[2:] - one.q[:-2]) / 0.4, atol=0.02)  # h² q‴/6
+    many = run.rollout(4, q0=[[1.0], [0.3]], v0=[[0.2], [0.0]], s0=[0.5, 0.0])
+    np.testing.assert_allclose(many.v[0], one.v[:5], atol=1e-12)
+    with pytest.raises(InputError, match="v0 and p0 both say how fast the start is"):
+        run.rollout(4, q0=1.0, v0=0.2, p0=0.2)
+    with pytest.raises(InputError, match="q0 and v0 need 1 numbers each"):
+        run.rollout(4, q0=[1.0, 2.0], v0=[0.0, 0.0])

@@ -238,6 +238,19 @@ def test_what_a_refused_prediction_names_works(settings):
         assert predict(run, data, **instead).rms is not None
 
 
+def test_predicted_velocities_are_those_of_the_motion():
+    # fails if a prediction's v is its momentum's place holder, or another sample's
+    model = model_of("linear")
+    run, data = run_of(model), recording(model)
+    found = predict(run, data)
+    assert found.v is not None
+    q, v = (x.reshape(2, -1) for x in (found.states.q, found.v))
+    torch.testing.assert_close(v[:, 1:-1], (q[:, 2:] - q[:, :-2]) / (2 * H), rtol=0, atol=0.05)
+    motion = found.motion()
+    assert motion is not None
+    torch.testing.assert_close(motion.v, found.v, rtol=0, atol=0)
+
+
 def test_no_warm_up_is_named_where_none_works():
     # fails if a trajectory of four samples, which no warm-up of three leaves two of, is told --warmup 3
     model = model_of("linear")
