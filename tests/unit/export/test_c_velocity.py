@@ -3,6 +3,7 @@
 import ctypes
 import math
 import shutil
+from typing import Any
 
 import pytest
 import torch
@@ -61,7 +62,7 @@ def test_statuses_of_velocities():
 def test_where_no_velocity_has_this_momentum():
     # fails if the last guess is taken for a velocity: K = v²/2 + v³/3 has p = v + v², which is nowhere below −1/4
     one = (1.0,)
-    model = ContactLagrangian(ModelConfig((False,), "linear", one, one, one, (0.0,), potential_width=0,
+    model: Any = ContactLagrangian(ModelConfig((False,), "linear", one, one, one, (0.0,), potential_width=0,
                                           features=("v1^3",))).requires_grad_(False)  # fmt: skip
     model.kinetic.sum.coefficient.fill_(1 / 3)  # pyright: ignore[reportAttributeAccessIssue]
     q, p, s = (
@@ -82,9 +83,9 @@ def test_velocities_in_float(case):
     q, v, s = states_of(model.dof, 5)
     eager, single = Stepper(model), compiled(header_of(model, "float32"))
     low = [x.float() for x in (q, v, s)]
-    torch.testing.assert_close(single.init_qv(*low, 0.1).p.double(), eager.init_qv(q, v, s, 0.1).p.detach(),
+    torch.testing.assert_close(single.init_qv(*low, h=0.1).p.double(), eager.init_qv(q, v, s, 0.1).p.detach(),
                                rtol=1e-5, atol=1e-6)  # fmt: skip
-    back = single.velocity(single.init_qv(*low, 0.1), 0.1)
+    back = single.velocity(single.init_qv(*low, h=0.1), 0.1)
     torch.testing.assert_close(back, low[1], rtol=1e-4, atol=1e-5)
 
 

@@ -1,6 +1,7 @@
 """What a run offers beside its numbers: rollouts in numpy, pictures, files, words."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,8 +118,9 @@ def test_settings_by_name():
 def test_velocities_in_and_out():
     # fails if v0 is taken for a momentum, v is not the slope of the motion, or what a rollout lost has one
     run = fake_run(level="affine")
+    damping: Any = run.model.damping
     with torch.no_grad():
-        run.model.damping.drag.fill_(0.3)  # pyright: ignore[reportAttributeAccessIssue]
+        damping.drag.fill_(0.3)
     one = run.rollout(40, q0=1.0, v0=0.2, s0=0.5)
     assert one.v[0] == pytest.approx(0.2, rel=1e-12)
     assert abs(one.p[0] - 0.2) > 0.1

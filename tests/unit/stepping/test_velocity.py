@@ -1,6 +1,7 @@
 """Velocities in and out: `Stepper.init_qv` and `Stepper.velocity`."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -14,13 +15,13 @@ F64 = torch.float64
 K, GAMMA, B, DRAG, LAMBDA = 4.0, 0.3, 0.2, 0.1, 0.15
 
 
-def pendulum(**settings):
+def pendulum(**settings) -> Any:
     """A pendulum of stiffness K and damping GAMMA."""
     given = {"level": "linear", "potential_width": 0, "rate": GAMMA, "damping_width": 0} | settings
     return ContactLagrangian(ModelConfig((True,), stiffness=(K,), **given)).requires_grad_(False)
 
 
-def rubbing():
+def rubbing() -> Any:
     """The same with viscous friction and drag of the square of the velocity."""
     model = pendulum(level="forced", drag=("|v1| v1",))
     model.friction.viscous.fill_(B)
@@ -28,7 +29,7 @@ def rubbing():
     return model
 
 
-def sticking(breakaway=0.0):
+def sticking(breakaway=0.0) -> Any:
     """The same with dry friction that can hold it. Stribeck's term makes its steps, and so v, of order 1."""
     model = pendulum(level="forced", coulomb=True, sticking=True)
     model.friction.coulomb.fill_(0.8)
@@ -36,17 +37,17 @@ def sticking(breakaway=0.0):
     return model
 
 
-def falling():
+def falling() -> Any:
     """Damping by the way that is gone, as a parachute has it: p = v + λ s is no velocity."""
     model = pendulum(level="affine")
     model.damping.drag.fill_(LAMBDA)
     return model
 
 
-def coupled():
+def coupled() -> Any:
     """Two lengths whose kinetic term is q1 (v1² + v1 v2), which K's features give: the mass depends on the position."""
     ones = (1.0, 1.0)
-    model = ContactLagrangian(
+    model: Any = ContactLagrangian(
         ModelConfig((False, False), "linear", ones, ones, ones, (0.0, 0.0), potential_width=0,
                     features=("q1 v1^2", "q1 v1 v2"))
     ).requires_grad_(False)  # fmt: skip

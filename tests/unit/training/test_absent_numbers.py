@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -105,7 +106,7 @@ def test_numbers_that_were_not_learned_have_no_uncertainty():
 
 def test_what_is_stored_as_a_logarithm_is_told_as_what_it_is():
     # fails if an engineer is told the logarithm of a mass or of a speed, or a spread that is not theirs
-    model = two_bodies()
+    model: Any = two_bodies()
     with torch.no_grad():
         model.kinetic.log_diagonal.fill_(0.5 * math.log(3.0))
     spread = {name: 0.01 * torch.ones_like(p) for name, p in model.named_parameters()}
