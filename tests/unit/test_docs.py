@@ -1,4 +1,4 @@
-"""What README, CONTRIBUTING and docs/ name exists: code, files, links, commands, flags, parts of the mathematics."""
+"""What README, its like and docs/ name exists: code, files, links, commands, flags, parts of the mathematics."""
 
 import argparse
 import importlib
@@ -10,7 +10,8 @@ import pytest
 from herglotz.cli.parser import build_parser
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FACE = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "benchmarks/fetch.md")]
+PAGES = [*FACE, *sorted((ROOT / "docs").rglob("*.md"))]
 CODE = {p: p.read_text(encoding="utf-8") for room in ("src", "tests", "train", "benchmarks", "tools", "examples")
         for p in sorted((ROOT / room).rglob("*.py")) if p != Path(__file__).resolve()}  # fmt: skip
 RUNTIME = [p.read_text(encoding="utf-8") for p in sorted((ROOT / "src").rglob("*.h"))]  # of the generated C

@@ -36,6 +36,8 @@ READING = (
     flag("--polar", "positions of a body on a circle that become one angle: x,y (centre and radius by least squares), "
          "x,y,X,Y with the centre in numbers or columns, x,-y where y grows downwards; again for the next body of a "
          "chain; none to leave positions as they are", action="append", metavar="X,Y"),
+    flag("--input-terms", "terms of inputs that act beside them, with commas: V^2, |V| or V' of an input V (default: "
+         "those that the data ask for)", type=names, metavar="TERMS"),
     flag("--sensor-zeros", f"what the sensors read where the coordinates are 0, {EACH}",
          type=finite, nargs="+", metavar="X"),
     flag("--sensor-scales", f"what one unit of each reading is worth, {EACH}", type=finite, nargs="+", metavar="X"),
@@ -59,7 +61,7 @@ RUN = (
 def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what the flags say of the columns, for `load`."""
     roles = ("time", "coordinates", "inputs", "drop", "group")
-    meant = ("angles", "degrees", "polar", "sensor_zeros", "sensor_scales")
+    meant = ("angles", "degrees", "polar", "input_terms", "sensor_zeros", "sensor_scales")
     given = {name: getattr(arguments, name) for name in (*meant, *roles)}
     return {name: value for name, value in given.items() if value is not None}
 

@@ -215,6 +215,9 @@ class _Numbers:
 
     def function(self, name: str, x: np.ndarray) -> np.ndarray:
         fold = lambda a: None if isinstance(a, Ref) else MATHEMATICS[name](a)  # noqa: E731
+        if name in ("sin", "cos") and (angles := self.program.angles) is not None:
+            which = ("sin", "cos").index(name)
+            return _array([angles.waves(a)[which] if isinstance(a, Ref) else fold(a) for a in x.flat]).reshape(x.shape)
         return self.program.elementwise(f"FN_{name}({{0}})", fold, x, kernel=f"FN_{name}_row" if name in ROWS else None)
 
     def greater(self, x: Any, y: Any) -> np.ndarray:

@@ -58,6 +58,9 @@ class Program:
     statements: list[Statement] = field(default_factory=list)
     tables: dict[tuple[float, ...], str] = field(default_factory=dict)
     known: dict[Any, Atom] = field(default_factory=dict)
+    operations: dict[Ref, tuple[Any, ...]] = field(default_factory=dict)  # the form and the operands of scalars
+    loop: float = LOOP  # results from which on a loop is written; infinite: none is
+    angles: Any = None  # `herglotz.codegen.angles.Angles`, where sines and cosines follow from one another
 
     def given(self, name: str, size: int) -> list[Ref]:
         """An input of the function: a row of `size`, or a scalar where that is 0."""
@@ -73,7 +76,8 @@ class Program:
         """The result of a formula such as `{0} + {1}`; the same formula of the same numbers is computed once."""
         key = (form, *atoms)
         if key not in self.known:
-            self.known[key] = self._append(f"const REAL @@ = {form.format(*map(self.read, atoms))};", 0)
+            ref = self._append(f"const REAL @@ = {form.format(*map(self.read, atoms))};", 0)
+            self.known[key], self.operations[ref] = ref, key
         return self.known[key]
 
     def elementwise(
@@ -110,7 +114,7 @@ class Program:
     def _row(self, form: str, entries: list[tuple[Atom, ...]], kernel: str | None) -> list[Ref]:
         """The results of one run of entries: a loop if it is long, else scalars."""
         count = len(entries)
-        if count < LOOP:
+        if count < self.loop:
             return [self.scalar(form, atoms) for atoms in entries]
         columns, forms = list(zip(*entries, strict=True)), (form,)
         if form in SINE_AND_COSINE:
@@ -157,7 +161,7 @@ class Program:
             lines, start = [], 0
             while start < len(atoms):
                 count = _run([(x,) for x in atoms], start)
-                if count < LOOP:
+                if count < self.loop:
                     lines += [f"@@[{i}] = {self._spread(atoms[i])};" for i in range(start, start + count)]
                 else:
                     right = self._in_loop(atoms[start : start + count])
@@ -180,9 +184,9 @@ class Program:
         if not kept:
             return start
         if not _varies([*weight.flat, *start]) and _varies(x):
-            if size >= LOOP and len(kept) <= 4:
+            if size >= self.loop and len(kept) <= 4:
                 return self._few_inputs(x, weight, start)
-            if max(len(kept), size) >= LOOP and np.count_nonzero(weight) >= min(DENSE, weight.size):
+            if max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size):
                 return self._call_product(x, weight, start)
         return [self.sum([start[k], *(multiply(self, v, w) for v, w in zip(x, weight[:, k], strict=True))])
                 for k in range(size)]  # fmt: skip
@@ -208,7 +212,7 @@ class Program:
     def sum(self, atoms: Iterable[Atom]) -> Atom:
         """The sum, by a call where the numbers lie in a long row."""
         terms = [x for x in atoms if x != 0.0]
-        if len(terms) >= LOOP and _run([(x,) for x in terms], 0) == len(terms) and isinstance(terms[0], Ref):
+        if len(terms) >= self.loop and _run([(x,) for x in terms], 0) == len(terms) and isinstance(terms[0], Ref):
             where = self.pointer(terms)
             key = ("sum", where, len(terms))
             if key not in self.known:

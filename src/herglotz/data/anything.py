@@ -28,7 +28,7 @@ from herglotz.telling import tell
 
 TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
 AS_THEY_ARE = Wanted(coordinates=())  # coordinates of arrays, which no header names
-OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "polar",
+OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "polar", "input_terms",
            "sensor_zeros", "sensor_scales")  # fmt: skip
 
 
@@ -44,6 +44,7 @@ def as_trajectories(
     angles: Names | bool | None = None,
     degrees: Names | None = None,
     polar: Names | None = None,
+    input_terms: Names | None = None,
     sensor_zeros: Sequence[float] | None = (),
     sensor_scales: Sequence[float] | None = (),
     like: Trajectories | None = None,
@@ -71,9 +72,9 @@ def as_trajectories(
         Columns of a table that are left aside; the column that numbers its trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
-    degrees, polar
-        Coordinates in degrees whose header does not say so; pairs of positions that become one angle each: as in
-        `load`.
+    degrees, polar, input_terms
+        Coordinates in degrees whose header does not say so; pairs of positions that become one angle each; terms of
+        inputs that act beside them: as in `load`.
     sensor_zeros, sensor_scales
         q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
         for none.
@@ -92,10 +93,12 @@ def as_trajectories(
     """
     names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
     coordinates, data = names["coordinates"], _by_field(data)
-    meant = {"angles": angles, "degrees": degrees, "polar": polar}
+    meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms}
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
     if isinstance(data, Trajectories):
-        wrong = "trajectories have their columns already; angles, degrees, polar and sensors alone change them"
+        wrong = (
+            "trajectories have their columns already; angles, degrees, polar, input_terms and sensors alone change them"
+        )
         refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         found = data
     elif isinstance(data, (str, Path)):
@@ -116,7 +119,7 @@ def as_trajectories(
         return measured(_of_each(data, options), sensor_zeros)
     else:
         found = _array(data, h, time, names)
-    if not isinstance(data, Trajectories) or any(x is not None for x in (degrees, polar)):
+    if not isinstance(data, Trajectories) or any(x is not None for x in (degrees, polar, input_terms)):
         found = as_told(found, AS_THEY_ARE, **meant, like=like)
     return _noted(_marked(measured(found, sensor_zeros, sensor_scales), angles), data)
 

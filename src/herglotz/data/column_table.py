@@ -7,6 +7,7 @@ from typing import Any
 
 from herglotz.data.column_roles import is_angular
 
+INPUT_TERM = "input term"  # role of a column of u that follows from a recorded one
 WARNING = "warning: "  # begins a note that a user should see outside of the table, too
 LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
 

@@ -10,6 +10,7 @@ import torch
 
 from herglotz.data.actuator import acting
 from herglotz.data.holds import NOT_SAID, Arrival
+from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.readers import load
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
@@ -45,7 +46,7 @@ def input_recording(
     """
     found = path if isinstance(path, Trajectories) else load(path, known=tuple(map(tuple, known)), motion=False)
     path = found.source or "recording"
-    found = acting(found, unsaid)
+    found = acting(found if found.u is None else with_input_terms(found, input_terms_of(known)), unsaid)
     if found.u is None:
         raise InputError(f"inputs {path}: holds no inputs; name their columns u, u_*, force or torque")
     if found.time_unit != time_unit:

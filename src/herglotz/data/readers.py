@@ -10,7 +10,7 @@ from typing import Any
 
 from herglotz.data.checks import check_alike
 from herglotz.data.column_table import of_file
-from herglotz.data.csv_columns import Names, Wanted
+from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.csv_dialect import is_row_of_numbers
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.degrees import in_told_degrees
@@ -18,6 +18,7 @@ from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
+from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
@@ -70,6 +71,7 @@ def load(
     angles: Names | bool | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
     degrees: Names | None = None,  # coordinates in degrees whose header does not say so; () for none
     polar: Names | None = None,  # pairs of positions, "x,y", that become one angle each; () for none
+    input_terms: Names | None = None,  # squares, sizes and rates of inputs that act as well; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
@@ -93,6 +95,8 @@ def load(
         Pairs of positions that become one angle each (`herglotz.data.polar`): "x,y" of a body on a circle, or
         ["x1,y1", "x2,y2"] of a chain, the second body on the first; "x,y,X,Y" with the centre in numbers or columns;
         "x,-y" where y grows downwards. Left out: as in `like`; () for none.
+    input_terms
+        Terms of inputs that act beside them (`herglotz.data.input_terms`): "V^2", "|V|", "V'". Left out: as in `like`.
     unwrap
         Make angles continuous.
     show
@@ -128,7 +132,7 @@ def load(
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
-    found = as_told(found, wanted, polar, degrees, angles, like)
+    found = as_told(found, wanted, polar, degrees, angles, like, input_terms)
     found = parted(measured(found, sensor_zeros, sensor_scales))
     if angles is not None:
         found = with_angles(found, angles)
@@ -146,13 +150,18 @@ def as_told(
     degrees: Names | None,
     angles: Names | bool | None,
     like: Trajectories | None,
+    input_terms: Names | None = None,
 ) -> Trajectories:
-    """The coordinates that the columns are meant for: angles of bodies, and of degrees; refused where one jumps."""
+    """The coordinates and inputs that the columns are meant for: angles of bodies, and of degrees, terms of inputs.
+
+    Refused where a coordinate jumps.
+    """
     pairs = pairs_of(polar, like)
     chosen = polar is not None or wanted.coordinates is not None or wanted.known
     found = in_polar(found, pairs) if pairs or chosen else with_hints(found)
     refuse_jumps(found, wanted)
-    return in_told_degrees(found, degrees, angles, like)
+    terms = input_terms if input_terms is not None or like is None else input_terms_of(like.columns)
+    return with_input_terms(in_told_degrees(found, degrees, angles, like), as_names(terms or ()))
 
 
 def with_angles(found: Trajectories, angles: Names | bool) -> Trajectories:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
-from herglotz.data.column_table import column_table
+from herglotz.data.column_table import INPUT_TERM, column_table
 from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
@@ -156,7 +156,7 @@ class Trajectories:
     def input_labels(self) -> tuple[tuple[str, str], ...]:
         """Name and unit of each column of u, as the table had them; u, or u1, u2, ..., where no table was read."""
         m = 0 if self.u is None else self.u.shape[1]
-        found = tuple((name, unit) for name, role, unit in self.columns if role == "input")
+        found = tuple((name, unit) for name, role, unit in self.columns if role in ("input", INPUT_TERM))
         return found if len(found) == m else tuple(("u" if m == 1 else f"u{j + 1}", "") for j in range(m))
 
     @cached_property

@@ -13,9 +13,11 @@ from matplotlib.figure import Figure
 from herglotz.plots.fan import momentum_unit
 from herglotz.plots.motion import trained_mask
 from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, position_axis, styled, with_unit
-from herglotz.stepping import Rollout, State, Stepper
+from herglotz.stepping import State, Stepper
+from herglotz.training.flow import motion
 
 if TYPE_CHECKING:
+    from herglotz.models import ContactLagrangian
     from herglotz.training import Run
 
 LINES, MOST_PANELS = 13, 3
@@ -79,9 +81,16 @@ def _background(run: Run) -> np.ndarray:
         starts, duration = [grid[:, :1], grid[:, 1:], torch.zeros_like(grid[:, 0])], SHORT * typical
     steps = max(3, min(MOST_STEPS, round(duration / run.h)))
     h = min(run.h, duration / steps)
+    return _flow(model, State(*starts), h, steps).double().cpu().numpy()
+
+
+def _flow(model: ContactLagrangian, start: State, h: float, steps: int) -> torch.Tensor:
+    """Positions and momenta of rollouts, (lines, K + 1, 2, n): by the compiled step where that takes all of them."""
     with torch.no_grad():
-        found: Rollout = Stepper(model).rollout(*State(*starts), h=h, steps=steps)
-    return torch.stack([found.q, found.p], -2).double().cpu().numpy()
+        x = motion(model, start.joined, torch.full((len(start.q), steps), h).to(start.q), None)
+        if x is None:
+            x = Stepper(model).rollout(*start, h=h, steps=steps).states.joined
+    return x[..., : 2 * model.dof].unflatten(-1, (2, model.dof))
 
 
 def _draw_line(ax: Axes, q: np.ndarray, p: np.ndarray) -> None:

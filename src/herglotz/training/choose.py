@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+from herglotz.data.input_terms import input_terms_of
 from herglotz.data.units import common_unit, size
 from herglotz.training.config import FitConfig
 from herglotz.training.look import Look
@@ -110,7 +111,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         absent=c.absent, turning=seen.turning, spreads=dict(base.spreads),
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
-        departures=c.departures, zeros=seen.zeros,
+        departures=c.departures, input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros,
         reasons=_reasons(seen, user_settings, named=named, one_step=one_step) | {
             "objective": why,
             "network": why_network,
@@ -131,6 +132,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
         "turning": "terms of positions on a line, as of a free spring, miss the data by less",
         "substeps": (HALVED if seen.settings.substeps > 1 else KEPT_STEPS) if named else AS_SET,
         **seen.why_arrival,
+        "input_terms": seen.why_input_terms or AS_SET,
         "zeros": seen.why_zeros or "no recording was found to differ from the others",
         "forces": _forces_reason(seen),
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",

@@ -91,6 +91,9 @@ class FitConfig:
         with the named terms that were found, and kept if the score of held-out blocks is better with them
         (`herglotz.training.sensor_zeros`). The search for terms is then repeated. None: where named terms miss whole
         trajectories by more than the noise. True: also where they do not. False: nowhere.
+    find_input_terms
+        Inputs may act by their square, their size or their rate as well (`herglotz.data.input_terms`): these are tried
+        where named terms miss the data by more than the noise.
     supervision
         What the one-step objective is fitted to: "q" (positions), "qs" (s beside them) or "qps" (momenta as well),
         where they are recorded at every sample. Their unit is fitted. With s known the full level is reliable.
@@ -160,6 +163,7 @@ class FitConfig:
     sticking: bool | None = None
     robust: str = "auto"
     find_zeros: bool | None = None
+    find_input_terms: bool = True
     supervision: str = "q"
     restarts: int | None = None
     use_inputs: bool = True

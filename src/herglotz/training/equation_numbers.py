@@ -83,7 +83,8 @@ class Numbers:
             row = M.new_zeros(len(M))
             row[list(slopes)] = row.new_tensor(list(slopes.values()))
             row = row / size
-            new = row / row.norm()
+            row = row / row.norm()  # numbers over their size in `row` have no unit either
+            new = row
             for _ in range(2):  # rounding of the first time goes
                 new = new - basis.T @ (basis @ new)
             if float(new.norm()) > DEPENDENT:

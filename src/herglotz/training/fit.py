@@ -15,6 +15,7 @@ from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
 from herglotz.data.files import remove_leftovers
 from herglotz.data.holds import Arrival
+from herglotz.data.input_terms import with_input_terms
 from herglotz.data.lock import locked
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
@@ -104,6 +105,7 @@ def fit(
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
     read = data
     data = data if plan is None or plan.turning else on_a_line(data)
+    data = data if plan is None else with_input_terms(data, plan.input_terms)
     data = told_arrival(data, config, None if plan is None else Arrival(plan.hold, plan.delay, plan.lag))
     check_sizes(data.source or "data", data.q, data.names)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"

@@ -124,20 +124,25 @@ def _interval(data: Trajectories, form: list[tuple[int, float]]) -> tuple[float,
 def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> list[tuple[str, float]]:
     """sin(k (x − a)) of a linear form x that vanish at both ends of its interval, which begins at a."""
     middle, half = _interval(data, form)
-    found = []
+    longest, found = _short(math.pi / (2 * half)), []
+    phase = _short(longest * (half - middle))
     for j in range(1, count + 1):
-        k = math.pi * j / (2 * half)
-        parts = [(w * k, f" q{i + 1}") for i, w in form] + [(math.remainder(k * (half - middle), 2 * math.pi), "")]
-        text = " ".join(f"{'-' if w < 0 else '+'} {abs(w):.9g}{what}" for w, what in parts)
-        found.append((f"sin({text.removeprefix('+ ')})", k))
+        parts = [(w * j * longest, f" q{i + 1}") for i, w in form] + [(j * phase, "")]
+        text = " ".join(f"{'-' if w < 0 else '+'} {abs(w):.10g}{what}" for w, what in parts)
+        found.append((f"sin({text.removeprefix('+ ')})", j * longest))
     return found
 
 
 def _pairs(data: Trajectories, i: int) -> list[tuple[str, float]]:
     """Waves of one coordinate whose period is its interval."""
     half = _interval(data, [(i, 1.0)])[1]
-    rates = [math.pi * j / half for j in range(1, DAMPING[-1] + 1)]
-    return [(f"{f}({k:.8g} q{i + 1})", k) for k in rates for f in ("cos", "sin")]
+    rates = [j * _short(math.pi / half) for j in range(1, DAMPING[-1] + 1)]
+    return [(f"{f}({k:.10g} q{i + 1})", k) for k in rates for f in ("cos", "sin")]
+
+
+def _short(x: float) -> float:
+    """A number of seven digits, whose multiples are exact in ten: sines of multiples follow from that of one."""
+    return float(f"{x:.7g}")
 
 
 def _harmonics(i: int) -> list[tuple[str, float]]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -23,10 +24,12 @@ from torch import Tensor, nn
 from torch.func import functional_call, vjp, vmap
 
 import herglotz
+from herglotz.codegen.angles import Angles
 from herglotz.codegen.c_compiler import SOURCE, built, compiler
-from herglotz.codegen.c_function import Outputs, whole
+from herglotz.codegen.c_function import Outputs
+from herglotz.codegen.gated import Prepared, gated
 from herglotz.codegen.interpret import interpret
-from herglotz.codegen.program import Program, literal
+from herglotz.codegen.program import Program
 from herglotz.codegen.trace import traced
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative
@@ -43,6 +46,7 @@ LEVEL = "-O1"  # long straight lines of sums and products gain nothing from -O3,
 # Rooms, and files beside this one, whose sources decide what a kernel computes.
 MADE_OF = ("models", "mechanics", "stepping", "codegen")
 OWN = ("kernel.py", "parameter_vector.py")
+HANDED = ("const char *restrict gate", "const double *restrict fixed")  # what `hz_prepare` sets
 BATCHES = (101, 211, 431, 1021)  # primes: the example batch of a trace is larger than any axis
 
 
@@ -235,26 +239,22 @@ class Functions:
 
 def source_of(model: ContactLagrangian) -> str:
     """The whole C of a structure: sizes, traced functions, and the runtime."""
-    functions, tables = Functions(model), {}
+    functions, prepared = Functions(model), Prepared()
     n, m, P, sticks = functions.n, model.inputs, len(functions.parameters.numbers), functions.sticks
     end = {"h": 0, **({"u": m} if m else {}), "theta": P, "sharpest": n}
     held = {"stiffness": n, "bound": n} if sticks else {}
     state, solved = {"x": 2 * n + 1}, ("F", "J", "end", "A", "*c", "G")
     parts = []
     if sticks:
-        rest = _Traced(functions.rest, state | end, m, ("z", "stiffness", "bound"), tables)
-        trial = _Traced(functions.evaluate, state | {"z": n} | end | held, m, ("F", "J"), tables)
+        rest = _Traced(functions.rest, state | end, m, ("z", "stiffness", "bound"), prepared)
+        trial = _Traced(functions.evaluate, state | {"z": n} | end | held, m, ("F", "J"), prepared)
         parts = [rest.function("rest", "z", "stiffness", "bound"), trial.function("evaluate", "F", "J")]
-    step = _Traced(functions.derive, state | {"delta": n} | end, m, solved, tables)
+    step = _Traced(functions.derive, state | {"delta": n} | end, m, solved, prepared)
     parts += [] if sticks else [step.function("evaluate", "F", "J")]
     parts += [step.function("finish", "end"), step.function("derive", "end", "A", "*c", "G")]
     sizes = f"#define hz_N {n}\n#define hz_M {m}\n#define hz_P {P}\n#define hz_STICKS {int(sticks)}\n"
-    constants = "".join(
-        f"static const double {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
-        for row, name in tables.items()
-    )
     head, *loops = ((RUNTIME / name).read_text() for name in ("mathematics.h", "sweep.c", "tridiagonal.c"))
-    return "\n".join([sizes, head, constants, *parts, OPTIMISED, *loops])
+    return "\n".join([sizes, head, *parts, prepared.function(), OPTIMISED, *loops])
 
 
 OPTIMISED = """
@@ -268,10 +268,15 @@ class _Traced:
     """A traced function with the numbers of its results, from which C functions of some of them are written."""
 
     def __init__(
-        self, function: Callable[..., Any], given: dict[str, int], inputs: int, results: Sequence[str],
-        tables: dict[tuple[float, ...], str],
-    ):  # fmt: skip
-        self.program, self.given, self.inputs = Program(tables=tables), given, inputs
+        self,
+        function: Callable[..., Any],
+        given: dict[str, int],
+        inputs: int,
+        results: Sequence[str],
+        prepared: Prepared,
+    ):
+        self.program, self.given, self.inputs, self.prepared = Program(loop=math.inf), given, inputs, prepared
+        self.program.angles = Angles(self.program)
         at = list(given).index("h") + 1
         whole_function = function if inputs else lambda *x: function(*x[:at], None, *x[at:])
         graph = traced(whole_function, _examples(given))
@@ -288,7 +293,9 @@ class _Traced:
         if not self.inputs:
             read.insert(list(self.given).index("h") + 1, "const double *restrict u")
         outputs: Outputs = {key: self.outputs[key] for key in results}
-        return whole(self.program, f"\nstatic void hz_{name}({', '.join([*read, *written])})", outputs)
+        head = f"\nstatic void hz_{name}({', '.join([*read, *HANDED, *written])})"
+        columns = {"G": self.given["theta"]}  # of derivatives by θ
+        return gated(self.program, head, outputs, self.prepared, columns)
 
 
 def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:

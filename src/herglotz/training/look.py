@@ -11,6 +11,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS, Arrival
+from herglotz.data.input_terms import with_input_terms
 from herglotz.data.roughness import roughness
 from herglotz.data.sensors import measured
 from herglotz.data.spikes import spikes
@@ -75,6 +76,7 @@ class Look:
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
+    why_input_terms: str = ""  # why inputs have terms; empty: as told
     turning: bool = True  # angles turn; False: they were found to be positions on a line
     structure: str | None = None  # what was found about the terms, in words; None: it was not asked
     found: Structure | None = None  # named terms that whole trajectories were fitted with
@@ -100,13 +102,17 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     """
     seen, zeros = _seen(data, user_settings, stages, plan, ()), ()
     changed: dict[str, Any] = {}  # what a look again does not say
-    while (found := seen.found) is not None and (found.hold or found.zeros or not found.turning):
-        known = found._replace(hold="", zeros=(), why_zeros="") if found.turning else None
+    while (found := seen.found) is not None and (found.hold or found.input_terms or found.zeros or not found.turning):
+        known = found._replace(hold="", input_terms=(), zeros=(), why_zeros="") if found.turning else None
         label = stages.label
         if found.hold:
             told = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
             data, label = replace(data, hold=found.hold), label + f", hold {found.hold}"
             changed["why_arrival"] = seen.why_arrival | {"hold": told}
+        if found.input_terms:
+            terms = ", ".join(found.input_terms)
+            data, label = with_input_terms(data, found.input_terms), label + f", inputs {terms}"
+            changed["why_input_terms"] = "held-out blocks of time are missed by less with them"
         if found.zeros:
             zeros, label, changed["why_zeros"] = found.zeros, label + f", zeros {found.zeros}", found.why_zeros
         if not found.turning:

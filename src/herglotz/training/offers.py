@@ -17,7 +17,8 @@ ALWAYS = ("kinetic.log_diagonal", "kinetic.base.log_diagonal", "damping.rate")
 # Amplitudes with the numbers that shape them, which have no effect where the amplitude is 0.
 SHAPES = {"friction.coulomb": "friction.log_smooth", "friction.breakaway": "friction.log_stribeck"}
 ON = {"friction.breakaway": "friction.coulomb"}  # what is an excess of another offer is none without it
-SIMPLE = ("potential.stiffness", "potential.tilt", "friction.input_map")  # of the simplest model, beside `ALWAYS`
+INPUTS = "friction.input_map"  # gains of all inputs, row by row
+SIMPLE = ("potential.stiffness", "potential.tilt", INPUTS)  # of the simplest model, beside `ALWAYS`
 
 
 class Offer(NamedTuple):
@@ -35,14 +36,17 @@ class Offer(NamedTuple):
 
 
 def offers_of(
-    model: ContactLagrangian, keys: list[str], bands: Sequence[Band] = ()
+    model: ContactLagrangian, keys: list[str], bands: Sequence[Band] = (), terms: int = 0
 ) -> tuple[tuple[str, ...], list[Offer], frozenset[str]]:
     """The numbers that every model has, all offers, and the names of those that the simplest one has taken.
 
-    `keys` (`training.dictionary.keys_of`) are what the numbers are; those of waves join in their `bands`.
+    `keys` (`training.dictionary.keys_of`) are what the numbers are; those of waves join in their `bands`. The last
+    inputs are `terms` of others, which the simplest model is without.
     """
     numbers, always, found, simple = ParameterVector(model).numbers, [], [], set()
     waves = {text: band.name for band in bands for text in band.texts}
+    m, n = model.inputs, model.dof
+    of_terms = {f"{INPUTS}[{i * m + j}]" for i in range(n) for j in range(m - terms, m)}
     own = own_terms(model.config.angles)  # of one coordinate: its spring and tilt
     for number, key in zip(numbers, keys, strict=True):
         stem = re.sub(r"\[\d+\]", "", number)
@@ -54,7 +58,7 @@ def offers_of(
             shape = number.replace(stem, SHAPES.get(stem, stem))
             on = key.replace(stem, ON[stem]) if stem in ON else ""
             found.append(Offer(key, (number,), (shape,) if shape != number and shape in numbers else (), on))
-            if stem in SIMPLE or key in own:
+            if (stem in SIMPLE and number not in of_terms) or key in own:
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
     found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]

@@ -44,6 +44,7 @@ class Plan:
     turning: bool = True  # angles turn; False: they are positions on a line, as of a free spring
     absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
     spreads: dict[str, float] = field(default_factory=dict)  # prior deviations of the waves that make functions
+    input_terms: tuple[str, ...] = ()  # of recorded inputs, which act beside them
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
     reasons: dict[str, str] = field(default_factory=dict)
 
@@ -113,6 +114,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "order": "order of the time step",
     "features": "terms of the model",
     "hold": "inputs between samples",
+    "input_terms": "terms of the inputs",
     "delay": "delay of the inputs",
     "lag": "lag of the actuator",
     "zeros": "what the sensors read at 0, recording after recording",
@@ -129,7 +131,8 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "departures": "strengths of the prior that are compared",
 }
 DECISIONS = tuple(WORDS)
-IF_ANY = ("hold", "delay", "lag", "zeros", "drag", "absent", "continues_probe", "fitted_before")  # told if not 0
+IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drag", "absent", "continues_probe",
+          "fitted_before")  # fmt: skip  # told if not 0
 MEANINGS = {
     "level": {
         "conservative": "no damping",

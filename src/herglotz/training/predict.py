@@ -12,6 +12,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.actuator import acting
+from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.sensors import measured
 from herglotz.data.splits import leading, leading_rows
 from herglotz.data.waves import with_waves
@@ -212,6 +213,7 @@ def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
         if "1" not in (data.units[i], unit) and data.units[i] != unit:
             raise InputError(f"{where}: {name} is in {data.units[i]}, the run was fitted in {unit}; convert the column")
     data = with_waves(data, run.config.frequencies)
+    data = data if data.u is None else with_input_terms(data, input_terms_of(wanted.columns))
     u = data.u if run.model.inputs else None
     p, v = (None if x is None else x[:, at] for x in (data.p, data.v))
     called = {data.names[i]: name for i, name in zip(at, wanted.names, strict=True)}

@@ -262,6 +262,7 @@ class Reading(TypedDict, total=False):
     angles: str | list[str]
     degrees: str | list[str]
     polar: str | list[str]
+    input_terms: str | list[str]
     sensor_zeros: list[float]
     sensor_scales: list[float]
     hold: Literal["zero", "first", "smooth"]

@@ -14,6 +14,7 @@ from typing import Any
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.input_terms import all_input_terms, with_input_terms
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
@@ -23,7 +24,7 @@ from herglotz.training.functions import bands
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import DRY, candidates, special, started
-from herglotz.training.offers import standing
+from herglotz.training.offers import INPUTS, standing
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
@@ -79,6 +80,9 @@ class Search:
         ends = [best]
         if (start := self.linear_start(fitter)) is not None:
             ends.append(self.climbed(fitter, *start))
+            best = self.better(best, ends[-1])
+        if (plain := self.grown(fitter)) is not None and (best is None or plain.length >= best.length):
+            ends.append(self.settled(plain))
             best = self.better(best, ends[-1])
         if best is None:
             return None
@@ -171,6 +175,14 @@ class Search:
                 return self.settled(trial)
             trial = longer
         return None
+
+    def grown(self, fitter: Fitter) -> Trial | None:
+        """The simplest model over the longest segments that it follows as it is.
+
+        Where inputs follow from the state, terms that join over short segments make up for one another.
+        """
+        trial = fitter.fit(fitter.simple, {}, fitter.lengths[0], None, 2 * ITERATIONS)
+        return None if trial is None else self.finer(fitter.grow(self.finer(trial)))
 
     def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
         """The better one of two models."""
@@ -290,6 +302,28 @@ class Search:
             if other is not None and other.replaces(best):
                 best, found = other, hold
         return found
+
+    def driven_by(self, terms: Sequence[str]) -> Search:
+        """The same of data whose inputs act by these terms as well."""
+        data = with_input_terms(self.data, terms)
+        base = estimate_baseline(data, outliers=self.freedom is not None)
+        other = Search(data, base, self.config, outliers=self.freedom is not None)
+        other.order = self.order
+        return other
+
+    def input_terms(self, trial: Trial) -> tuple[str, ...]:
+        """The terms of the inputs that a model with all of them among its offers has taken, if it is better."""
+        every = all_input_terms(self.data) if self.config.find_input_terms else ()
+        if trial.at_the_noise or not every:
+            return ()
+        other = self.driven_by(every)
+        fitter = other.fitter(Variant(self.order))
+        found = other.climbed(fitter, fitter.simple, {})
+        if found is None or not found.replaces(trial):
+            return ()
+        gains, m = [name for name in found.taken if name.startswith(INPUTS)], len(other.data.input_labels)
+        columns, recorded = {int(name.partition("[")[2].rstrip("]")) % m for name in gains}, m - len(every)
+        return tuple(every[k - recorded] for k in sorted(columns) if k >= recorded)
 
     def braking(self, trial: Trial) -> Trial:
         """With a load in the place of dry friction that pushes, which would create energy, or with neither.

@@ -66,6 +66,7 @@ class Structure(NamedTuple):
     why_zeros: str = ""  # them in words
     turning: bool = True  # angles turn; False: these terms are those of positions on a line, as of a free spring
     compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`Search.compared`)
+    input_terms: tuple[str, ...] = ()  # of inputs, which these terms ask for beside the recorded ones
     hold: str = ""  # of inputs, with which these terms miss the data by far less than with the one that was tried
 
 
@@ -141,6 +142,9 @@ def search(
     if hold := read.held(best, holds):
         wanted, read = (each.of(replace(each.data, hold=hold)) for each in (wanted, read))
         best = read.run() or best
+    if more := read.input_terms(best):
+        wanted, read = wanted.driven_by(more), read.driven_by(more)
+        best = read.run() or best
     found = read.with_functions(best)
     if found is not best:  # functions may be what recordings seemed to differ by, and tell a hold that terms did not
         later = read.held(found, [other for other in holds if other != hold])
@@ -165,7 +169,7 @@ def search(
     zeros, why, compared = (), "", read.compared(found)
     if differ is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
-    return Structure(settings, base, words, found.rms, zeros, why, True, compared, hold)
+    return Structure(settings, base, words, found.rms, zeros, why, True, compared, more, hold)
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

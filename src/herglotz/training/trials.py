@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.input_terms import input_terms_of
 from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, relative_spread
 from herglotz.data.smoothing import smoothed
 from herglotz.training.baseline import Baseline
@@ -185,7 +186,9 @@ class Fitter:
         self.model = with_sticking(model, excess=False) if variant.sticking else model
         every = ParameterVector(self.model)
         self.keys = dict(zip(every.numbers, keys_of(every.numbers, self.model.config), strict=True))
-        self.always, every_offer, self.simple = offers_of(self.model, list(self.keys.values()), every_band)
+        self.always, every_offer, self.simple = offers_of(
+            self.model, list(self.keys.values()), every_band, len(input_terms_of(data.columns))
+        )
         without_offers(self.model, every_offer)
         one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]  # is dry friction already
         self.offers = [offer for offer in every_offer if offer.name not in one_way]

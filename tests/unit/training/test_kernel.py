@@ -44,6 +44,12 @@ MODELS = {
         drag=("(v1 - v2)", "|v| v"),
     ),
     "own structure": replace(PENDULUM, alike=False, stiffness=(1.0,)),
+    "waves of one length": replace(
+        PENDULUM,
+        angles=(False,),
+        features=(*(f"sin({1.234567 * k:.10g} q1 + {0.7654321 * k:.10g})" for k in range(1, 25)), "cos(3 q1) v1^2"),
+        drag=("cos(2 q1) v1", "sin(2 q1) v1", "cos(4 q1) v1"),
+    ),
 }
 
 
@@ -143,6 +149,29 @@ def test_one_kernel_serves_every_subset_of_its_terms():
     fewer = replace(JOINTS, features=(), coulomb=False)
     assert len({kernel(config) for config in (JOINTS, MODELS["joints without a number"], fewer)}) == 1
     assert kernel(PENDULUM) is kernel(MODELS["one rate"])
+
+
+def test_terms_that_are_absent_cost_nothing_and_say_nothing():
+    # fails if what only absent terms need is computed: θ⁶ of a motion far out is infinite, and 0 · ∞ is no number
+    problem, x = problem_of(replace(SPRING, features=("q1^2",), drag=(), coulomb=False, inputs=0, input_zero=False))
+    assert problem.compiled is not None
+    assert "q1^6" in problem.compiled.kernel.place
+    x[problem.P :] *= 1e60
+    assert bool(torch.isfinite(problem.cost(x)))
+    _, A, b = problem.normal_equations(x)
+    assert bool(torch.isfinite(dense(A)).all() and torch.isfinite(b).all())
+
+
+def test_a_number_that_is_0_and_is_fitted_has_its_derivative():
+    # fails if a parameter is taken for absent because it is 0
+    problem, x = problem_of(PENDULUM)
+    x[: problem.P] = 0.0
+    problem.normal_equations(x)
+    other, _ = eager(PENDULUM)
+    other.normal_equations(x)
+    its = slopes(other, x)
+    assert float((slopes(problem, x) - its).abs().max()) <= 1e-10 * float(its.abs().max())
+    assert float(its[..., : problem.P].abs().amax((0, 1)).min()) > 0
 
 
 def test_numbers_go_by_their_terms():

@@ -1,7 +1,8 @@
 /* Free runs over segments of a trajectory with their derivatives: the compiled half of `herglotz.training.kernel`.
 
    Before this file stand what depends on the model: hz_N coordinates, hz_M inputs, hz_P parameters, and the functions
-   hz_evaluate, hz_derive and, with set-valued dry friction, hz_rest. */
+   hz_evaluate, hz_finish, hz_derive and, with set-valued dry friction, hz_rest, which leave out what is behind gates that
+   hz_prepare does not open (`codegen/gated.py`). */
 
 #define hz_D (2 * hz_N) /* numbers of a state that the motion depends on: q, p */
 #define hz_X (2 * hz_N + 1)
@@ -58,17 +59,17 @@ static inline double hz_merit(const double F[hz_N], const double scale[hz_N]) {
 
 /* The increment of a step by Newton's iteration with backtracking, from a guess; 0 where there is none. */
 static int hz_increment(const double x[hz_X], double h, const double *u, const double *theta, const double *constants,
-                        double delta[hz_N]) {
+                        const char *gate, const double *fixed, double delta[hz_N]) {
   double z[hz_N], F[hz_N], J[hz_N * hz_N], move[hz_N], scale[hz_N], merit;
   const double still = 1e-15 * hz_largest(x);
   int i, iteration, good = 0;
 #if hz_STICKS
   double stiffness[hz_N], bound[hz_N];
-  hz_rest(x, h, u, theta, constants, z, stiffness, bound);
-#define hz_AT(z) hz_evaluate(x, z, h, u, theta, constants, stiffness, bound, F, J)
+  hz_rest(x, h, u, theta, constants, gate, fixed, z, stiffness, bound);
+#define hz_AT(z) hz_evaluate(x, z, h, u, theta, constants, stiffness, bound, gate, fixed, F, J)
 #else
   for (i = 0; i < hz_N; i++) z[i] = delta[i];
-#define hz_AT(z) hz_evaluate(x, z, h, u, theta, constants, F, J)
+#define hz_AT(z) hz_evaluate(x, z, h, u, theta, constants, gate, fixed, F, J)
 #endif
   hz_AT(z);
   for (i = 0; i < hz_N; i++) scale[i] = fabs(J[i * hz_N + i]) > 0 ? fabs(J[i * hz_N + i]) : 1;
@@ -168,7 +169,12 @@ long hz_sweep(long S, const long *begin, const double *h, const double *u, const
   double *const Y = Z ? (double *)malloc((size_t)(hz_D * W) * sizeof(double)) : 0;
   long s, k, at, failed = -1;
   int i, j;
+  char on[hz_P], gate[hz_GATES];
+  double fixed[hz_FIXED];
   if (Z && !Y) return 0;
+  for (i = 0; i < hz_P; i++) on[i] = theta[i] != 0;
+  for (k = 0; k < F; k++) on[chosen[k]] = 1;
+  hz_prepare(theta, constants, on, gate, fixed);
   for (s = 0; s < S && failed < 0; s++) {
     double *const here = x + s * hz_X, *const own = delta + s * hz_N, *const D = Z ? Z + s * hz_D * W : 0;
     double before = begin[s] < begin[s + 1] ? h[begin[s]] : 1;
@@ -178,15 +184,15 @@ long hz_sweep(long S, const long *begin, const double *h, const double *u, const
         double end[hz_N + 1], A[hz_D * hz_D], G[hz_D * hz_P], c;
         for (i = 0; i < hz_N; i++) own[i] *= h[k] / before;
         before = h[k];
-        if (!hz_increment(here, h[k], input, theta, constants, own)) {
+        if (!hz_increment(here, h[k], input, theta, constants, gate, fixed, own)) {
           failed = s;
           break;
         }
         if (D) {
-          hz_derive(here, own, h[k], input, theta, constants, end, A, &c, G);
+          hz_derive(here, own, h[k], input, theta, constants, gate, fixed, end, A, &c, G);
           hz_carry(A, G, c, F, chosen, D, Y);
         } else {
-          hz_finish(here, own, h[k], input, theta, constants, end);
+          hz_finish(here, own, h[k], input, theta, constants, gate, fixed, end);
         }
         for (i = 0; i < hz_N; i++) {
           here[i] += own[i];

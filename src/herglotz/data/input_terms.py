@@ -1,0 +1,70 @@
+"""Inputs that act by their square, their size or their rate: further columns of u that follow from recorded ones.
+
+The force between the plates of a capacitor grows as V², a motor pulls a one-sided brake by |i|, and a moved base drives
+a mass by k r + c r′. The learned map from inputs to forces is linear in all columns. Rates are those of a parabola
+through a value and its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data.column_table import INPUT_TERM
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import refuse
+
+FORMS = ("{}^2", "|{}|", "{}'")
+
+
+def input_terms_of(columns: Iterable[Sequence[str]]) -> tuple[str, ...]:
+    """The terms of inputs among columns: name, role and unit each."""
+    return tuple(name for name, role, _ in columns if role == INPUT_TERM)
+
+
+def all_input_terms(data: Trajectories) -> tuple[str, ...]:
+    """The terms that its recorded inputs can have; none where it has some already."""
+    if data.u is None or input_terms_of(data.columns):
+        return ()
+    return tuple(form.format(name) for name, _ in data.input_labels for form in FORMS)
+
+
+def with_input_terms(data: Trajectories, terms: Sequence[str]) -> Trajectories:
+    """The recording with these terms of its inputs as further columns of u: `V^2`, `|V|` and `V'` of an input V.
+
+    Raise InputError if a term is none of these, or of no input.
+    """
+    terms = tuple(term for term in terms if term not in input_terms_of(data.columns))
+    if not terms:
+        return data
+    where, labels = data.source or "data", dict(data.input_labels)
+    known = {form.format(name): (name, form) for name in labels for form in FORMS}
+    every = ", ".join(labels) or "no inputs"
+    remedy = f"write x^2, |x| or x' of an input x; the inputs are {every}"
+    for term in terms:
+        refuse({f"{where}: {term!r} is no term of an input; {remedy}": term not in known})
+    assert data.u is not None
+    names, columns, rows = list(labels), [], []
+    for term in terms:
+        name, form = known[term]
+        columns.append(_column(data, data.u[:, names.index(name)], form))
+        rows.append((term, INPUT_TERM, _unit(labels[name], form, data.time_unit)))
+    recorded = data.columns if data.columns else tuple((name, "input", unit) for name, unit in labels.items())
+    return replace(data, u=torch.cat([data.u, torch.stack(columns, 1)], 1), columns=(*recorded, *rows))
+
+
+def _column(data: Trajectories, u: Tensor, form: str) -> Tensor:
+    """(N,) values of a term of an input (N,)."""
+    if form != "{}'":
+        return u.square() if form == "{}^2" else u.abs()
+    parts = zip(u.split(data.lengths), data.t.split(data.lengths), strict=True)
+    return torch.cat([torch.gradient(one, spacing=(t,))[0] for one, t in parts])
+
+
+def _unit(unit: str, form: str, time_unit: str) -> str:
+    if form == "|{}|" or not unit:
+        return unit
+    return f"{unit}^2" if form == "{}^2" else f"{unit}/{time_unit}"

@@ -1,0 +1,90 @@
+"""The search for inputs that act by their square, their size or their rate."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import herglotz as hz
+from herglotz.data import Trajectories
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.look import look
+from herglotz.training.plan import Plan
+from herglotz.training.search import Search
+from herglotz.training.stages import Stages
+
+H = 0.04
+
+
+def driven(force, u, steps=8, samples=220, noise=2e-4, seed=0):
+    """A damped spring x″ = −20 x − x′ + force(u, u′), integrated finely, with noise."""
+    make = np.random.default_rng(seed)
+    t, h = np.arange(samples) * H, H / steps
+    rate = lambda s: (u(s + 1e-5) - u(s - 1e-5)) / 2e-5  # noqa: E731
+    f = lambda s, y: np.array([y[1], -20 * y[0] - y[1] + force(u(s), rate(s))])  # noqa: E731
+    y, out = np.array([0.02, 0.0]), []
+    for time in t:
+        out.append(y[0])
+        for k in range(steps):
+            s = time + k * h
+            a = f(s, y)
+            b = f(s + h / 2, y + h / 2 * a)
+            y = y + h * f(s + h / 2, y + h / 2 * b)
+    q = np.array(out) + noise * make.standard_normal(samples)
+    return Trajectories.of(t, q, u=np.array([u(s) for s in t]), hold="smooth")
+
+
+def sway(s):
+    return np.sin(2.3 * s) + 0.6 * np.sin(3.9 * s + 1)
+
+
+CASES = {"u'": lambda u, rate: 2 * u + 1.5 * rate, "u^2": lambda u, _: 3 * u * u, "|u|": lambda u, _: 3 * abs(u)}
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return {}
+
+
+@pytest.mark.parametrize("term", CASES)
+def test_what_an_input_acts_by_is_found(term, runs):
+    # fails if a term is not offered, or columns that nothing asks for stay
+    data = driven(CASES[term], sway)
+    runs[term] = run = hz.fit(data, train_fraction=1, progress=False)
+    assert run.metrics["plan"]["input_terms"] == (term,) or run.metrics["plan"]["input_terms"] == [term]
+    assert run.metrics["verdict"].startswith("fits to the noise")
+    assert term in str(run.equation())
+
+
+def test_a_run_predicts_recordings_without_the_term(runs):
+    # fails if a new recording is not given the columns that the model is driven by
+    run = runs["u^2"]
+    new = driven(CASES["u^2"], lambda s: sway(s + 2), seed=3)
+    assert run.predict(new).rms < 3 * 2e-4
+
+
+def test_a_plan_repeats_the_terms(runs):
+    # fails if a plan is followed with the recorded inputs alone
+    run = runs["u^2"]
+    again = hz.fit(
+        driven(CASES["u^2"], sway), train_fraction=1, progress=False, plan=Plan.from_dict(run.metrics["plan"])
+    )
+    assert again.data.input_labels == run.data.input_labels
+    assert str(again.equation()) == str(run.equation())
+
+
+def test_inputs_that_act_as_recorded_have_no_terms():
+    # fails if terms join where the noise is met without them
+    data = driven(lambda u, _: 3 * u, sway)
+    seen = look(data, FitConfig(train_fraction=1), Stages())
+    assert seen.data.input_labels == data.input_labels
+
+
+def test_nothing_is_looked_for_where_that_is_said():
+    # fails if the setting is not read
+    data = driven(CASES["u^2"], sway)
+    config = FitConfig(find_input_terms=False).resolved(data)
+    missed: Any = SimpleNamespace(at_the_noise=False)
+    assert Search(data, estimate_baseline(data), config).input_terms(missed) == ()
