@@ -35,6 +35,6 @@ run.plot()
 import numpy as np
 
 push = np.where(np.arange(100) < 50, 40.0, 0.0)  # 40 N for 1.5 s, then nothing: the axis stops and sticks
-moved = run.rollout(100, q0=[0.0], p0=[0.0], inputs=push)
+moved = run.rollout(100, q0=[0.0], v0=[0.0], inputs=push)
 print(f"{1000 * moved.q[50, 0]:.1f} mm after the push, {1000 * moved.q[-1, 0]:.1f} mm at the end")
 print("speed at the end:", float(np.diff(moved.q[-3:, 0]).max()))

@@ -16,6 +16,16 @@ def refuse(wrong: dict[str, object]) -> None:
             raise InputError(message)
 
 
+def check_start(q0: bool, v0: bool, p0: bool, dash: str = "") -> None:
+    """Raise unless a start is given whole, a position with either a velocity or a momentum, or not at all."""
+    q, v, p = (f"{dash}{name}" for name in ("q0", "v0", "p0"))
+    refuse({
+        f"{v} and {p} both say how fast the start is; leave one out": v0 and p0,
+        f"{q} and {v} (or {p}, the momentum) go together; give both, or neither to start from the last fitted state":
+            q0 != (v0 or p0),
+    })  # fmt: skip
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """The known word that this one resembles, as the end of a message; empty where it resembles none."""
     near = get_close_matches(word, list(known), n=1, cutoff=0.65)

@@ -12,22 +12,22 @@ from herglotz.errors import InputError
 FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
 DESCRIPTION = """\
 Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training and the plan; with
---animate, animation.gif instead, of data and model moving. Of DATA: its samples. With --theory, of a SCENE or a RUN:
-the momentum against the generating function and the Hamilton–Jacobi residual; of parachute also the paper's two
+--animate, animation.gif instead, of data and model moving. Of DATA: its samples. Of a SCENE, and with --theory of a
+RUN: the momentum against the generating function and the Hamilton–Jacobi residual; of parachute also the paper's two
 figures. (`herglotz verify RUN --plots FOLDER` draws the first two as well.)
 
 examples:
   herglotz plot runs/pendulum
   herglotz plot runs/pendulum --animate
   herglotz plot pendulum.csv --out figures --format pdf
-  herglotz plot parachute --theory --out figures
+  herglotz plot parachute --out figures
 """
 
 
 HELP = "draw a run, data or the theory of a scene"
 FLAGS = (
     flag("source", "folder of a run, a data file, or a scene", metavar="RUN|DATA|SCENE", type=Path),
-    flag("--theory", "figures of the generating function, of a scene or a run", action="store_true"),
+    flag("--theory", "figures of the generating function, of a run (a scene has no others)", action="store_true"),
     flag("--out", "folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
          type=Path, metavar="FOLDER"),
     flag("--format", "kind of file (default %(default)s)", choices=FORMATS, default="png"),
@@ -41,12 +41,13 @@ def run(arguments: argparse.Namespace) -> int:
     source: Path = arguments.source
     folder = arguments.out or (source if source.is_dir() else Path())
     check_output_folder(folder)
-    if columns_of(arguments) and (arguments.theory or source.is_dir()):
+    theory = arguments.theory or _is_scene(source)
+    if columns_of(arguments) and (theory or source.is_dir()):
         flags = ", ".join(f"--{name}" for name in columns_of(arguments))
         raise InputError(f"columns are chosen in a data file, and {source} is none: leave out {flags}")
-    if arguments.animate and (arguments.theory or not source.is_dir()):
+    if arguments.animate and (theory or not source.is_dir()):
         raise InputError(f"--animate draws a run; {source} is none: fit it first, and leave out --theory")
-    if arguments.theory:
+    if theory:
         from herglotz.plots import save_theory_figures
 
         written = save_theory_figures(str(source), folder, form=arguments.format)
@@ -77,3 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
     for path in written:
         print(path)
     return 0
+
+
+def _is_scene(source: Path) -> bool:
+    """Whether this names a scene, and no file or folder."""
+    if source.exists():
+        return False
+    from herglotz.scenes import scene_names
+
+    return str(source) in scene_names()

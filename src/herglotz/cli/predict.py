@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,8 @@ A recorded step that is longer than those the model was fitted to is crossed in 
 sampled faster is thinned, its inputs averaged: K counts the samples that are left. A note says where the free run
 leaves the range of positions and momenta that the model was fitted to: which, how far, since when.
 
---out FILE writes the predicted motion, and FILE.png beside it: data, free run and their difference.
+--out FILE writes the predicted positions and velocities (and momenta with --momenta), and FILE.png beside it: data,
+free run and their difference.
 Where the recordings of the fit differ in what their sensors read at 0, those zeros that suit the first samples best
 are taken off this recording; --sensor-zeros says it instead, relative to the longest recording of the fit.
 With --windows W --horizon T, W windows spread over the recording are scored instead, each K samples and then a free
@@ -47,6 +49,7 @@ FLAGS = (
     flag("--windows", "score W windows (with --horizon)", type=count, metavar="W"),
     flag("--horizon", "time of the free run in a window, in the data's unit of time", type=positive, metavar="T"),
     flag("--out", "write the predicted motion: .csv or .npz, and a .png", type=Path, metavar="FILE"),
+    flag("--momenta", "write the momenta besides", action="store_true"),
     FORCE,
     flag("--json", "print the numbers as JSON, and nothing else", action="store_true"),
     *READING,
@@ -74,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         data, warmup=arguments.warmup, windows=arguments.windows, horizon=arguments.horizon,
         same_zeros=arguments.sensor_zeros is not None,
     )  # fmt: skip
-    written = [] if out is None else _write(found, out)
+    written = [] if out is None else _write(found, out, arguments.momenta)
     if arguments.json:
         print_json(found.metrics())
     else:
@@ -125,7 +128,7 @@ def _report(found: Prediction, arguments: argparse.Namespace) -> None:
     print_table([*rows, *([("steps", steps)] if steps else [])])
 
 
-def _write(found: Prediction, out: Path) -> list[Path]:
+def _write(found: Prediction, out: Path, momenta: bool) -> list[Path]:
     """The predicted motion as far as it goes, and the figure."""
     from herglotz.data import save
     from herglotz.data.units import in_degrees
@@ -133,6 +136,8 @@ def _write(found: Prediction, out: Path) -> list[Path]:
     from herglotz.plots.motion import plot_prediction
 
     motion: Any = found.motion()
+    if motion is not None and not momenta:
+        motion = replace(motion, p=None)
     written = [] if motion is None else [out]
     if motion is not None:
         save(out, in_degrees(motion, found.data.degrees) if out.suffix.lower() == ".csv" else motion)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_file, count, existing, finite, flag, positive, print_json, say
 from herglotz.cli.flags import FORCE, TRUST
-from herglotz.errors import InputError
+from herglotz.errors import InputError, check_start
 
 if TYPE_CHECKING:
     import torch
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from herglotz.training.recorded_range import Beyond
 
 DESCRIPTION = """\
-Step a model K times and write t, q, s and p as .csv or .npz. It starts from the last state that the fit
-trained on, or from --q0 and --p0. The model's mass is 1 (first coordinate), so p is close to a velocity there.
+Step a model K times and write t, positions and velocities as .csv or .npz; with --momenta also the action s and the
+momenta p, of which the first mass is 1. It starts from the last state that the fit trained on, or from --q0 and --v0.
 
 examples:
   herglotz rollout runs/pendulum --steps 200 --out future.csv
   herglotz rollout runs/driven --steps 200 --inputs torque.csv --out motion.csv
-  herglotz rollout runs/pendulum --steps 200 --h 0.05 --q0 1.2 --p0 0 --out motion.csv
+  herglotz rollout runs/pendulum --steps 200 --h 0.05 --q0 1.2 --v0 -0.5 --out motion.csv
 """
 
 
@@ -69,7 +69,9 @@ FLAGS = (
     flag("--out", "file to write: .csv or .npz", required=True, type=Path, metavar="FILE"),
     flag("--h", "step, in the data's unit of time (default: the model's)", type=positive),
     flag("--q0", "initial position, one number a coordinate", type=finite, nargs="+"),
-    flag("--p0", "initial momentum, one number a coordinate (with --q0)", type=finite, nargs="+"),
+    flag("--v0", "initial velocity, one number a coordinate (with --q0), in the model's units: rad for degrees",
+         type=finite, nargs="+"),
+    flag("--p0", "initial momentum, one number a coordinate, in the place of --v0", type=finite, nargs="+"),
     flag("--s0", "initial action (default 0 with --q0, else the fitted one)", type=finite),
     flag("--trajectory", "trajectory of the run whose last fitted state to start from, counted from 0 (default "
          "%(default)s)", type=count, default=0, metavar="B"),
@@ -78,6 +80,7 @@ FLAGS = (
     flag("--inputs", "times and inputs (positions may stand beside them) that drive the model, each at its own time: K "
          "samples from the start's time on (with --q0: from the first), at their own steps unless --h",
          type=existing, metavar="FILE"),
+    flag("--momenta", "write the action s and the momenta p besides", action="store_true"),
     flag("--t0", "time of the start (default: of the fitted state; 0 with --q0)", type=finite, metavar="T"),
     FORCE,
     TRUST,
@@ -90,8 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_output_file(arguments.out, (".csv", ".npz"), arguments.force)
     if arguments.steps < 2:
         raise InputError(f"--steps must be at least 2, got {arguments.steps}")
-    if (arguments.q0 is None) != (arguments.p0 is None):
-        raise InputError("--q0 and --p0 go together; give both, or neither to start from the last fitted state")
+    check_start(*(x is not None for x in (arguments.q0, arguments.v0, arguments.p0)), dash="--")
 
     import torch
 
@@ -109,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
         found = source.stepper.rollout(*start, h=h, steps=arguments.steps, inputs=inputs)
     seconds = time.perf_counter() - began
     _check(found, float(times.diff().mean()))
-    motion = _motion(source, found, times, str(arguments.source))
+    motion = _motion(source, found, times, arguments)
     out: Path = arguments.out
     save(out, in_degrees(motion, source.degrees) if out.suffix.lower() == ".csv" else motion)
     outside = None if source.box is None else source.box(found.q, found.p, found.s)
@@ -117,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
     far = quantities_outside(source.limits, motion, motion.t, motion.q, found.p.double())
     if arguments.json:
         left_by = {"beyond": [asdict(each) for each in far]}
-        print_json(_numbers(found, times, seconds, left) | left_by | {"file": str(out)})
+        print_json(_numbers(motion, found, seconds, left) | left_by | {"file": str(out)})
     else:
         _report(source, found, times, f"{out}: {arguments.steps} steps")
     _warn(source, times, left, far, "" if arguments.h else f"; --h {source.h:g} takes the model's own")
@@ -126,18 +128,33 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _motion(source: Source, found: Rollout, times: torch.Tensor, name: str) -> Trajectories:
+def _motion(source: Source, found: Rollout, times: torch.Tensor, arguments: argparse.Namespace) -> Trajectories:
     from herglotz.data import Trajectories
 
+    s, p = (x.double() if arguments.momenta else None for x in (found.s, found.p))
     return Trajectories.of(
-        times, found.q.double(), names=source.names, units=source.units, angles=source.angles, s=found.s.double(),
-        p=found.p.double(), time_unit=source.time_unit, source=name,
+        times, found.q.double(), names=source.names, units=source.units, angles=source.angles, s=s, p=p,
+        v=_velocity(source, found, times), time_unit=source.time_unit, source=str(arguments.source),
         columns=tuple((name, "coordinate", "deg") for name in source.degrees),
     )  # fmt: skip
 
 
-def _numbers(found: Rollout, times: torch.Tensor, seconds: float, left: int | None) -> dict[str, Any]:
-    last = found.final
+def _velocity(source: Source, found: Rollout, times: torch.Tensor) -> torch.Tensor | None:
+    """The velocities (K + 1, n); None, with a note, where the file or the model has none."""
+    import torch
+
+    from herglotz.stepping import StepError
+
+    h = times.diff().to(found.q.dtype)  # a state's velocity is that of the step that made it
+    try:
+        with torch.no_grad():
+            return source.stepper.velocity(found.states, torch.cat([h[:1], h])).double()
+    except (InputError, StepError) as error:
+        return _note(f"no velocities are written: {error}")
+
+
+def _numbers(motion: Trajectories, found: Rollout, seconds: float, left: int | None) -> dict[str, Any]:
+    last, times, v = found.final, motion.t, motion.v
     return {
         "steps": len(times) - 1,
         "t0": float(times[0]),
@@ -145,7 +162,13 @@ def _numbers(found: Rollout, times: torch.Tensor, seconds: float, left: int | No
         "seconds": seconds,
         "largest_residual": float(found.residual.max()),
         "outside_from_step": left,
-        "final": {"q": last.q.tolist(), "p": last.p.tolist(), "s": float(last.s), "sigma": float(found.sigma[-1])},
+        "final": {
+            "q": last.q.tolist(),
+            "v": None if v is None else v[-1].tolist(),
+            "p": last.p.tolist(),
+            "s": float(last.s),
+            "sigma": float(found.sigma[-1]),
+        },
     }
 
 
@@ -224,16 +247,20 @@ def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]
     like, n = source.start, len(source.names)
     if arguments.q0 is None:
         if like is None:
-            raise InputError(f"{arguments.source}: records no state to start from; give --q0 and --p0")
+            raise InputError(f"{arguments.source}: records no state to start from; give --q0 and --v0")
         s = like.s if arguments.s0 is None else torch.full_like(like.s, arguments.s0)
         return State(like.q, like.p, s), source.t0 if arguments.t0 is None else arguments.t0
-    for name in ("q0", "p0"):
+    second = "v0" if arguments.p0 is None else "p0"
+    for name in ("q0", second):
         given = getattr(arguments, name)
         if len(given) != n:
             raise InputError(f"--{name} needs {n} number(s), one a coordinate ({', '.join(source.names)}), got {given}")
     dtype = getattr(source.stepper, "dtype", None) or (torch.float64 if like is None else like.q.dtype)
-    values = (arguments.q0, arguments.p0, arguments.s0 or 0.0)
-    return State(*(torch.tensor(x, dtype=dtype) for x in values)), arguments.t0 or 0.0
+    values = (arguments.q0, getattr(arguments, second), arguments.s0 or 0.0)
+    state = State(*(torch.tensor(x, dtype=dtype) for x in values))
+    if second == "v0":
+        state = source.stepper.init_qv(*state, arguments.h or source.h)
+    return state, arguments.t0 or 0.0
 
 
 def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[torch.Tensor | None, torch.Tensor]:

@@ -1,4 +1,4 @@
-"""Checks of a set of trajectories before learning; every failure is an `InputError`."""
+"""Checks of a set of trajectories before learning, and of the arrays that make one; a failure is an `InputError`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
 
-ARRAYS = ("t", "q", "s", "p", "u")
+ARRAYS = ("t", "q", "s", "p", "u", "v")
 MIN_SAMPLES = 3  # one discrete Herglotz residual joins q_{k−1}, q_k, q_{k+1}
 EXACT = 2**53  # integers up to here are floats of double precision
 SMALLEST, LARGEST = 1e-50, 1e50  # of numbers that are fitted: cubes and sums of a million squares are numbers
@@ -75,9 +76,11 @@ def _check_shapes(where: str, arrays: Mapping[str, Tensor]) -> None:
     if q.ndim != 2 or q.shape[0] != len(t) or q.shape[1] < 1:
         raise InputError(f"{where}: q must have shape ({len(t)}, n), one row a sample of t, got {tuple(q.shape)}")
     wanted = {"s": f"({len(t)},)", "p": f"({len(t)}, {q.shape[1]})", "u": f"({len(t)}, m)"}
+    wanted["v"] = wanted["p"]
     fits = {
         "s": lambda x: x.shape == t.shape,
         "p": lambda x: x.shape == q.shape,
+        "v": lambda x: x.shape == q.shape,
         "u": lambda x: x.ndim == 2 and x.shape[0] == len(t) and x.shape[1] >= 1,
     }
     for name in wanted:
@@ -174,3 +177,19 @@ def check_alike(sets: Sequence[Any]) -> None:
             raise InputError(f"{len(arrays)} of the {len(sets)} sets to join have {name}; drop it or add it to all")
         if len({(x.dtype, x.device, x.shape[1:]) for x in arrays}) > 1:
             raise InputError(f"the sets to join differ in the dtype, device or width of {name}; make them the same")
+
+
+def as_tensor(name: str, x: Tensor | np.ndarray | Sequence) -> Tensor:
+    """A tensor as it is, and what else holds numbers in float64; raise InputError if it is not an array of numbers."""
+    if isinstance(x, Tensor):
+        return torch.atleast_1d(x)
+    try:
+        return torch.from_numpy(np.array(x, dtype=np.float64, ndmin=1))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is not an array of numbers ({error}); give a tensor, an array or a list") from error
+
+
+def as_columns(name: str, x: Tensor | np.ndarray | Sequence | None) -> Any:
+    """(N, n) of what may be (N,); None stays None."""
+    x = None if x is None else as_tensor(name, x)
+    return x[:, None] if x is not None and x.ndim == 1 else x

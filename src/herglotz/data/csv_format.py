@@ -147,6 +147,10 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     header = ["trajectory", f"t[{trajectories.time_unit}]"]
     header += [f"{name}[{unit}]" for name, unit in zip(q, trajectories.units, strict=True)]
     parts = [trajectories.t[:, None], trajectories.q]
+    if trajectories.v is not None:  # left aside by `read_csv`, as all rates are
+        rate = [f"{unit}/{trajectories.time_unit}".removesuffix("/1") for unit in trajectories.units]
+        header += [f"{name}_dot[{unit}]" for name, unit in zip(q, rate, strict=True)]
+        parts.append(trajectories.v)
     if trajectories.s is not None:
         header, parts = [*header, "s"], [*parts, trajectories.s[:, None]]
     if trajectories.p is not None:

@@ -207,7 +207,14 @@ def _with_angles(
     columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
     names, units, turning = zip(*labels, strict=True)
     return replace(
-        data, q=q, names=names, units=units, angles=turning, columns=(*columns, *rows), notes=(*data.notes, *notes)
+        data,
+        q=q,
+        v=None,
+        names=names,
+        units=units,
+        angles=turning,
+        columns=(*columns, *rows),
+        notes=(*data.notes, *notes),
     )
 
 

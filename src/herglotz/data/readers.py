@@ -60,6 +60,7 @@ FORMATS = (
     Format("arrays t, q, ... of MATLAB (.mat)", ".mat", read_packed, True),
 )  # fmt: skip
 WRITES = ".csv and .npz"
+SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods", ".numbers")
 PROSE = 65536  # bytes of a text file in which a recording has a row of numbers
 SHOWN = 76  # characters of the note that names the files of a folder: a line of a terminal
 
@@ -267,5 +268,10 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
             found = one.read(path)
             return replace(found, hold=wanted.hold) if wanted.hold else found
     what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
+    if suffix in SPREADSHEETS:
+        raise InputError(
+            f"{path}: is a spreadsheet; save the sheet as .csv (in Excel: Save as, CSV UTF-8), or hand over its "
+            "table in Python: fit(pandas.read_excel(...))"
+        )
     known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
     raise InputError(f"{path}: cannot read {what}; known formats: {known}")

@@ -18,7 +18,7 @@ def measured(
     zeros: Sequence[float] | None = (),  # n numbers, in degrees where the table has degrees; empty or None: 0
     scales: Sequence[float] | None = (),  # what one unit of each reading is worth, n numbers; empty or None: 1
 ) -> Trajectories:
-    """The positions q = scale · (y − zero) of readings y; momenta and the action stay as they are recorded.
+    """The positions q = scale · (y − zero) of readings y, and v = scale · ẏ; p and s stay as they are recorded.
 
     B recordings that differ have B · n numbers, recording after recording. Raise InputError if there is another number
     of them, one is not finite, or a scale is 0.
@@ -31,7 +31,8 @@ def measured(
     refuse({none: 0.0 in [float(x) for x in worth]})
     turned = [name in data.degrees and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
     q = data.q - zero * zero.new_tensor([math.pi / 180 if x else 1.0 for x in turned]) if read else data.q
-    return replace(data, q=scale * q if worth else q)
+    v = scale * data.v if worth and data.v is not None else data.v
+    return replace(data, q=scale * q if worth else q, v=v)
 
 
 def _of_each_sample(data: Trajectories, what: str, numbers: Sequence[float]) -> Tensor:

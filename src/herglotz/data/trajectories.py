@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS, DTYPES, check, check_alike, offsets_of, unnamed
+from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
 from herglotz.data.column_table import INPUT_TERM, column_table
 from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
@@ -35,9 +35,9 @@ class Trajectories:
     ----------
     t, q, lengths, names, units, angles
         (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
-    s, p, u
-        (N,) action and (N, n) momentum, as in `herglotz.State`, and (N, m) control input, in units of the recording,
-        where they are known.
+    s, p, u, v
+        (N,) action and (N, n) momentum, as in `herglotz.State`, (N, m) control input and (N, n) velocity of a model, in
+        units of the recording, where they are known.
     time_unit, source, columns, notes
         Of t; origin, for messages; name, role and unit of each column that was read, and what else was made of them.
     hold, delay, lag
@@ -66,6 +66,7 @@ class Trajectories:
     lag: float | None = None  # time constant of the actuator; None: not said
     columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
     notes: tuple[str, ...] = ()  # on reading the table: its separators, rows left out
+    v: Tensor | None = None  # (N, n) velocity, of a model: recorded ones are not read
 
     def __post_init__(self) -> None:
         check_arrival(self.source or "trajectories", self.arrival)
@@ -84,6 +85,7 @@ class Trajectories:
         s: Tensor | np.ndarray | None = None,
         p: Tensor | np.ndarray | None = None,
         u: Tensor | np.ndarray | None = None,
+        v: Tensor | np.ndarray | None = None,
         time_unit: str = "s",
         source: str = "",
         hold: str = "",
@@ -93,18 +95,20 @@ class Trajectories:
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
 
-        Arrays and lists become float64; tensors keep their dtype. `q`, `p` and `u` of shape (N,) become (N, 1).
+        Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v` and `u` of shape (N,) become (N, 1).
         Left out: one trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
-        t, q = _tensor("t", t), _column(_tensor("q", q))
+        own_p, own_u, own_v = (as_columns(name, x) for name, x in (("p", p), ("u", u), ("v", v)))
+        t, q = as_tensor("t", t), as_tensor("q", q)
+        q = q[:, None] if q.ndim == 1 else q
         counts = lengths.tolist() if isinstance(lengths, (Tensor, np.ndarray)) else lengths
         n = q.shape[-1]
         angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
         return cls(
             t, q, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
             tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
-            None if s is None else _tensor("s", s), None if p is None else _column(_tensor("p", p)),
-            None if u is None else _column(_tensor("u", u)), time_unit, source, hold, delay, lag, columns,
+            None if s is None else as_tensor("s", s), own_p, own_u, time_unit, source, hold, delay, lag, columns,
+            v=own_v,
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -335,16 +339,3 @@ class Trajectories:
     def rows(self, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
         """Return these rows of the concatenation, as trajectories of these lengths."""
         return replace(self, **self._map(lambda x: x[rows]), lengths=lengths)
-
-
-def _tensor(name: str, x: Tensor | np.ndarray | Sequence) -> Tensor:
-    if isinstance(x, Tensor):
-        return torch.atleast_1d(x)
-    try:
-        return torch.from_numpy(np.array(x, dtype=np.float64, ndmin=1))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is not an array of numbers ({error}); give a tensor, an array or a list") from error
-
-
-def _column(x: Tensor) -> Tensor:
-    return x[:, None] if x.ndim == 1 else x

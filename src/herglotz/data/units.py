@@ -25,6 +25,7 @@ def in_radians_and_seconds(data: Trajectories) -> Trajectories:
         data = replace(
             data,
             q=data.q * factor,
+            v=None if data.v is None else data.v * factor,
             units=tuple("rad" if turned else unit for turned, unit in zip(degrees, data.units, strict=True)),
             angles=tuple(turned or angle for turned, angle in zip(degrees, data.angles, strict=True)),
         )
@@ -38,7 +39,8 @@ def in_seconds(data: Trajectories) -> Trajectories:
     # A quotient by a power of ten is the float nearest to the decimal number: 300 ms prints as 0.3 s.
     many = PER_SECOND[data.time_unit]
     delay, lag = (None if x is None else x / many for x in data.arrival[1:])
-    return replace(data, t=data.t / many, time_unit="s", delay=delay, lag=lag)
+    v = None if data.v is None else data.v * many
+    return replace(data, t=data.t / many, v=v, time_unit="s", delay=delay, lag=lag)
 
 
 def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
@@ -47,9 +49,11 @@ def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
     Momenta stay those of radians.
     """
     turned = [name in names and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
+    factor = data.q.new_tensor([180 / math.pi if x else 1.0 for x in turned])
     return replace(
         data,
-        q=data.q * data.q.new_tensor([180 / math.pi if x else 1.0 for x in turned]),
+        q=data.q * factor,
+        v=None if data.v is None else data.v * factor,
         units=tuple("deg" if x else unit for x, unit in zip(turned, data.units, strict=True)),
         angles=tuple(angle and not x for x, angle in zip(turned, data.angles, strict=True)),
     )

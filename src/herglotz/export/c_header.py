@@ -42,7 +42,7 @@ TOP = """\
 {arrival}   #include "{file}"  // cc -O3 -march=native -std=c99 -ffp-contract=fast example.c -lm
 
    int main(void) {{
-     hz_state x = hz_start;  // or your own: hz_init makes a state from two measured positions
+     hz_state x = hz_start;  // or your own: hz_init_qv makes a state of a position and a velocity
      hz_real left;
      int k, status = 0;
      for (k = 0; k < 100 && !(status & 15); k++) {{
@@ -88,8 +88,8 @@ static const char hz_dtype[] = {dtype};
 static const char hz_versions[] = {versions};
 static const char *const hz_units[] = {{{units}}};
 static const int hz_is_angle[hz_N] = {{{angles}}};
-static const hz_real hz_h = {h}; /* typical step: recorded, not imposed */
-static const hz_real hz_h_low = {h_low}, hz_h_high = {h_high}; /* steps it was fitted for */
+static const hz_real hz_h = {h}; /* typical step{in_unit}: recorded, not imposed */
+static const hz_real hz_h_low = {h_low}, hz_h_high = {h_high}; /* steps of the fit and of the recording{in_unit} */
 static const hz_real hz_tolerance = {tolerance}; /* of Newton, relative to the size of q */
 static const hz_real hz_floor = {floor}; /* rounding that no iteration removes */
 static const hz_real hz_top_speed = {top_speed}; /* the networks' rounding is relative to h times this, even at rest */
@@ -115,9 +115,9 @@ def export_c(
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
 
-    Its functions are `NAME_init` (state from two positions), `NAME_step`, `NAME_step_jacobian`, `NAME_rollout` and
-    the `_batch`es; an example stands at the top of the file. Compile with `-O3 -march=native` for speed; `docs/c.md`
-    has the rest.
+    Its functions are `NAME_init` (state from two positions), `NAME_init_qv` (from a position and a velocity),
+    `NAME_velocity`, `NAME_step`, `NAME_step_jacobian`, `NAME_rollout` and the `_batch`es; an example stands at the top
+    of the file. Compile with `-O3 -march=native` for speed; `docs/c.md` has the rest.
 
     Parameters
     ----------
@@ -170,19 +170,23 @@ def export_c(
 def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, derivatives: bool = True) -> str:
     """The text of the header.
 
-    Without `derivatives`, and beyond 8 coordinates, NAME_step_jacobian is left out: it is most of the work.
+    Without `derivatives` NAME_step_jacobian, NAME_init_qv and NAME_velocity are left out. Beyond 8 coordinates the
+    first one is: it is most of the work.
     """
+    velocities = derivatives
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
     step = StepInC(equations)
-    emitted = model_source(step, equations, derivatives)
+    emitted = model_source(step, equations, derivatives, velocities)
     types, number_tests, functions, products, checks, one_step, run, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
     parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests, functions, products]
     parts += [emitted.tables, _inputs(model, dtype), checks, as_scalars(emitted.step + one_step + run)]
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
-    parts += [as_scalars(emitted.slopes), api, "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+    parts += [as_scalars(emitted.slopes), api]
+    parts += [as_scalars(emitted.momentum), runtime("velocity.h")] if velocities else []
+    parts += ["#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     last = {
@@ -234,12 +238,17 @@ def _identifier(stem: str) -> str:
     return name if re.match("[A-Za-z]", name) else f"model_{name}"[:41]
 
 
+def _time_unit(entries: Mapping[str, Any]) -> str:
+    """That of h, without what would end the comment."""
+    return entries.get("time_unit", "s").replace("*", "")
+
+
 def _arrival(entries: Mapping[str, Any]) -> str:
     """What to do with recorded inputs before a step takes them; nothing where they act at once."""
     delay, lag = Arrival(**entries.get("arrival", {})).late
     if not delay and not lag:
         return ""
-    unit = entries.get("time_unit", "s").replace("*", "")  # "*/" would end the comment
+    unit = _time_unit(entries)
     late = f"u(t - {delay:.6g} {unit})" if delay else "u(t)"
     formula = f"T u_f' = {late} - u_f with T = {lag:.6g} {unit}" if lag else f"u_f(t) = {late}"
     return f"   Inputs u act late: give each step the mean over it of u_f,\n   {formula}.\n\n"
@@ -282,6 +291,7 @@ def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
         units="@UNITS@",
         angles=", ".join(str(int(a)) for a in entries["angles"]),
         h=number(entries["h"], dtype),
+        in_unit=f" in {_time_unit(entries)}" if "time_unit" in entries else "",
         h_low=number(span[0], dtype),
         h_high=number(span[-1], dtype),
         tolerance=number(entries["newton_tolerance"], dtype),

@@ -45,18 +45,34 @@ class CLibrary:
         self.library.herglotz_inits(*_arguments(len(s0), q0, q1, s0, h, u, p, s, status))
         return p, s
 
-    def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
-        """A step and its derivative (B, 2n+1, 2n+2+m); NaN where the step failed."""
-        if self.differentiates is None:  # built on first use: most steppers are not differentiated
+    def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+        """The momenta p of velocities, NaN where there is none, and statuses."""
+        p, status = self._empty(len(s), self.dof), self._failed(len(s))
+        self._differentiating().herglotz_momenta(*_arguments(len(s), q, v, s, h, p, status))
+        return p, status
+
+    def velocity(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+        """The velocities v of momenta, NaN where there is none, and statuses."""
+        v, status = self._empty(len(s), self.dof), self._failed(len(s))
+        self._differentiating().herglotz_velocities(*_arguments(len(s), q, p, s, h, v, status))
+        return v, status
+
+    def _differentiating(self) -> Any:
+        """The library with derivatives and velocities, built on first use: most steppers are asked for neither."""
+        if self.differentiates is None:
             assert self.whole is not None
             self.differentiates = build(self.whole(), library_of(self.metadata["name"]))
+        return self.differentiates
+
+    def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
+        """A step and its derivative (B, 2n+1, 2n+2+m); NaN where the step failed."""
         count, size = len(s), 2 * self.dof + 1
         widths = ((self.dof,), (self.dof,), (), ())
         *new, sigma = (self._empty(count, *width) for width in widths)
         status, residual = self._failed(count), self._empty(count)
         slopes = [self._empty(count, size, width) for width in (size, self.inputs, 1)]
         outputs = (*new, sigma, status, residual, *slopes)
-        self.differentiates.herglotz_jacobians(*_arguments(count, q, p, s, h, u, *outputs))
+        self._differentiating().herglotz_jacobians(*_arguments(count, q, p, s, h, u, *outputs))
         by_state, by_input, by_h = slopes
         return *new, sigma, residual, status, torch.cat([by_state, by_h, by_input], -1)
 
@@ -100,5 +116,9 @@ def _arguments(*values: Tensor | int | None) -> list[Any]:
 def compiled(header: str, path: PathLike = "header", whole: Callable[[], str] | None = None) -> ExportedStepper:
     """The stepper of a header; arguments and errors as of `CLibrary`."""
     library = CLibrary(header, path, whole)
-    programs = {"init": library.init} | ({"linearise": library.linearise} if library.dof <= MAX_DERIVATIVES else {})
+    programs: dict[str, Any] = {"init": library.init}
+    if library.dof <= MAX_DERIVATIVES:
+        programs["linearise"] = library.linearise
+    if whole is not None or "_VELOCITIES" in header:
+        programs |= {"momentum": library.momentum, "velocity": library.velocity}
     return ExportedStepper(programs, library.metadata, str(path), "c", library)

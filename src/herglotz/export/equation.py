@@ -21,6 +21,7 @@ from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
 from herglotz.stepping.partials_equation import End, PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip
+from herglotz.stepping.velocity import legendre
 
 # Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
 # u (B, m) where it takes inputs. What a step gains is told without the potential at q1, which the caller adds.
@@ -118,6 +119,16 @@ class Equations:
             return dense(step_jacobian(step_functions(self.model), State(q, p, s), h, delta, u[0] if u else None))
 
         return traced(slopes, (q, p, s, h, 0.1 * p, *u))
+
+    @cached_property
+    def momentum(self) -> Graph:
+        """`herglotz.stepping.velocity.legendre` at (q, v, s, h): L_v, L_vv and what set-valued friction adds."""
+        q, v, s, h, *_ = example(self.model, 0.1)
+
+        def found(*x: Tensor) -> tuple[Tensor, ...]:
+            return tuple(dense(y) for y in legendre(self.model, *x) if y is not None)
+
+        return traced(found, (q, v, s, h))
 
     def _traced(self, function: Callable[..., Any]) -> Graph:
         q, p, s, h, *u = example(self.model, 0.1)

@@ -14,7 +14,8 @@ from herglotz.export.box import Box, s_matters
 from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
 from herglotz.stepping.events import Watch
 from herglotz.stepping.rollout import Plan, Track, without_lost_factors
-from herglotz.stepping.state import check_h, check_rows, check_started, check_state
+from herglotz.stepping.state import check_h, check_moving, check_rows, check_started, check_state
+from herglotz.stepping.velocity import Legendre, momentum, velocity
 
 Program = Callable[..., tuple[Tensor, ...]]
 # (q (B, n), p (B, n), s (B,), h (B, K)[, u (B, K, m)]) → K steps, in any memory layout
@@ -26,8 +27,9 @@ class ExportedStepper(OneStepMethod):
     """The flow Φ̃ of an exported model; results are those of `Stepper`. `load_exported` makes it of a file.
 
     The programs are what the file can run, each a function of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) →
-    K steps, and where the format has them `model`, one differentiable step, `linearise` and `init`. A format without
-    the program `rollout` gives the loop of K steps instead, which needs no inputs where none act.
+    K steps, and where the format has them `model`, one differentiable step, `linearise`, `init`, and `legendre` (or
+    `momentum` and `velocity`). A format without the program `rollout` gives the loop of K steps instead, which needs no
+    inputs where none act.
     """
 
     def __init__(
@@ -76,6 +78,39 @@ class ExportedStepper(OneStepMethod):
         self._check(q0, q1, s0, ("q0", "q1", "s0"), finite=True)
         p, s = self.programs["init"](*map(plain, self._flat(State(q0, q1, s0), h, u)))
         return check_started(State(q1, p.reshape(q1.shape), s.reshape(s0.shape)))
+
+    def init_qv(self, q: Tensor, v: Tensor, s: Tensor | None = None, h: Tensor | float = 1.0) -> State:
+        """The state (q, p, s) of a position and a velocity, as `Stepper.init_qv`.
+
+        Raise InputError as `step`, and where the file holds no velocities.
+        """
+        s = torch.zeros_like(q[..., 0]) if s is None else s
+        self._check(q, v, s, ("q", "v", "s"), finite=True)
+        flat = [plain(x) for x in self._flat(State(q, v, s), h, None)[:4]]
+        if "momentum" in self.programs:
+            p, _ = self.programs["momentum"](*flat)
+        else:
+            p = momentum(self._legendre, *flat)
+        return check_started(State(q, p.reshape(q.shape), s))
+
+    def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:
+        """The velocity v (..., n) of states, as `Stepper.velocity`, without derivatives.
+
+        Raise InputError as `step`, and where the file holds no velocities; StepError where a state has none.
+        """
+        self._check(*state, finite=True)
+        with torch.no_grad():
+            q, p, s, h = (plain(x) for x in self._flat(state, h, None)[:4])
+            if "velocity" in self.programs:
+                v, status = self.programs["velocity"](q, p, s, h)
+            else:
+                v, status = velocity(self._legendre, State(q, p, s), h)
+        return check_moving(v.reshape(state.q.shape), status.reshape(state.s.shape))
+
+    def _legendre(self, *x: Tensor) -> Legendre:
+        if "legendre" not in self.programs:
+            raise InputError(f"{self.path}: {self._file} file without velocities; export the model again, as .pt2 or C")
+        return Legendre(*self.programs["legendre"](*map(plain, x)))
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step, as `Stepper.step`, in the dtype of the file, which has its own guess; u None: no input acts.

@@ -19,7 +19,11 @@ from herglotz.schema import check_entries
 FORMAT = 3  # 1 held a single step; 2 added rollouts and starts from positions, 3 the Jacobian of a step
 METADATA = "metadata.json"  # of our entries in a .pt2 archive
 KEY = "herglotz"  # of our entries among the metadata of an ONNX or compiled model
-AOTI = {"rollout": "model", "init": "init"}  # our names of the programs in a compiled package, and the package's
+AOTI = {
+    "rollout": "model",
+    "init": "init",
+    "legendre": "legendre",
+}  # our names of the programs in a compiled package, and the package's
 BOX_KEYS = tuple(f"{name}_{end}" for name in "qps" for end in ("low", "high"))
 REMEDY = "export the model again"
 TOLERANCE = 4  # machine epsilons, of Δ = q1 − q0: what is left of it goes into p divided by h, and adds up

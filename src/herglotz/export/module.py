@@ -186,3 +186,15 @@ class InitModule(nn.Module):
             V, slope = self.field(q1)
             L, p1 = L - h / 2 * V, p1 - (h / 2)[..., None] * slope
         return p1, s0 + L
+
+
+class LegendreModule(nn.Module):
+    """(q, v, s, h) → L_v (B, n), L_vv (B, n, n)[, grip, its slope (B, n)]: `herglotz.stepping.velocity.Legendre`."""
+
+    def __init__(self, equations: Equations):
+        super().__init__()
+        self.momentum = equations.momentum
+
+    def forward(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Values:
+        """At (B, n), (B, n), (B,) and steps (B,)."""
+        return tuple(self.momentum(q, v, s, h))

@@ -17,7 +17,7 @@ from herglotz.data.files import PathLike, write_atomically
 from herglotz.export.equation import Equations, example
 from herglotz.export.inline import inlined, opaque
 from herglotz.export.metadata import describe
-from herglotz.export.module import InitModule, RolloutModule, StepModule
+from herglotz.export.module import InitModule, LegendreModule, RolloutModule, StepModule
 from herglotz.export.step import ITERATIONS, StepGraphs
 from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
@@ -28,7 +28,7 @@ EXAMPLE_STEPS = 13  # of the traced rollout; the number of steps stays free
 def programs_of(
     model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str], hoists: bool = True
 ) -> dict[str, ExportedProgram]:
-    """Those programs of `model` (a differentiable step), `rollout`, `linearise` and `init` that are named.
+    """Those programs of `model` (a differentiable step), `rollout`, `linearise`, `init`, `legendre` that are named.
 
     Each holds for any batch size; `entries` is the file's metadata, `hoists` that of `RolloutModule`.
     """
@@ -42,6 +42,7 @@ def programs_of(
         "linearise": lambda: _program(StepModule(equations, graphs, iterations, linearised=True), (q, p, s, *more)),
         "rollout": lambda: _program(RolloutModule(graphs, iterations, hoists), (q, p, s, *stacked), stacked=True),
         "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
+        "legendre": lambda: _program(LegendreModule(equations), (q, p, s, more[0])),
     }
     return {name: make[name]() for name in names}
 

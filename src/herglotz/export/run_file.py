@@ -37,8 +37,9 @@ def export_run(
     kind
         "pt2", "aoti", "onnx" or "c"; None: by the end of the name.
     h_range
-        Steps that the file is for; None: those of the data. An end that agrees with the run's own step to six digits
-        is taken for it: recorded times carry rounding, and 0.2 means a step of 0.2000000000000002 too.
+        Steps that the file is for; None: those of the fit and of the recording, which a fit may cross in several of
+        its own. An end that agrees with the run's own step to six digits is taken for it: recorded times carry
+        rounding, and 0.2 means a step of 0.2000000000000002 too.
     name
         Prefix of every name in a C header, as of `export_c`; None: that of the file.
 
@@ -54,7 +55,7 @@ def export_run(
     if name is not None and kind != "c":
         raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
     (q, p, s), t = run.last_fitted()
-    span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or run.h_range]
+    span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or _steps(run)]
     metadata = {
         "names": list(run.data.names),
         "time_unit": run.data.time_unit,
@@ -72,3 +73,9 @@ def export_run(
         described["name"] = name
     WRITERS[kind](run.model, path, **described)
     return path
+
+
+def _steps(run: Run) -> tuple[float, float]:
+    """The shortest and the longest step of the fit and of the recording; a tuned model is made for one step."""
+    low, high = run.h_range
+    return low, high if run.setting else max(high, run.data.typical_step)

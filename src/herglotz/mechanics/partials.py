@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from inspect import signature
 from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
@@ -166,7 +167,7 @@ def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor
     check_arguments(q0, q1, s0)
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape)
-    L = checked(L_d, L_d(q0, q1, s0, h), torch.empty(shape, device="meta"))
+    L = checked(L_d, called(L_d, q0, q1, s0, h), torch.empty(shape, device="meta"))
     if h.ndim:
         _check_alone(L_d, L, q0.expand(*shape, -1), q1.expand(*shape, -1), s0.expand(shape), h)
     return L
@@ -184,6 +185,30 @@ def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] =
 REMEDY = (
     "one coordinate is q = torch.tensor([1.0], dtype=torch.float64), with s = torch.tensor(0.0, dtype=torch.float64)"
 )
+
+
+def called(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+    """L_d(q0, q1, s0, h); raise InputError if L_d takes another number of arguments."""
+    try:
+        return L_d(q0, q1, s0, h)
+    except TypeError as error:
+        if "positional argument" not in str(error) or _takes_four(L_d):
+            raise
+        raise InputError(
+            f"{_name(L_d)} must take four arguments, L_d(q0, q1, s0, h): {error}; add those that are missing, and "
+            "0 * s0 where nothing depends on s"
+        ) from None
+
+
+def _takes_four(L_d: Any) -> bool:
+    """Whether a function can be called with four arguments by position; True where that is not known."""
+    try:
+        signature(L_d.forward if isinstance(L_d, torch.nn.Module) else L_d).bind(*range(4))
+    except TypeError:
+        return False
+    except ValueError:  # of a function without a signature
+        return True
+    return True
 
 
 def checked(L_d: Any, L: Any, like: Tensor) -> Tensor:
@@ -237,7 +262,7 @@ def autograd_partials(
         q0, q1, s0 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q1, s0))
         # `* 1` gives each argument a graph node of its own, so that views of one tensor differentiate separately.
         a, b, s = q0 * 1, q1 * 1, s0 * 1
-        L = checked(L_d, L_d(a, b, s, h), s)
+        L = checked(L_d, called(L_d, a, b, s, h), s)
         if h.ndim:
             _check_alone(L_d, L, a, b, s, h)
         forces = L_d.forces(a, b, s, h) if isinstance(L_d, Forced) else None
@@ -273,7 +298,7 @@ def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor,
     """Whether a result should carry a graph: an argument wants a gradient, or a parameter inside L_d does."""
     if q0.requires_grad or q1.requires_grad or s0.requires_grad:
         return True
-    return checked(L_d, L_d(q0, q1, s0, h), s0).requires_grad
+    return checked(L_d, called(L_d, q0, q1, s0, h), s0).requires_grad
 
 
 def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor, ...]:

@@ -25,6 +25,9 @@ from herglotz.models.phase import Phase
 from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
 
+# Of the time that a motion takes: damping changes nothing meanwhile, and float32 still has 1/h².
+INSTANT = 2.0**-50
+
 
 def numbers_of(model: ContactLagrangian) -> dict[str, tuple[str, int]]:
     """Parameter and entry of every number that a model learns, by its name: `damping.rate`, `friction.viscous[1]`.
@@ -154,16 +157,18 @@ class ContactLagrangian(nn.Module):
             coupling=bool(self.forces_between) or self.drag is not None,
         )
 
-    def terms(self, phase: Phase) -> Terms:
-        """Evaluate every term once."""
+    def terms(self, phase: Phase, instant: bool = False) -> Terms:
+        """Evaluate every term once; in an `instant` the potential moves nothing, and is not evaluated."""
         order, n = phase.order, phase.q0.shape[-1]
         g = None if self.damping is None else self.damping(phase)
         N = None if self.correction is None else self.correction(phase)
         b = None if self.action is None else self.action.offsets(phase.features)
         if not self.config.baseline:
             return Terms(g, None, None, None, N, b)
-        V = self.potential(torch.stack([phase.q0, phase.q1]), order)  # both ends in one network call
         K = self.kinetic(phase)
+        if instant:
+            return Terms(g, K, K * 0.0, K * 0.0, N, b)
+        V = self.potential(torch.stack([phase.q0, phase.q1]), order)  # both ends in one network call
         V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
         if self.config.order == 4:
             N = self._missing(phase, V0, V1)
@@ -188,6 +193,21 @@ class ContactLagrangian(nn.Module):
         """`partials` at (q0, q0 + Δ, s0), without the rounding of q1 − q0 when the step is small."""
         q0, delta, s0 = torch.broadcast_tensors(q0, delta, s0[..., None])
         return self._evaluate(self._phase(q0, q0 + delta, s0[..., 0], h, order, delta), s0[..., 0], u)
+
+    def velocity_derivatives(
+        self,
+        q: Tensor,  # (..., n)
+        v: Tensor,  # (..., n)
+        s: Tensor,  # (...)
+    ) -> tuple[Tensor, Tensor]:
+        """Return p = L_v (..., n) and L_vv (..., n, n) of the model's L(q, v, s) = lim L_d(q, q + hv, s, h)/h, h → 0.
+
+        They are D2 L_d and h D22 L_d in an instant: jets divide by h and subtract nothing.
+        """
+        h = torch.full_like(s, INSTANT * max(self.config.scale) / max(self.config.speed))
+        phase = Phase(q, q, h, 2, self.config, v * h[..., None])
+        P = self._assembled(self.terms(phase, instant=True), phase, s, None)
+        return P.D2, P.D22 * h[..., None, None]
 
     def forces(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, u: Tensor | None = None
@@ -229,7 +249,10 @@ class ContactLagrangian(nn.Module):
         return Phase(q0, q1, h, order, self.config, delta)
 
     def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
-        t, h = self.terms(phase), phase.h
+        return self._assembled(self.terms(phase), phase, s0, self._forces(phase, u))
+
+    def _assembled(self, t: Terms, phase: Phase, s0: Tensor, force: Forces | None) -> Partials:
+        h = phase.h
         if self.action is not None:
             return action_partials(self._through_action(self.action, t, s0, h, phase.order))
         c = None if t.g is None else t.g.exp()
@@ -240,7 +263,7 @@ class ContactLagrangian(nn.Module):
             V = h / 2 * (t.V0 + t.V1)
             L = t.K - V if c is None or t.g is None else (c - 1.0) * (s0 - h / 2 * t.V0) + (t.g / 2).exp() * t.K - V
             L = L if t.N is None else L + t.N
-        return affine_partials(L, t.g, c, s0, self._forces(phase, u))
+        return affine_partials(L, t.g, c, s0, force)
 
     def _through_action(self, action: ActionFlow, t: Terms, s0: Tensor, h: Tensor, order: int) -> Jet:
         """L = s1 − s0 at the full level, over the 2n + 1 variables (q0, q1, s0), as a sum of increments."""

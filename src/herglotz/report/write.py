@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.errors import InputError
 from herglotz.plots import plot_bands, plot_learned, plot_sizes, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
+from herglotz.progress import ProgressBar
 from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
 from herglotz.threads import one_thread
@@ -44,7 +48,7 @@ herglotz verify model.h --against {run}           # the file steps as the run do
 # Python
 import herglotz as hz
 run = hz.load_run("{run}")
-motion = run.rollout(200)                   # numpy: motion.t, motion.q
+motion = run.rollout(200)                   # numpy: motion.t, motion.q, motion.v
 print(run.predict("another.csv").rms)"""
 
 
@@ -85,20 +89,26 @@ def describe(run: Run, against: Trajectories | None, name: str) -> Document:
     """The report's contents."""
     verdict = str(run.metrics.get("verdict", "not judged"))
     meaning = next((words for start, words in MEANING.items() if verdict.startswith(start)), "The run has no verdict.")
-    posterior = _posterior(run)
-    sections = [
-        Section("The learned equation", _equation(run, posterior)),
-        Section("Walk through the free run", (*_sliders(run),)),
-        Section("Data", _data(run)),
-        Section("Plan of the fit, with reasons", _plan(run)),
-        Section("Errors on held-out time", _errors(run)),
-        *([] if against is None else [Section("Another recording", _against(run, against))]),
-        Section("What the data leave open", _open(run, posterior)),
-        Section("Verification", _verification(run)),
-        Section("Speed", _speed(run)),
-        Section("How to use it", (Code(USE.format(run=name)),)),
-        Section("Where it comes from", _origin(run)),
-    ]
+    posterior = cache(lambda: _posterior(run))
+    parts: dict[str, Callable[[], tuple[Block, ...]]] = {
+        "The learned equation": lambda: _equation(run, posterior()),
+        "Walk through the free run": lambda: (*_sliders(run),),
+        "Data": lambda: _data(run),
+        "Plan of the fit, with reasons": lambda: _plan(run),
+        "Errors on held-out time": lambda: _errors(run),
+        **({} if against is None else {"Another recording": lambda: _against(run, against)}),
+        "What the data leave open": lambda: _open(run, posterior()),
+        "Verification": lambda: _verification(run),
+        "Speed": lambda: _speed(run),
+        "How to use it": lambda: (Code(USE.format(run=name)),),
+        "Where it comes from": lambda: _origin(run),
+    }
+    sections = []
+    with ProgressBar(total=len(parts), disable=not sys.stderr.isatty(), leave=False, unit="section") as progress:
+        for title, made in parts.items():
+            progress.set_description(title)
+            sections.append(Section(title, made()))
+            progress.update()
     return Document(f"herglotz: model of {run.data.source or 'a recording'}", verdict, meaning, tuple(sections))
 
 

@@ -55,7 +55,6 @@ def find_root(equation: StepEquation, guess: Tensor, tol: float, max_iterations:
     """
     sizes = _Sizes(equation)
     if sticks(equation):
-        assert isinstance(equation, PartialsEquation)
         start, *held = at_rest(equation)
         sticky = StickSlip(equation, *held)
         found = newton(sticky, start, Rules(tol, max_iterations), sizes.tensors)

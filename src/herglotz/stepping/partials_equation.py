@@ -16,6 +16,7 @@ from herglotz.mechanics import (
     partials,
 )
 from herglotz.mechanics.newton import Point
+from herglotz.models import capabilities
 from herglotz.stepping.state import State
 
 
@@ -57,6 +58,8 @@ class PartialsEquation:
     def __init__(self, L_d: DiscreteLagrangian, state: State, h: Tensor, order: int, increments: bool):
         self.L_d, self.h, self.order, self.increments = L_d, h, order, increments
         self.q0, self.p0, self.s0 = state
+        made_of = capabilities(L_d)
+        self.sticking = made_of is not None and made_of.sticking  # dry friction can hold a coordinate
 
     def __call__(self, x: Tensor, second: bool) -> Point:
         """See `StepEquation`."""

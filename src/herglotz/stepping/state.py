@@ -185,6 +185,17 @@ def check_started(state: State) -> State:
     return state
 
 
+def check_moving(v: Tensor, status: Tensor) -> Tensor:
+    """The same velocities; raise StepError for the first sample that has none."""
+    if bool((lost := status != Status.CONVERGED).any()):
+        sample = tuple(int(i) for i in lost.nonzero()[0])
+        raise StepError(
+            f"no velocity at sample {sample}: {Status(int(status[sample])).name}; L_v(q, v, s) = p has no solution "
+            "near v = 0, so p is beyond what this L_d reaches"
+        )
+    return v
+
+
 def check_h(h: Tensor | float, like: Tensor) -> Tensor:
     """The time step as a tensor of the dtype and device of `like`.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -16,11 +18,13 @@ from herglotz.stepping.state import (
     Step,
     StepError,
     check_h,
+    check_moving,
     check_rows,
     check_started,
     check_state,
     throw_failure,
 )
+from herglotz.stepping.velocity import legendre, momentum, velocity
 
 
 class Stepper(OneStepMethod):
@@ -95,6 +99,66 @@ class Stepper(OneStepMethod):
         check_state(State(q0, q1, s0), self.L_d, ("q0", "q1", "s0"), finite=True)
         h = check_h(h, q0)
         return check_started(State(*legendre_plus(driven_by(self.L_d, u), q0, q1, s0, h)))
+
+    def init_qv(self, q: Tensor, v: Tensor, s: Tensor | None = None, h: Tensor | float = 1.0) -> State:
+        """The state (q, p, s) of a position and a velocity: p = L_v(q, v, s) of the model's L = lim L_d/h, h → 0.
+
+        Source: section 9 of `docs/trajectory.md`; `herglotz.stepping.velocity` has what stands for it elsewhere.
+
+        Parameters
+        ----------
+        q, v
+            (..., n) position and velocity, in the units of L_d and over the unit of time.
+        s
+            (...) action, in the unit of L_d; left out: 0 (a choice of gauge).
+        h
+            () or (...) step of the motion that starts here, in the unit of time. It matters where dry friction is
+            set-valued, and where L_d is no model.
+
+        Returns
+        -------
+        State
+            With p as accurate as the steps: to order 4 for a model of order 4 without forces, else to order 2.
+
+        Raises
+        ------
+        InputError
+            If shapes or dtypes do not fit, a number is not finite, or h is not positive.
+        StepError
+            If p of a sample is too large a number.
+        """
+        s = torch.zeros_like(q[..., 0]) if s is None else s
+        check_state(State(q, v, s), self.L_d, ("q", "v", "s"), finite=True)
+        return check_started(State(q, momentum(partial(legendre, self.L_d), q, v, s, check_h(h, q)), s))
+
+    def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:
+        """The velocity v (..., n) of states: L_v(q, v, s) = p solved for v, the inverse of `init_qv`.
+
+        Source: section 9 of `docs/trajectory.md`. Differentiable once with respect to the state, by the
+        implicit-function theorem.
+
+        Parameters
+        ----------
+        state
+            (q, p, s) with shapes (..., n), (..., n), (...).
+        h
+            () or (...) step of the motion that the states are of, in the unit of time; see `init_qv`.
+
+        Returns
+        -------
+        Tensor
+            (..., n), in units of q over the unit of time.
+
+        Raises
+        ------
+        InputError
+            If shapes or dtypes do not fit, a number is not finite, or h is not positive.
+        StepError
+            If no velocity of a sample has this p; the message names the sample.
+        """
+        check_state(state, self.L_d, finite=True)
+        v, status = velocity(partial(legendre, self.L_d), state, check_h(h, state.q))
+        return check_moving(v, status)
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step: solve p = −D1 L_d / c for q1, then p1 = D2 L_d and s1 = s + L_d.

@@ -17,17 +17,24 @@ V. Acary & B. Brogliato, Numerical Methods for Nonsmooth Dynamical Systems (2008
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeGuard
 
 import torch
 from torch import Tensor
 
 from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
 from herglotz.mechanics.newton import Point
-from herglotz.models import capabilities
-from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.partials_equation import StepEquation
 
 SWEEPS = 8  # of Gauss–Seidel: they find which coordinates stick, Newton's iteration finds by how much the others move
+
+
+class PartialsAtHand(StepEquation, Protocol):
+    """A step equation whose `rest` is its partials, with the forces that hold."""
+
+    p0: Tensor  # (..., n)
+    order: int  # of the derivatives, unless `second` are asked for
+    sticking: bool
 
 
 class Rest(NamedTuple):
@@ -38,7 +45,7 @@ class Rest(NamedTuple):
     bound: Tensor  # w/K, the |z| up to which a coordinate sticks
 
 
-def at_rest(equation: PartialsEquation) -> Rest:
+def at_rest(equation: PartialsAtHand) -> Rest:
     """The start of the iteration, exact for n = 1 and by Gauss–Seidel for more, with the constants of z.
 
     The friction of the equation, which is in q1 or, in increments, in Δ = q1 − q0, is set-valued.
@@ -65,7 +72,7 @@ class StickSlip:
     K = `stiffness` and w/K = `bound` are those of `at_rest`.
     """
 
-    def __init__(self, equation: PartialsEquation, stiffness: Tensor, bound: Tensor):
+    def __init__(self, equation: PartialsAtHand, stiffness: Tensor, bound: Tensor):
         self.equation, self.stiffness, self.bound = equation, stiffness, bound
 
     def unknown(self, z: Tensor) -> Tensor:
@@ -89,9 +96,6 @@ class StickSlip:
         return Point(G, J - torch.diag_embed(torch.where(slides, 0.0, self.stiffness)), P)
 
 
-def sticks(equation: object) -> bool:
-    """Whether dry friction can hold a coordinate of this step."""
-    if not isinstance(equation, PartialsEquation):
-        return False
-    made_of = capabilities(equation.L_d)
-    return made_of is not None and made_of.sticking
+def sticks(equation: StepEquation) -> TypeGuard[PartialsAtHand]:
+    """Whether dry friction can hold a coordinate of this step: its partials then are at hand."""
+    return getattr(equation, "sticking", False)

@@ -15,8 +15,9 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.driving import driven, even_times, input_recording
 from herglotz.data.waves import waves
-from herglotz.errors import InputError
+from herglotz.errors import InputError, check_start
 from herglotz.stepping import State
+from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.recorded_range import Beyond, other_steps, quantities_outside, warning
@@ -30,9 +31,12 @@ class Motion:
 
     Parameters
     ----------
-    t, q, p, s
-        (K+1,) time; (..., K+1, n) position, and momentum, of which the first mass is 1; (..., K+1) action. In the units
-        of the data and, p and s, of `herglotz.State`.
+    t, q, v
+        (K+1,) time; (..., K+1, n) position and velocity, in the units of the data and these over that of t. v is NaN
+        where p belongs to no velocity (`Stepper.velocity`).
+    p, s
+        (..., K+1, n) momentum, of which the first mass is 1, and (..., K+1) action, in the units of
+        `herglotz.State`.
     status
         (..., K) of every step, dimensionless, 0 where it was solved (`herglotz.Status`).
     names, units, time_unit
@@ -43,6 +47,7 @@ class Motion:
 
     t: np.ndarray
     q: np.ndarray
+    v: np.ndarray
     p: np.ndarray
     s: np.ndarray
     status: np.ndarray
@@ -69,6 +74,7 @@ def free_motion(
     steps: int,
     *,
     q0: Numbers | None = None,
+    v0: Numbers | None = None,
     p0: Numbers | None = None,
     s0: Numbers | None = None,
     t0: float | None = None,
@@ -76,32 +82,39 @@ def free_motion(
     inputs: Any = None,
     trajectory: int = 0,
 ) -> Motion:
-    """Step a run from its last fitted state, or from (q0, p0, s0); see `Run.rollout`."""
-    if (q0 is None) != (p0 is None):
-        raise InputError("q0 and p0 go together; give both, or neither to start from the last fitted state")
+    """Step a run from its last fitted state, or from (q0, v0, s0) or (q0, p0, s0); see `Run.rollout`."""
+    check_start(q0 is not None, v0 is not None, p0 is not None)
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise InputError(f"steps must be a whole number >= 1, got {steps!r}")
-    state, time = run.last_fitted(trajectory) if q0 is None or p0 is None else _given(run, q0, p0, s0)
-    time = time if t0 is None else t0
-    dtype = state.q.dtype
+    fitted, time = run.last_fitted(trajectory if q0 is None else 0)
+    time = t0 if t0 is not None else time if q0 is None else 0.0
+    dtype = fitted.q.dtype
     u, times = _inputs(run, inputs, (time, steps, h), (trajectory, q0 is not None and t0 is None))
     if words := other_steps(times, run.h_range, run.data.time_unit):
         warnings.warn(f"{words}; run.at_step(h) steps the same motion at another h", stacklevel=4)
     step: Any = times.diff().to(dtype) if isinstance(inputs, (str, Path, Trajectories)) else (h or run.h)
+    h_of = torch.as_tensor(step, dtype=dtype).expand(steps)
     with torch.no_grad():
+        state = fitted if q0 is None else _given(run, q0, (v0, p0), s0, h_of[0])
         found = run.stepper.rollout(*state, h=step, steps=steps, inputs=None if u is None else u.to(dtype))
-    arrays = [x.detach().cpu().numpy() for x in (times, found.q, found.p, found.s, found.status)]
+        v = velocities(run.model, found.states, torch.cat([h_of[:1], h_of]))
+    arrays = [x.detach().cpu().numpy() for x in (times, found.q, v, found.p, found.s, found.status)]
     left = tuple(quantities_outside(run.box, run.data, times, found.q, found.p))
     return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit, beyond=left)
 
 
-def _given(run: FittedRun, q0: Numbers, p0: Numbers, s0: Numbers | None) -> tuple[State, float]:
-    like, n = run.last_fitted()[0].q, run.data.dof
-    q, p = (torch.atleast_1d(torch.as_tensor(x, dtype=like.dtype)) for x in (q0, p0))
-    if q.shape[-1] != n or p.shape != q.shape:
-        raise InputError(f"q0 and p0 need {n} numbers each, one a coordinate; got {tuple(q.shape)}, {tuple(p.shape)}")
+def _given(
+    run: FittedRun, q0: Numbers, moving: tuple[Numbers | None, Numbers | None], s0: Numbers | None, h: Tensor
+) -> State:
+    """The state of a position, and a velocity or a momentum."""
+    like, n, name = run.last_fitted()[0].q, run.data.dof, "p0" if moving[0] is None else "v0"
+    q, x = (torch.atleast_1d(torch.as_tensor(y, dtype=like.dtype)) for y in (q0, moving[name == "p0"]))
+    if q.shape[-1] != n or x.shape != q.shape:
+        raise InputError(
+            f"q0 and {name} need {n} numbers each, one a coordinate; got {tuple(q.shape)}, {tuple(x.shape)}"
+        )
     s = q.new_zeros(q.shape[:-1]) if s0 is None else torch.as_tensor(s0, dtype=like.dtype).expand(q.shape[:-1])
-    return State(q, p, s), 0.0
+    return State(q, x, s) if name == "p0" else run.stepper.init_qv(q, x, s, h)
 
 
 def _inputs(

@@ -19,6 +19,7 @@ from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper, state_of
+from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
@@ -45,6 +46,7 @@ class Prediction:
     outside: float  # share of model steps that are shorter or longer than those of the training data
     zeros: tuple[float, ...] = ()  # of the sensors, (n,), that were taken off the recording; empty: 0
     beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit, farthest first: the model extrapolates there
+    v: Tensor | None = None  # (N, n) velocities of the states, in units of q over that of t
 
     def __repr__(self) -> str:
         rms = "failed" if self.rms is None else f"{self.rms:.3g}"
@@ -90,7 +92,8 @@ class Prediction:
         counts = [k if k >= 3 else 0 for k in counts]
         if not any(counts):
             return None
-        whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None)
+        v = None if self.v is None else self.v.nan_to_num()
+        whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None, v=v)
         return whole.rows(leading_rows(self.data.lengths, counts), tuple(filter(None, counts)))
 
     def metrics(self) -> dict[str, Any]:
@@ -163,13 +166,7 @@ def predict(
         data = data.thinned(every)
     if windows is not None or horizon is not None:
         data = _windows(data, warmup, windows, horizon)
-    for b, length in enumerate(data.lengths):
-        if length < warmup + 2:
-            thinned = f", every {every} of the recording" if every > 1 else ""
-            raise InputError(
-                f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs "
-                f"at least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
-            )
+    _check_lengths(data, warmup, every)
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)
     grid = _free_run(run.stepper, data, states, warmup, high)
@@ -177,7 +174,11 @@ def predict(
     h = grid.h[inside]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
-    found = Prediction(data, state_of(states), warmup, every, most, outside, zeros)
+    model, x = run.model, state_of(states)
+    # Where a recorded step is crossed in several, p is that of the last of them.
+    step = run.h if most == 1 else float(h.median())
+    v = velocities(model, x, torch.tensor(step))
+    found = Prediction(data, x, warmup, every, most, outside, zeros, v=v)
     return replace(found, beyond=_beyond(run.box, found))
 
 
@@ -214,13 +215,26 @@ def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
     data = with_waves(data, run.config.frequencies)
     data = data if data.u is None else with_input_terms(data, input_terms_of(wanted.columns))
     u = data.u if run.model.inputs else None
-    p = None if data.p is None else data.p[:, at]
+    p, v = (None if x is None else x[:, at] for x in (data.p, data.v))
     called = {data.names[i]: name for i, name in zip(at, wanted.names, strict=True)}
     data = replace(
-        data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
+        data, q=data.q[:, at], p=p, v=v, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
         columns=tuple((called.get(name, name), role, unit) for name, role, unit in data.columns),
     )  # fmt: skip
     return acting(data, run.arrival)  # other recordings that say nothing are like those of the fit
+
+
+def _check_lengths(data: Trajectories, warmup: int, every: int) -> None:
+    """Raise unless every trajectory goes on for two samples after its warm-up."""
+    length = min(data.lengths)
+    if length >= warmup + 2:
+        return
+    thinned = f", every {every} of the recording" if every > 1 else ""
+    shorter = f"use --warmup {max(3, length // 2)} or a longer recording"
+    raise InputError(
+        f"{data.source or 'data'}: trajectory {data.lengths.index(length)} has {length} samples{thinned}; a warm-up of "
+        f"{warmup} needs at least {warmup + 2}: {shorter if length >= 5 else 'leave it out, for none is short enough'}"
+    )
 
 
 def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:
@@ -239,12 +253,25 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
     if not found:
         raise InputError(
             f"{data.source or 'data'}: no trajectory holds {warmup} samples and a time of {horizon:g} after them (at "
-            "least two samples there); use a shorter --horizon or --warmup"
+            f"least two samples there); {_shorter(data, warmup, horizon)}"
         )
     chosen = torch.linspace(0, len(found) - 1, min(count, len(found))).round().long().tolist()
     spans = [found[k] for k in chosen]
     rows = torch.cat([torch.arange(a, b) for a, b in spans])
     return data.rows(rows, tuple(b - a for a, b in spans))
+
+
+def _shorter(data: Trajectories, warmup: int, horizon: float) -> str:
+    """The largest warm-up and the longest time that the recording has room for, as a remedy."""
+    times = [data.t[a : a + k] for a, k in zip(data.offsets, data.lengths, strict=True)]
+    most = max(min(int((t + horizon * (1 - 1e-9) <= t[-1]).sum()), len(t) - 2) for t in times)
+    left = max((float(t[-1] - t[warmup - 1]) for t in times if len(t) >= warmup + 2), default=0.0)
+    shortest = min(float((t[2:] - t[:-2]).min()) for t in times)
+    words = [f"--warmup {most}"] if 3 <= most < warmup and horizon >= shortest else []
+    if left > 0 and not shortest <= horizon <= left:
+        digits = 10.0 ** (3 - math.floor(math.log10(left)))
+        words.append(f"--horizon {math.floor(left * digits * (1 + 1e-9)) / digits:g}")
+    return f"use {' or '.join(words)}" if words else "use a longer recording"
 
 
 def _started(

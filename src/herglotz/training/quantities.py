@@ -20,9 +20,12 @@ DIMENSIONS = {
     "friction.viscous": (0, 1),
     "friction.coulomb": (1, 2),
     "friction.breakaway": (1, 2),
+    "friction.log_smooth": (1, 1),
+    "friction.log_stribeck": (1, 1),
     INPUT_MAP: (1, 2),  # per unit of the input
 }
-LOGARITHMS = ("kinetic.log", "friction.log")  # stored as logarithms: such a value has no unit
+# Stored as logarithms, and how often each is in the exponent: the entry C of the mass's factor counts as C².
+LOGARITHMS = {"kinetic.log_diagonal": 2, "friction.log_smooth": 1, "friction.log_stribeck": 1}
 
 
 @dataclass(frozen=True)
@@ -55,18 +58,33 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
             continue
         values = run.model.get_parameter(name).detach().reshape(-1)
         words = WORDS.get(name, name)
-        words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
         whose = f" of {run.data.names[i]}" if len(values) == run.data.dof > 1 else ""
+        if name == "kinetic.log_diagonal":  # the first coordinate's is 1
+            words, whose = _mass(run, i + 1)
         if name == INPUT_MAP and len(values) > 1:
             whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
         spread = float(std[name].reshape(-1)[i])
-        found.append(Quantity(name, words + whose, _unit(name, run, i), float(values[i]), spread))
+        value = float(values[i])
+        if (power := LOGARITHMS.get(name)) is not None:
+            value = math.exp(power * value)
+            spread *= power * value
+        found.append(Quantity(name, words + whose, _unit(name, run, i), value, spread))
     return found
+
+
+def _mass(run: Run, i: int) -> tuple[str, str]:
+    """What C_ii² of m = C Cᵀ is: the mass, or what of it moves where the coordinates before it are free."""
+    names = run.data.names
+    free = "" if run.model.config.diagonal else f" while {', '.join(names[:i])} {'is' if i == 1 else 'are'} free"
+    return WORDS["kinetic.log_diagonal"], f" of {names[i]}{free}, over that of {names[0]}"
 
 
 def _unit(name: str, run: Run, i: int) -> str:
     if name == "friction.input_zero":
         return run.data.input_labels[i][1]
+    if name == "kinetic.log_diagonal":
+        own, first = run.data.units[i + 1], run.data.units[0]
+        return "" if own == first or "1" in (own, first) else f"{first}²/{own}²"
     if name not in DIMENSIONS or run.data.time_unit in ("", "1"):
         return ""
     row, per = i, ""

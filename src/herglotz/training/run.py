@@ -48,7 +48,7 @@ class Run:
     data, train_lengths
         All N samples, and how many leading ones of each trajectory were trained on.
     states
-        q (N, n), p (N, n) and s (N,) at every sample; the first coordinate's mass is 1: its p is close to a velocity.
+        q (N, n), p (N, n) and s (N,) at every sample; `stepper.velocity(states, h)` has v.
     h, box, reading
         Typical step, in the data's unit of time; lowest and highest q, p, s of the training part; how data were read.
     """
@@ -202,21 +202,19 @@ class Run:
         ----------
         steps
             Number of steps K.
-        q0, p0, s0
-            Start, (..., n), (..., n), (...); left out, the last fitted state of `trajectory` (0). s0 is 0 by default.
-        t0
-            Time of the start; left out, that of the fitted state, or 0.
-        h
-            Step, in the data's unit of time; left out, the model's own, or those of recorded inputs.
+        q0, v0, s0, trajectory
+            Start, (..., n), (..., n), (...); left out, the last fitted state of this trajectory (0). s0 is 0 by
+            default; a momentum `p0` may stand in the place of the velocity v0.
+        t0, h
+            Time of the start; left out, that of the fitted state, or 0. Step, in the data's unit of time; left out, the
+            model's own, or those of recorded inputs.
         inputs
             Held (m,), a step each (K, m), or a recording (path or trajectories) whose inputs act at their own times.
-        trajectory
-            Whose last fitted state to start from.
 
         Returns
         -------
         Motion
-            t (K+1,), q and p (..., K+1, n), s (..., K+1), status (..., K).
+            t (K+1,), q, v and p (..., K+1, n), s (..., K+1), status (..., K).
 
         Raises
         ------
@@ -296,7 +294,7 @@ class Run:
         Raises
         ------
         InputError
-            If the kind is not known, or the extra that writes it is missing.
+            If the kind is not known, or its extra is missing.
         """
         return _above("export").export_run(self, path, kind, **settings)
 

@@ -187,6 +187,11 @@ def _bound(folder: Path) -> dict[str, bytes]:
         )
     manifest = _json(path, read_bytes(path))
     check_entries(Manifest, manifest, str(path), REMEDY)
+    if manifest["format"] > FORMAT:
+        raise InputError(
+            f"{folder}: is of format {manifest['format']}, written by herglotz {manifest['herglotz']}; this version "
+            f"reads formats up to {FORMAT}: install that one or a later one"
+        )
     contents = {}
     for name in FILES:
         contents[name] = read_bytes(folder / name)

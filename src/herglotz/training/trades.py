@@ -25,8 +25,8 @@ NEAR_LARGEST = 0.9  # pivots this near the largest are ties, and the first is ta
 WORDS = {
     "kinetic.log_diagonal": "the mass",
     "kinetic.off_diagonal": "the coupling of masses",
-    "potential.stiffness": "the stiffness k of the potential",
-    "potential.tilt": "the tilt b of the potential (a constant force at q = 0)",
+    "potential.stiffness": "the stiffness at q = 0",
+    "potential.tilt": "the constant force at q = 0, towards smaller q",
     "damping.rate": "the damping rate γ",
     "damping.drag": "the drag",
     "friction.viscous": "viscous friction",

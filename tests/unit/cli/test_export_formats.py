@@ -4,6 +4,7 @@ import json
 import shutil
 from argparse import Namespace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -82,7 +83,9 @@ def test_the_file_holds_a_model_card(tiny_onnx, tiny_run):
     run = load_run(tiny_run)
     assert card.startswith("Model of tiny.csv (sha256 ")
     assert run.summary() in card
-    assert f"For steps of {run.h:g} s, and positions theta " in card
+    # fails if the step of the recording, which the fit crosses in two, is beyond those of the file
+    assert run.data.typical_step == pytest.approx(2 * run.h)
+    assert f"For steps of {run.h:g} to {run.data.typical_step:g} s, and positions theta " in card
 
 
 def test_rollout_of_the_file_is_that_of_the_run(tiny_onnx, tiny_run, tmp_path):
@@ -100,10 +103,12 @@ def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
     # fails if a run or a file steps at any h in silence, or a motion leaves the data in silence
     out, motion = str(tmp_path / "a.h"), ["--steps", "3", "--out", str(tmp_path / "a.csv"), "--force"]
     assert main(["export", str(tiny_run), "--format", "c", "--out", out]) == 0
-    own = f"{load_run(tiny_run).h:g}"
-    for source in (out, str(tiny_run)):
+    own, text = f"{load_run(tiny_run).h:g}", Path(out).read_text()
+    assert "typical step in s: recorded" in text
+    assert "steps of the fit and of the recording in s" in text
+    for source, steps in ((out, f"{own} to 0.2"), (str(tiny_run), own)):
         assert main(["rollout", source, *motion, "--h", "0.05"]) == 0
-        note = f"note: steps of 0.05 s are outside of those that the model was fitted to, {own} s"
+        note = f"note: steps of 0.05 s are outside of those that the model was fitted to, {steps} s"
         assert note in " ".join(capsys.readouterr().err.split())
     assert main(["export", str(tiny_run), "--format", "c", "--out", out, "--h-range", "0.05", own, "--force"]) == 0
     assert main(["rollout", out, *motion, "--h", "0.05", "--q0", "0.1", "--p0", "0"]) == 0

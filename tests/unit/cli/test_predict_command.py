@@ -40,7 +40,7 @@ def test_files_and_words(tiny_run, other_csv, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "RMS theta" in text
     assert "rad" in text
-    assert out.read_text().startswith("trajectory,t[s],theta[rad],p_theta") or "theta[rad]" in out.read_text()
+    assert out.read_text().startswith("trajectory,t[s],theta[rad],theta_dot[rad/s]\n")
     assert (tmp_path / "motion.png").read_bytes()[:4] == b"\x89PNG"
 
 

@@ -44,6 +44,21 @@ def test_the_verdict_comes_first_and_everything_is_said(written, tiny_run):
     assert f"herglotz export {tiny_run}" in text
 
 
+def test_a_report_says_how_far_it_is(tiny_run, tmp_path, monkeypatch, capsys):
+    # fails if a minute of figures and checks passes in silence on a terminal, or a bar is drawn where none looks
+    empty = lambda *_: ()  # noqa: E731
+    for name in ("_equation", "_sliders", "_data", "_plan", "_errors", "_open", "_verification", "_speed", "_origin"):
+        monkeypatch.setattr(f"herglotz.report.write.{name}", empty)
+    command = ["report", str(tiny_run), "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert "section" not in capsys.readouterr().err
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    assert main(command) == 0
+    said = capsys.readouterr().err
+    assert "The learned equation" in said
+    assert "Where it comes from:  90%" in said
+
+
 def test_the_slider_holds_the_run(written, tiny_run):  # fails if data, model or the end of training are another's
     run = load_run(tiny_run)
     found = json.loads(re.findall(r'<script type="application/json">(.*?)</script>', written[0])[0])

@@ -182,7 +182,8 @@ def test_rollout_goes_on_where_training_ended(tiny_run, tmp_path, capsys):
     first = run.train_lengths[0] - 1
     each = round(run.data.typical_step / run.h)  # model steps in a recorded one
     steps = each * (run.data.samples - 1 - first)
-    code, found = run_json(capsys, "rollout", tiny_run, "--steps", steps, "--out", tmp_path / "a.csv")
+    rollout = ("rollout", tiny_run, "--steps", steps, "--out", tmp_path / "a.csv")
+    code, found = run_json(capsys, *rollout, "--momenta")
     assert (code, found["steps"]) == (0, steps)
     assert found["outside_from_step"] is None  # fails if s, which moves nothing here, is held to the training part's
     motion = load(tmp_path / "a.csv")
@@ -190,6 +191,12 @@ def test_rollout_goes_on_where_training_ended(tiny_run, tmp_path, capsys):
     torch.testing.assert_close(motion.q[::each], run.prediction[first:], rtol=0, atol=1e-10)
     assert motion.p is not None
     assert motion.s is not None
+    # fails if what nobody asked for is written, or a velocity is not that of the model: here its momentum
+    rows = (tmp_path / "a.csv").read_text().splitlines()
+    assert rows[0] == "trajectory,t[s],theta[rad],theta_dot[rad/s],s,p_theta"
+    assert all(float(row.split(",")[3]) == pytest.approx(float(row.split(",")[5]), abs=1e-12) for row in rows[1:])
+    assert run_json(capsys, *rollout, "--force")[1]["final"]["v"] == pytest.approx([float(rows[-1].split(",")[3])])
+    assert (tmp_path / "a.csv").read_text().startswith("trajectory,t[s],theta[rad],theta_dot[rad/s]\n")
 
 
 def test_rollout_of_a_file_is_that_of_the_run(tiny_run, exported_pt2, tmp_path):
@@ -208,13 +215,19 @@ def test_rollout_from_given_state(kind, tiny_run, tmp_path):  # fails if -1e-1 i
         pytest.importorskip("onnxruntime")
         source, h = str(tmp_path / "a.onnx"), 0.2
         assert main(["export", str(tiny_run), "--format", "onnx", "--out", source]) == 0
-    state = ["--q0", "-1e-1", "--p0", "0.5", "--s0", "0.25", "--h", str(h)]
+    state = ["--q0", "-1e-1", "--p0", "0.5", "--s0", "0.25", "--h", str(h), "--momenta"]
     assert main(["rollout", source, "--steps", "3", *state, "--out", str(tmp_path / "a.csv")]) == 0
     motion = load(tmp_path / "a.csv")
     assert motion.p is not None
     assert motion.s is not None
     assert (float(motion.q[0]), float(motion.p[0]), float(motion.s[0])) == (-0.1, 0.5, 0.25)
     torch.testing.assert_close(motion.t, h * torch.arange(4, dtype=torch.float64))
+    # fails if --v0 starts with another velocity, or a file does not know its velocities
+    state[2] = "--v0"
+    assert main(["rollout", source, "--steps", "3", *state, "--out", str(tmp_path / "a.npz")]) == 0
+    motion = load(tmp_path / "a.npz")
+    assert motion.v is not None
+    assert float(motion.v[0]) == pytest.approx(0.5, rel=1e-12)
 
 
 def test_export(exported_pt2):

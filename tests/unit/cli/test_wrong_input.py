@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from herglotz.cli import main
+from herglotz.training.run_folder import FORMAT
 
 GOOD = "t[s],theta[rad]\n" + "".join(f"{k / 10},{1 - k / 50}\n" for k in range(30))
 BAD_FILES = {
@@ -170,6 +171,9 @@ def test_help_is_asked_for_in_words(capsys, asked):  # fails if a newcomer who t
         (["--steps", "5", "--q0", "1"], "go together"),
         (["--steps", "5", "--q0", "1", "2", "--p0", "0"], "--q0 needs 1 number"),
         (["--steps", "5", "--q0", "inf", "--p0", "0"], "finite"),
+        (["--steps", "5", "--v0", "1"], "--q0 and --v0 (or --p0, the momentum) go together"),
+        (["--steps", "5", "--q0", "1", "--v0", "1", "--p0", "0"], "--v0 and --p0 both say how fast the start is"),
+        (["--steps", "5", "--q0", "1", "--v0", "1", "2"], "--v0 needs 1 number"),
         (["--steps", "5", "--trajectory", "7"], "there is no trajectory 7"),
         (["--steps", "-5"], "whole number"),
         (["--steps", "5", "--u", "1"], "--u needs no number(s)"),
@@ -210,3 +214,12 @@ def test_wrong_entries_of_a_run(tmp_path, capsys, tiny_run, where, value, messag
     manifest["files"]["metrics.json"] = hashlib.sha256((run / "metrics.json").read_bytes()).hexdigest()
     (run / "manifest.json").write_text(json.dumps(manifest))
     assert message in mistake(capsys, tmp_path, "trust", run)
+
+
+def test_a_run_of_a_newer_format_is_refused(tmp_path, capsys, tiny_run):
+    # fails if a folder that this version does not understand is read, or called damaged
+    run = shutil.copytree(tiny_run, tmp_path / "run")
+    manifest = json.loads((run / "manifest.json").read_text())
+    (run / "manifest.json").write_text(json.dumps(manifest | {"format": FORMAT + 1, "herglotz": "9.1", "files": {}}))
+    said = mistake(capsys, tmp_path, "trust", run)
+    assert f"is of format {FORMAT + 1}, written by herglotz 9.1; this version reads formats up to {FORMAT}" in said

@@ -343,3 +343,11 @@ def test_structs_of_matlab(tmp_path):  # fails if a struct is "no header", or se
         savemat(path, wrong)
         with pytest.raises(InputError, match=message):
             load(path)
+
+
+@pytest.mark.parametrize("name", ["a.xlsx", "a.XLS", "a.ods"])
+def test_a_spreadsheet_is_told_to_become_a_csv(tmp_path, name):
+    # fails if a user with an Excel file is told ten formats in the place of what to do
+    (tmp_path / name).write_bytes(b"PK\x03\x04 and more")
+    with pytest.raises(InputError, match=r"is a spreadsheet; save the sheet as \.csv .*read_excel"):
+        load(tmp_path / name)

@@ -121,22 +121,31 @@ def formats_of(model) -> dict[str, ExportedStepper]:
     entries = describe(model, H, None, (), 30, {"h_range": None})
     names = ("q", "p", "s", "h", *(("u",) if model.inputs else ()))
     with quiet():
-        program = programs_of(model, entries, ("linearise",))["linearise"]
+        programs = programs_of(model, entries, ("linearise", "legendre"))
+        program, legendre = programs["linearise"], programs["legendre"]
         content = graph_of(program, names, (*OUTPUTS[:-1], "jacobian"), {})
+        outputs = ("L_v", "L_vv", "grip", "grip_by_v")[: 4 if model.capabilities.sticking else 2]
+        second = graph_of(legendre, ("q", "v", "s", "h"), outputs, {})
     options = ort.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = 1, 4
-    session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
-    def run(*x):
-        feeds = {name: y.numpy() for name, y in zip(names, x, strict=True)}
-        return tuple(torch.from_numpy(y) for y in session.run(None, feeds))
+    def program_of(content, names):
+        session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
-    def file(kind, linearise):
-        return ExportedStepper({"rollout": linearise, "linearise": linearise}, entries, kind=kind)
+        def run(*x):
+            feeds = {name: y.numpy() for name, y in zip(names, x, strict=True) if name in read}
+            return tuple(torch.from_numpy(y) for y in session.run(None, feeds))
+
+        read = {x.name for x in session.get_inputs()}
+        return run
+
+    def file(kind, linearise, legendre):
+        return ExportedStepper({"rollout": linearise, "linearise": linearise, "legendre": legendre}, entries, kind=kind)
 
     header = c_source(model, described(model, entries, "model", "float64", None), "stepper.h")
-    pt2 = program.module(check_guards=False)
-    return {"c": compiled(header), "pt2": file("pt2", pt2), "onnx": file("onnx", run)}
+    pt2 = [x.module(check_guards=False) for x in (program, legendre)]
+    onnx = [program_of(content, names), program_of(second, ("q", "v", "s", "h"))]
+    return {"c": compiled(header), "pt2": file("pt2", *pt2), "onnx": file("onnx", *onnx)}
 
 
 @pytest.fixture
@@ -165,7 +174,7 @@ def _quick_compiler(tmp_path_factory):
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.usefixtures("_traced_once")
 def test_a_term_steps_in_every_format(case):
-    # fails if a format refuses a term, leaves it out of a step, or has another derivative of it
+    # fails if a format refuses a term, leaves it out of a step, has another derivative of it, or another velocity
     pytest.importorskip("onnx")
     model = model_of(case)
     state, inputs = problem(model)
@@ -191,6 +200,14 @@ def test_a_term_steps_in_every_format(case):
                     if a is not None and b is not None:
                         assert float((a - b).abs().max()) <= 1e-11 * float(b.abs().max()), form
             state = found.step.state
+        # p stands for a velocity here, and then for a momentum.
+        q, p, s = path[0]
+        torch.testing.assert_close(
+            file.init_qv(q, p, s, H).p, eager.init_qv(q, p, s, H).p.detach(), rtol=1e-12, atol=1e-12
+        )
+        torch.testing.assert_close(
+            file.velocity(path[0], H), eager.velocity(path[0], H).detach(), rtol=1e-12, atol=1e-12
+        )
 
 
 def kinds(config: ModelConfig) -> Iterator[tuple]:

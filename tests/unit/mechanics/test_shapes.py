@@ -124,3 +124,33 @@ def test_a_step_a_sample_with_one_position_for_all():
     many, one = partials(L_d, f64(0.3), f64(0.7), f64(0.2)[0], h), partials(L_d, f64(0.3), f64(0.7), f64(0.2)[0], h[1])
     assert many.D1.shape == (3, 1)
     torch.testing.assert_close((many.D1[1], many.D3[1]), (one.D1, one.D3))
+
+
+class Short(torch.nn.Module):
+    def forward(self, q0, q1, h):
+        return (q1 - q0).square().sum(-1) / (2 * h)
+
+
+def short(q0, q1, h):
+    return (q1 - q0).square().sum(-1) / (2 * h)
+
+
+@pytest.mark.parametrize(("L_d", "name"), [(short, "short"), (Short(), "Short")])
+def test_an_L_d_of_three_arguments_is_told_what_to_take(L_d, name):
+    # fails if Python's own error, which has no remedy, is what a user of L_d(q0, q1, h) sees at one of the doors
+    for call in (
+        lambda: Stepper(L_d).step(State(Q, P, S), 0.1),
+        lambda: Stepper(L_d).velocity(State(Q, P, S), 0.1),
+        lambda: value(L_d, Q, Q, S, 0.1),
+    ):
+        with pytest.raises(InputError, match=rf"{name} must take four arguments, L_d\(q0, q1, s0, h\): .* 0 \* s0"):
+            call()
+
+
+def test_a_mistake_inside_an_L_d_is_its_own():
+    # fails if a function inside that is called wrongly is said to be a wrong number of arguments of L_d
+    def wrong(q0, q1, s0, h):
+        return short(q0, q1, s0, h)  # pyright: ignore[reportCallIssue]
+
+    with pytest.raises(TypeError, match="takes 3 positional arguments"):
+        Stepper(wrong).step(State(Q, P, S), 0.1)

@@ -1,6 +1,7 @@
 """What a run offers beside its numbers: rollouts in numpy, pictures, files, words."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ def test_a_rollout_is_numpy_without_gradients():
     run = fake_run(trajectories=2)
     first = run.data.offsets[1] + run.train_lengths[1] - 1
     found = run.rollout(5, trajectory=1)
-    assert all(isinstance(x, np.ndarray) for x in (found.t, found.q, found.p, found.s, found.status))
+    assert all(isinstance(x, np.ndarray) for x in (found.t, found.q, found.v, found.p, found.s, found.status))
     np.testing.assert_allclose(found.q, run.prediction[first : first + 6].detach().numpy(), atol=1e-10)
     np.testing.assert_allclose(found.t, run.data.t[first : first + 6], atol=1e-12)
     assert found.ok
@@ -33,7 +34,7 @@ def test_a_start_may_be_numbers_or_a_batch():  # fails if a number, a list or an
     many = run.rollout(4, q0=np.array([[1.0], [0.3]]), p0=[[0.2], [0.0]], h=0.2)
     assert (one.s[0], one.t[-1], many.q.shape) == (0.5, 3.8, (2, 5, 1))
     np.testing.assert_allclose(one.q, many.q[0], atol=1e-12)
-    with pytest.raises(InputError, match="q0 and p0 go together"):
+    with pytest.raises(InputError, match=r"q0 and v0 .* go together"):
         run.rollout(4, q0=1.0)
     with pytest.raises(InputError, match="q0 and p0 need 1 numbers each"):
         run.rollout(4, q0=[1.0, 2.0], p0=[0.0, 0.0])
@@ -112,3 +113,21 @@ def test_settings_by_name():
     assert hz.FitConfig().changed({"features": "cos(q1)", "departures": 0.5}).features == ("cos(q1)",)
     assert torch.get_num_threads() >= 1
     assert isinstance(fake_run().rollout(2), Motion)
+
+
+def test_velocities_in_and_out():
+    # fails if v0 is taken for a momentum, v is not the slope of the motion, or what a rollout lost has one
+    run = fake_run(level="affine")
+    damping: Any = run.model.damping
+    with torch.no_grad():
+        damping.drag.fill_(0.3)
+    one = run.rollout(40, q0=1.0, v0=0.2, s0=0.5)
+    assert one.v[0] == pytest.approx(0.2, rel=1e-12)
+    assert abs(one.p[0] - 0.2) > 0.1
+    np.testing.assert_allclose(one.v[1:-1], (one.q[2:] - one.q[:-2]) / 0.4, atol=0.02)  # h² q‴/6
+    many = run.rollout(4, q0=[[1.0], [0.3]], v0=[[0.2], [0.0]], s0=[0.5, 0.0])
+    np.testing.assert_allclose(many.v[0], one.v[:5], atol=1e-12)
+    with pytest.raises(InputError, match="v0 and p0 both say how fast the start is"):
+        run.rollout(4, q0=1.0, v0=0.2, p0=0.2)
+    with pytest.raises(InputError, match="q0 and v0 need 1 numbers each"):
+        run.rollout(4, q0=[1.0, 2.0], v0=[0.0, 0.0])

@@ -1,7 +1,9 @@
 """Numbers of a model that are 0 and no unknowns of a fit."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -97,9 +99,23 @@ def test_numbers_that_were_not_learned_have_no_uncertainty():
     posterior = SimpleNamespace(problem=SimpleNamespace(parameters=vector), standard_deviations=lambda: spread)
     data = Trajectories.of(torch.arange(3.0), torch.zeros(3, 2), (3,), names=("a", "b"))
     found = quantities(posterior, SimpleNamespace(model=model, data=data))  # pyright: ignore
-    assert [x.words for x in found if x.name == "potential.stiffness"] == ["the stiffness k of the potential of b"]
+    assert [x.words for x in found if x.name == "potential.stiffness"] == ["the stiffness at q = 0 of b"]
     assert [x.words for x in found if x.name == "friction.viscous"] == ["viscous friction of a"]
-    assert all(x.std == 1.0 for x in found)
+    assert all(x.std == 1.0 for x in found if not x.name.startswith("kinetic"))
+
+
+def test_what_is_stored_as_a_logarithm_is_told_as_what_it_is():
+    # fails if an engineer is told the logarithm of a mass or of a speed, or a spread that is not theirs
+    model: Any = two_bodies()
+    with torch.no_grad():
+        model.kinetic.log_diagonal.fill_(0.5 * math.log(3.0))
+    spread = {name: 0.01 * torch.ones_like(p) for name, p in model.named_parameters()}
+    parameters = SimpleNamespace(parameters=ParameterVector(model))
+    posterior = SimpleNamespace(problem=parameters, standard_deviations=lambda: spread)
+    data = Trajectories.of(torch.arange(3.0), torch.zeros(3, 2), (3,), names=("a", "b"), units=("m", "mm"))
+    (mass,) = (x for x in quantities(posterior, SimpleNamespace(model=model, data=data)) if "kinetic" in x.name)  # pyright: ignore
+    assert (mass.words, mass.unit) == ("the mass of b, over that of a", "m²/mm²")
+    assert (mass.value, mass.std) == (pytest.approx(3.0), pytest.approx(0.06))
 
 
 @pytest.mark.parametrize("order", [2, 4])

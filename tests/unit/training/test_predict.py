@@ -1,5 +1,6 @@
 """`Run.predict`: a recording of the model's own motion is predicted exactly, whatever its steps and inputs."""
 
+import re
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -215,6 +216,47 @@ def test_mistakes_say_what_to_do():
     for settings, message in cases:
         with pytest.raises(InputError, match=message):
             predict(run, **{"data": data, **settings})
+
+
+@pytest.mark.parametrize(
+    "settings", [{"warmup": 80}, {"warmup": 60, "windows": 2, "horizon": 5.0}, {"windows": 2, "horizon": 99.0},
+                 {"windows": 1, "horizon": 1e-3}],
+)  # fmt: skip
+def test_what_a_refused_prediction_names_works(settings):
+    # fails if the warm-up or the horizon that the message names is refused as well: of two trajectories the shorter one
+    # decides, and of a window both together
+    model = model_of("linear")
+    run, data = run_of(model), recording(model)
+    if "windows" not in settings:
+        data = data.rows(torch.arange(data.lengths[0] + 11), (data.lengths[0], 11))
+    with pytest.raises(InputError) as refused:
+        predict(run, data, **settings)
+    named = re.findall(r"--(warmup|horizon) ([\d.e-]*\d)", str(refused.value))
+    assert named
+    for name, number in named:
+        instead = settings | {name: int(number) if name == "warmup" else float(number)}
+        assert predict(run, data, **instead).rms is not None
+
+
+def test_predicted_velocities_are_those_of_the_motion():
+    # fails if a prediction's v is its momentum's place holder, or another sample's
+    model = model_of("linear")
+    run, data = run_of(model), recording(model)
+    found = predict(run, data)
+    assert found.v is not None
+    q, v = (x.reshape(2, -1) for x in (found.states.q, found.v))
+    torch.testing.assert_close(v[:, 1:-1], (q[:, 2:] - q[:, :-2]) / (2 * H), rtol=0, atol=0.05)
+    motion = found.motion()
+    assert motion is not None
+    torch.testing.assert_close(motion.v, found.v, rtol=0, atol=0)
+
+
+def test_no_warm_up_is_named_where_none_works():
+    # fails if a trajectory of four samples, which no warm-up of three leaves two of, is told --warmup 3
+    model = model_of("linear")
+    data = recording(model)
+    with pytest.raises(InputError, match="needs at least 22: leave it out, for none is short enough"):
+        predict(run_of(model), data.rows(torch.arange(85), (81, 4)))
 
 
 def test_coordinates_are_found_by_name():

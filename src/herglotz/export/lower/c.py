@@ -139,10 +139,11 @@ class Emitted(NamedTuple):
 
     tables: str
     step: str  # types and functions of `REAL` and `FN_`
+    momentum: str  # the Legendre transform, "" unless asked for
     slopes: str  # the derivative of a step
 
 
-def model_source(step: StepInC, equations: Equations, derivatives: bool) -> Emitted:
+def model_source(step: StepInC, equations: Equations, derivatives: bool, velocities: bool = True) -> Emitted:
     """The emitted parts of a header, with constants as `R(0.5)`."""
     program = Program(tables=step.program.tables)
     q = program.given("q", step.n)
@@ -156,11 +157,12 @@ def model_source(step: StepInC, equations: Equations, derivatives: bool) -> Emit
     texts = TYPES.format(push=push, problem=step.members("P"),
                          terms=step.members("t")) + whole(program, head, outputs) + step.source()  # fmt: skip
     slopes = _slopes_source(equations, step) if derivatives else ""
+    momentum = _momentum_source(equations, step) if velocities else ""
     tables = "".join(
         f"static const hz_real {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
         for row, name in step.program.tables.items()
     )
-    return Emitted(tables, texts, slopes)
+    return Emitted(tables, texts, momentum, slopes)
 
 
 TYPES = """
@@ -197,3 +199,16 @@ def _slopes_source(equations: Equations, step: StepInC) -> str:
     head = "\n/* d(q, p, s)' / d(q, p, s, h, push) at the solution q1 = q0 + move, row by row. */\n"
     head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
     return whole(program, head, {"slopes": list(slopes.ravel())})
+
+
+def _momentum_source(equations: Equations, step: StepInC) -> str:
+    """The Legendre transform p = L_v as a C function: `herglotz.stepping.velocity`."""
+    program, n = Program(tables=step.program.tables), step.n
+    sizes = {"q": n, "v": n, "s": 0, "h": 0}
+    arrays = interpret(program, equations.momentum, [program.given(name, size) for name, size in sizes.items()])
+    named = zip(("p", "by_v", "grip", "grip_by_v"), arrays, strict=False)
+    outputs = {name: list(x.ravel()) for name, x in named}
+    head = "\n/* L_v and L_vv at (q, v, s); of set-valued friction (h/2) r(q, v) and its slope by v. */\n"
+    head += "static inline void FN_momentum(const REAL q[hz_N], const REAL v[hz_N], REAL s, REAL h,\n    "
+    head += ", ".join(f"REAL {name}[{'hz_N * hz_N' if name == 'by_v' else 'hz_N'}]" for name in outputs)
+    return whole(program, f"{head})", outputs)

@@ -29,7 +29,8 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     Inputs q, p (B, n), s (B,) and h (K, B), a row a step; K = 1 is one step. Outputs q, p (K, B, n), the others (K, B):
     what steps 1 … K give. Batch size and number of steps are free. A model with inputs takes u (K, B, m) after h.
     A failed step has a status other than 0, and NaN from there on. The entry `herglotz_init` of the model's metadata is
-    a second, small ONNX model in base 64: the state from two positions, q0, q1 (B, n), s0, h (B,)[, u] → p, s at q1.
+    a second, small ONNX model in base 64: the state from two positions, q0, q1 (B, n), s0, h (B,)[, u] → p, s at q1;
+    `herglotz_legendre` has p = L_v and L_vv at q, v (B, n), s, h (B,).
 
     The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`. Raise
     InputError if onnx is not installed, an argument is not usable, or the file cannot be written.
@@ -40,13 +41,16 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
         raise InputError(f"ONNX export needs {error.name}; install it with: pip install 'herglotz[export]'") from None
     text = to_json(entries)
     with quiet():
-        programs = programs_of(model, entries, ("rollout", "linearise", "init"))
+        programs = programs_of(model, entries, ("rollout", "linearise", "init", "legendre"))
     u = ("u",) if entries["inputs"] else ()
     said = OUTPUTS if entries["box"] is not None else OUTPUTS[:-1]
     further = {"init": (("q0", "q1", "s0", "h"), ("p", "s")), "linearise": (("q", "p", "s", "h"), (*said, "jacobian"))}
     properties = {KEY: text}
+    further = {name: ((*inputs, *u), outputs) for name, (inputs, outputs) in further.items()}
+    legendre = ("L_v", "L_vv", "grip", "grip_by_v") if entries["model"]["sticking"] else ("L_v", "L_vv")
+    further["legendre"] = ("q", "v", "s", "h"), legendre
     for name, (inputs, outputs) in further.items():
-        second = graph_of(programs[name], (*inputs, *u), outputs, {})
+        second = graph_of(programs[name], inputs, outputs, {})
         properties[f"{KEY}_{name}"] = base64.b64encode(second).decode()
     content = graph_of(programs["rollout"], ("q", "p", "s", "h", *u), said, properties)
     return sealed_onnx(content)

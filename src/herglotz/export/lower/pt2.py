@@ -15,10 +15,10 @@ from herglotz.models import ContactLagrangian
 def export_pt2(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     """Write the model's flow as a `.pt2` file: graphs of tensor operations that any PyTorch of this version runs.
 
-    It holds four programs. `model`, the one that `torch.export.load(path).module()` gives on a machine without
+    It holds five programs. `model`, the one that `torch.export.load(path).module()` gives on a machine without
     herglotz, is one step (q, p, s, h) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state;
     `rollout` is K steps with both loops inside; `linearise` is one step and its Jacobian; `init` makes (p1, s1) from
-    (q0, q1, s0, h). The batch size is free and
+    (q0, q1, s0, h); `legendre` (q, v, s, h) has p = L_v and its slope L_vv. The batch size is free and
     every step h > 0 is accepted. A model with inputs takes u after h. With a box, outside is 1 where a step starts or
     ends beyond it, plus 2 where h is beyond `h_range`.
 
@@ -52,7 +52,7 @@ def export_pt2(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
         If h, box, units or metadata are not usable, or the file cannot be written.
     """
     with quiet():
-        programs = programs_of(model, entries, ("model", "rollout", "linearise", "init"))
+        programs = programs_of(model, entries, ("model", "rollout", "linearise", "init", "legendre"))
         from torch.export.pt2_archive._package import package_pt2  # what torch.export.save calls for a single program
 
         buffer = io.BytesIO()

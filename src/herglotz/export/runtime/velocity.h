@@ -1,0 +1,142 @@
+/* Velocities in and out: p = L_v(q, v, s) and its inverse. Where dry friction can hold a coordinate, p has half of its
+   impulse besides, +-(h/2) r(q, v), and the inverse asks for a number z of which v is what lies beyond a bound, as the
+   move of a step does. */
+
+#define hz_VELOCITIES
+
+/* What hz_momentum gives, with zeros where nothing is set-valued. */
+typedef struct {
+  hz_real p[hz_N], by_v[hz_N * hz_N], grip[hz_N], grip_by_v[hz_N];
+} hz_legendre;
+
+static inline void hz_legendre_at(const hz_real q[hz_N], const hz_real v[hz_N], hz_real s, hz_real h, hz_legendre *at) {
+#if hz_STICKING
+  hz_momentum(q, v, s, h, at->p, at->by_v, at->grip, at->grip_by_v);
+#else
+  int i;
+  hz_momentum(q, v, s, h, at->p, at->by_v);
+  for (i = 0; i < hz_N; i++) at->grip[i] = at->grip_by_v[i] = hz_R(0.0);
+#endif
+}
+
+static inline hz_real hz_beyond(hz_real z, hz_real bound) {
+  return z > bound ? z - bound : z < -bound ? z + bound : hz_R(0.0);
+}
+
+/* x = A^-1 x by Gauss with row exchanges; A is lost. */
+static inline void hz_eliminate(hz_real A[hz_N * hz_N], hz_real x[hz_N]) {
+  int i, j, k;
+  for (k = 0; k < hz_N; k++) {
+    int best = k;
+    hz_real other;
+    for (i = k + 1; i < hz_N; i++)
+      if (hz_fabs(A[i * hz_N + k]) > hz_fabs(A[best * hz_N + k])) best = i;
+    for (j = 0; j < hz_N; j++) {
+      other = A[best * hz_N + j];
+      A[best * hz_N + j] = A[k * hz_N + j];
+      A[k * hz_N + j] = other;
+    }
+    other = x[best];
+    x[best] = x[k];
+    x[k] = other;
+    for (i = k + 1; i < hz_N; i++) {
+      const hz_real factor = A[i * hz_N + k] / A[k * hz_N + k];
+      for (j = k + 1; j < hz_N; j++) A[i * hz_N + j] -= factor * A[k * hz_N + j];
+      x[i] -= factor * x[k];
+    }
+  }
+  for (i = hz_N - 1; i >= 0; i--) {
+    for (j = i + 1; j < hz_N; j++) x[i] -= A[i * hz_N + j] * x[j];
+    x[i] /= A[i * hz_N + i];
+  }
+}
+
+static inline hz_real hz_largest(const hz_real x[hz_N]) {
+  hz_real size = hz_R(0.0);
+  int i;
+  for (i = 0; i < hz_N; i++) size = hz_fabs(x[i]) > size ? hz_fabs(x[i]) : size;
+  return size;
+}
+
+/* The state at q with the velocity v, in hz_units over the unit of time, and the action s; sigma starts at 1. h is the
+   step that the motion goes on with: it matters where dry friction can hold a coordinate, and is checked as that of a
+   step. `out` is written on success only. Returns a status. */
+static inline int hz_init_qv(const hz_real q[hz_N], const hz_real v[hz_N], hz_real s, hz_real h, hz_state *out) {
+  hz_legendre at;
+  hz_state next;
+  int i;
+  for (i = 0; i < hz_N; i++) {
+    next.q[i] = q[i];
+    next.p[i] = v[i];
+  }
+  next.s = s;
+  next.sigma = hz_R(1.0);
+  if (hz_before(&next, h)) return hz_BAD_INPUT;
+  hz_legendre_at(q, v, s, h, &at);
+  for (i = 0; i < hz_N; i++)
+    next.p[i] = at.p[i] + (v[i] > hz_R(0.0) ? at.grip[i] : v[i] < hz_R(0.0) ? -at.grip[i] : hz_R(0.0));
+  if (!hz_all_finite(next.p)) return hz_DIVERGED;
+  *out = next;
+  return hz_outside_box(out) | hz_outside_h(h);
+}
+
+/* The velocity of a state that steps of h have made: the inverse of hz_init_qv, by Newton from rest; a move that does
+   not lessen what is left of p is halved. `v` is written on success only. Returns a status: hz_SINGULAR or
+   hz_MAX_ITERATIONS where no velocity with this p is found. */
+static inline int hz_velocity(const hz_state *state, hz_real h, hz_real v[hz_N]) {
+  hz_legendre at;
+  hz_real z[hz_N], base[hz_N], move[hz_N], own[hz_N], bound[hz_N], G[hz_N], A[hz_N * hz_N], now[hz_N];
+  hz_real scale = hz_R(0.0), merit, before = hz_R(0.0), last = hz_R(0.0), part = hz_R(1.0);
+  int i, j, sweep, iteration, better;
+  const int status = hz_before(state, h);
+  if (status) return status;
+  for (i = 0; i < hz_N; i++) z[i] = move[i] = base[i] = now[i] = hz_R(0.0);
+  hz_legendre_at(state->q, z, state->s, h, &at);
+  for (i = 0; i < hz_N; i++) {
+    own[i] = hz_fabs(at.by_v[i * hz_N + i]);
+    bound[i] = hz_STICKING ? at.grip[i] / own[i] : hz_R(0.0);
+  }
+  for (sweep = 0; hz_STICKING && sweep < 8; sweep++) /* of Gauss and Seidel: which coordinates stand still */
+    for (i = 0; i < hz_N; i++) {
+      z[i] = state->p[i] - at.p[i];
+      for (j = 0; j < hz_N; j++)
+        if (j != i) z[i] -= at.by_v[i * hz_N + j] * hz_beyond(z[j], bound[j]);
+      z[i] /= own[i];
+    }
+  for (iteration = 0; iteration <= hz_max_iterations; iteration++) {
+    for (i = 0; i < hz_N; i++) now[i] = hz_beyond(z[i], bound[i]);
+    hz_legendre_at(state->q, now, state->s, h, &at);
+    for (i = 0; i < hz_N; i++) {
+      const int slides = !hz_STICKING || now[i] != hz_R(0.0);
+      const hz_real sign = now[i] > hz_R(0.0) ? hz_R(1.0) : hz_R(-1.0);
+      G[i] = state->p[i] - at.p[i] - (slides ? sign * at.grip[i] : own[i] * z[i]);
+      for (j = 0; j < hz_N; j++)
+        A[j * hz_N + i] = slides ? at.by_v[j * hz_N + i] : hz_R(0.0);
+      A[i * hz_N + i] += slides ? sign * at.grip_by_v[i] : own[i];
+    }
+    merit = hz_largest(G);
+    better = !iteration || merit <= (hz_R(1.0) - hz_R(1e-4) * part) * before;
+    if (!hz_all_finite(G)) {
+      if (!iteration) return hz_DIVERGED;
+    } else if (better || merit <= hz_floor * hz_largest(state->p)) { /* the last digits need not lessen */
+      hz_eliminate(A, G);
+      if (!hz_all_finite(G)) return hz_SINGULAR;
+      last = hz_largest(G);
+      if (!iteration) scale = last > hz_largest(z) ? last : hz_largest(z);
+      for (i = 0; i < hz_N; i++) {
+        base[i] = z[i];
+        move[i] = G[i];
+        z[i] += G[i];
+      }
+      if (last <= hz_floor * scale) break;
+      before = merit;
+      part = hz_R(1.0);
+      continue;
+    }
+    part /= hz_R(2.0);
+    for (i = 0; i < hz_N; i++) z[i] = base[i] + part * move[i];
+  }
+  if (iteration > hz_max_iterations) return hz_MAX_ITERATIONS;
+  for (i = 0; i < hz_N; i++) v[i] = hz_beyond(z[i], bound[i]);
+  return hz_outside_box(state) | hz_outside_h(h);
+}
