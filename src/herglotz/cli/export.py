@@ -12,7 +12,13 @@ from herglotz.errors import InputError
 # File extension of each format.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
 SUFFIX |= {"casadi": ".c", "acados": ".c", "fmu": ".fmu", "fmu2": ".fmu"}
-FORMAT = {".pt2": "pt2", ".onnx": "onnx", ".h": "c", ".c": "casadi", ".fmu": "fmu"}  # of a file whose format is not named
+FORMAT = {
+    ".pt2": "pt2",
+    ".onnx": "onnx",
+    ".h": "c",
+    ".c": "casadi",
+    ".fmu": "fmu",
+}  # of a file whose format is not named
 DESCRIPTION = """\
 Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
 
@@ -37,7 +43,7 @@ examples:
 HELP = "write a model as one file"
 FLAGS = (
     flag("source", "folder that `herglotz fit` wrote", metavar="RUN", type=Path),
-    flag("--out", "file to write, ending in .pt2, .onnx, .fmu or (C) .h or .c", required=True, type=Path, metavar="FILE"),
+    flag("--out", "file to write, ending in .pt2, .onnx, .fmu or (C) .h, .c", required=True, type=Path, metavar="FILE"),
     flag("--format", "kind of file (default: as the name says)", choices=tuple(SUFFIX)),
     flag("--h-range", "range of steps h (default: that of the data); C flags other steps, Python refuses them",
          type=positive, nargs=2, metavar=("LOW", "HIGH")),

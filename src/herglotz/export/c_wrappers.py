@@ -69,7 +69,9 @@ def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None 
         As `export_c`, and if the model has more than 8 coordinates: acados needs the Jacobian.
     """
     if (n := model.config.dof) > MAX_DERIVATIVES:
-        raise InputError(f"acados needs the Jacobian of a step, which C has up to {MAX_DERIVATIVES} coordinates, not {n}")
+        raise InputError(
+            f"acados needs the Jacobian of a step, which C has up to {MAX_DERIVATIVES} coordinates, not {n}"
+        )
     return _wrapped(model, Path(path), name, "acados.c", settings)
 
 

@@ -58,7 +58,8 @@ class Instance:
         self.new, self.said = version == "3.0", []
         words = fmpy.read_model_description(str(folder))
         kind = fmi3.FMU3Slave if self.new else fmi2.FMU2Slave
-        self.fmu = kind(words.guid if not self.new else words.instantiationToken, str(folder), "arm", "one")
+        token = words.instantiationToken if self.new else words.guid
+        self.fmu = kind(guid=token, unzipDirectory=str(folder), modelIdentifier="arm", instanceName="one")
         log = lambda *a: self.said.append((a[-1], a[-2], a[-3]))  # noqa: E731
         if self.new:
             self.fmu.instantiate(logMessage=log)
@@ -134,7 +135,7 @@ def test_the_description_is_valid_and_names_the_variables(version, fmus):
     # fails if the XML breaks the schema or a rule of the standard, a name is not escaped, or units and starts are lost
     from fmpy.validation import validate_fmu
 
-    path, folder = fmus[version]
+    path = fmus[version][0]
     assert validate_fmu(str(path)) == []
     words = fmpy.read_model_description(str(path))
     assert words.fmiVersion == version
@@ -144,10 +145,6 @@ def test_the_description_is_valid_and_names_the_variables(version, fmus):
     assert [v.unit for v in words.modelVariables] == ["s", "N", None, "rad", None, None]
     assert [float(v.start) for v in words.modelVariables[3:]] == [0.3, -0.2, 0.1]
     assert float(words.defaultExperiment.stepSize) == H
-    first = path.read_bytes()
-    again = folder.parent / f"again{version[0]}.fmu"
-    assert not (set(folder.rglob("*")) & {folder / "binaries"}) or zipfile.ZipFile(path).testzip() is None
-    del first, again
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -202,7 +199,7 @@ def test_states_are_saved_restored_and_written(arm):
     first = on()
     size = ctypes.c_size_t()
     assert arm.call("SerializedFMU" + ("State" if arm.new else "state") + "Size", saved, ctypes.byref(size)) == 0
-    written = (ctypes.c_char * size.value)()
+    written = ((ctypes.c_ubyte if arm.new else ctypes.c_char) * size.value)()
     assert arm.call(arm.states("Serialize"), saved, written, size) == 0
     assert arm.call(arm.states("Set"), saved) == 0
     assert arm.get([0])[0] == pytest.approx(5 * H)
@@ -214,7 +211,7 @@ def test_states_are_saved_restored_and_written(arm):
     assert arm.call(arm.states("Set"), other) == 0
     assert on().tolist() == first.tolist()
     arm.call(arm.states("Free"), ctypes.byref(other))
-    written[3] = b"?"
+    written[3] = 63 if arm.new else b"?"  # no hexadecimal digit
     assert arm.call(read, written, size, ctypes.byref(other)) == ERROR
     assert arm.call(read, written, ctypes.c_size_t(size.value - 1), ctypes.byref(other)) == ERROR
     assert arm.call(arm.states("Set"), None) == ERROR
@@ -264,7 +261,8 @@ def test_bad_use_is_an_error_and_changes_nothing(arm):
     assert arm.real("Get", (99,), (ctypes.c_double * 1)()) == ERROR
     assert any(b"between 0.05 and 0.1" in one[0] for one in arm.said if isinstance(one[0], bytes))
     assert arm.step(0.0, 1.5 * H) == 0  # two steps of 0.075
-    assert arm.call("EnterInitializationMode", *([ctypes.c_double(0)] * 0)) == ERROR if not arm.new else True
+    if not arm.new:
+        assert arm.call("EnterInitializationMode") == ERROR
     arm.one = ctypes.c_void_p()
     assert arm.set(INPUTS, (0.0, 0.0)) == ERROR
     assert arm.step(0.0, H) == ERROR
@@ -280,11 +278,9 @@ def test_steps_before_initialization_and_other_tokens(version, fmus):
     one = Instance(fmus[version][1], version, ready=False)
     assert one.step(0.0, H) == ERROR
     one.fmu.freeInstance()
-    wrong = Instance.__new__(Instance)
-    del wrong
-    kind = one.fmu.__class__
-    other = kind("another", str(fmus[version][1]), "arm", "two")
-    with pytest.raises(Exception, match="[Ii]nstantiat"):
+    words = {"unzipDirectory": str(fmus[version][1]), "modelIdentifier": "arm", "instanceName": "two"}
+    other = one.fmu.__class__(guid="of another model", **words)
+    with pytest.raises(Exception, match="nstantiate"):
         other.instantiate()
 
 
@@ -331,8 +327,9 @@ def test_other_models(tmp_path, monkeypatch):
         path = export_fmu(model_of(9, "linear"), tmp_path / "many.fmu", h=H)
     assert validate_fmu(str(path)) == []
     assert not any("binaries" in name for name in zipfile.ZipFile(path).namelist())
-    assert not fmpy.read_model_description(str(path)).coSimulation.providesDirectionalDerivatives
-    with pytest.raises(InputError, match="version must be one of 3.0, 2.0"):
+    description = zipfile.ZipFile(path).read("modelDescription.xml")
+    assert b'providesDirectionalDerivatives="false"' in description
+    with pytest.raises(InputError, match="version must be one of 3"):
         export_fmu(models["float32"], path, h=H, version="1.0")
 
 
