@@ -303,7 +303,7 @@ def test_sources_compile_without_a_warning_and_survive_the_sanitizers(version, f
     folder = fmus[version][1]
     source = folder / "sources" / f"fmi{version[0]}.c"
     program = tmp_path / "program"
-    sanitized = ["-O1", "-g", "-fno-sanitize-recover=all", "-fsanitize=address,undefined"]
+    sanitized = ["-O0", "-g", "-fno-sanitize-recover=all", "-fsanitize=address,undefined"]
     words = [str(CC), "-std=c99", *WARNINGS, *sanitized, f'-DSOURCE="{source}"', f"-DFMI={version[0]}"]
     words += [str(Path(__file__).with_name("fmu_program.c")), "-o", str(program), "-lm"]
     built = subprocess.run(words, capture_output=True, text=True)
