@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ class Instance:
 
         self.new, self.said = version == "3.0", []
         words = fmpy.read_model_description(str(folder))
-        kind = fmi3.FMU3Slave if self.new else fmi2.FMU2Slave
+        kind: Any = fmi3.FMU3Slave if self.new else fmi2.FMU2Slave
         token = words.instantiationToken if self.new else words.guid
         self.fmu = kind(guid=token, unzipDirectory=str(folder), modelIdentifier="arm", instanceName="one")
         log = lambda *a: self.said.append((a[-1], a[-2], a[-3]))  # noqa: E731
