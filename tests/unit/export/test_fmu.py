@@ -3,6 +3,7 @@
 import ctypes
 import json
 import shutil
+import struct
 import subprocess
 import zipfile
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import torch
 from export_models import damped, model_of, with_terms
 
+from herglotz.codegen import c_compiler
 from herglotz.errors import InputError
 from herglotz.export import export_fmu, load_exported
 
@@ -190,7 +192,7 @@ def test_states_are_saved_restored_and_written(arm):
     for k in range(5):
         arm.set(INPUTS, (0.3, 0.1))
         assert arm.step(k * H, H) == 0
-    saved = arm.state()
+    saved, q = arm.state(), arm.get(STATE)[0]
 
     def on():
         for k in range(5, 25):
@@ -212,6 +214,9 @@ def test_states_are_saved_restored_and_written(arm):
     assert arm.call(arm.states("Set"), other) == 0
     assert on().tolist() == first.tolist()
     arm.call(arm.states("Free"), ctypes.byref(other))
+    at = bytes(written).index(struct.pack("d", q))  # fails if bytes that hold no state are restored
+    broken = type(written)(*(bytes(written)[:at] + struct.pack("d", float("nan")) + bytes(written)[at + 8 :]))
+    assert arm.call(read, broken, size, ctypes.byref(other)) == ERROR
     written[3] = 63 if arm.new else b"?"  # no hexadecimal digit
     assert arm.call(read, written, size, ctypes.byref(other)) == ERROR
     assert arm.call(read, written, ctypes.c_size_t(size.value - 1), ctypes.byref(other)) == ERROR
@@ -262,6 +267,13 @@ def test_bad_use_is_an_error_and_changes_nothing(arm):
     assert arm.real("Get", (99,), (ctypes.c_double * 1)()) == ERROR
     assert any(b"between 0.05 and 0.1" in one[0] for one in arm.said if isinstance(one[0], bytes))
     assert arm.step(0.0, 1.5 * H) == 0  # two steps of 0.075
+    saved = arm.state()
+    assert arm.step(0.0, H) == 0
+    moved = arm.get(STATE)
+    assert arm.call(arm.states("Set"), saved) == 0
+    assert arm.step(0.0, H * (1 + 1e-9)) == 0
+    assert arm.get(STATE).tolist() == moved.tolist()  # fails if rounding of recorded times makes another step
+    arm.call(arm.states("Free"), ctypes.byref(saved))
     if not arm.new:
         assert arm.call("EnterInitializationMode") == ERROR
     arm.one = ctypes.c_void_p()
@@ -332,6 +344,20 @@ def test_other_models(tmp_path, monkeypatch):
     assert b'providesDirectionalDerivatives="false"' in description
     with pytest.raises(InputError, match="version must be one of 3"):
         export_fmu(models["float32"], path, h=H, version="1.0")
+
+
+def test_the_binary_is_for_every_processor_of_the_kind(tmp_path, monkeypatch):
+    # fails if an FMU ends with an illegal instruction on another machine, or a compiler's error is a mere warning
+    used = []
+    monkeypatch.setattr(c_compiler, "_compile", lambda _, sources, flags: used.append((sources, flags)) or b"")
+    path = export_fmu(damped("linear", torch.float64), tmp_path / "arm.fmu", h=H)
+    assert not any("native" in flag for flag in used[0][1])
+    assert "-std=c99" in used[0][1]
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="does not compile"):
+        c_compiler.portable_library({c_compiler.SOURCE: "int x = y;"})
+    folders = {name.rpartition("/")[0] for name in zipfile.ZipFile(path).namelist() if name.startswith("binaries/")}
+    assert folders == {f"binaries/{fmpy.platform_tuple}"}
 
 
 def test_a_damaged_fmu_is_refused(fmus, tmp_path):

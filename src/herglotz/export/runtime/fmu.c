@@ -115,29 +115,31 @@ static int fmu_terminate(fmu_instance *it) {
 static int fmu_communicate(fmu_instance *it, double time, double H) {
   const double slack = 1e-6; /* recorded times carry rounding */
   fmu_values *now, then;
-  double k;
+  double steps, k;
+  hz_real h;
   char text[160];
   if (!fmu_allowed(it, fmu_RUNNING, fmu_RUNNING)) return fmu_ERROR;
-  now = &it->now;
-  then = *now;
   if (!(time - time == 0.0 && H - H == 0.0 && H > 0.0))
     return fmu_said(it, fmu_ERROR, "The communication step is not a finite number above 0.");
-  now->steps = ceil(H / (double)hz_h_high * (1.0 - slack));
-  if (now->steps < 1.0) now->steps = 1.0;
-  now->h = (hz_real)(H / now->steps);
-  if (fabs((double)now->h - (double)hz_h) <= slack * (double)hz_h) now->h = hz_h;
-  if ((double)now->h < (double)hz_h_low * (1.0 - slack)) {
+  steps = ceil(H / (double)hz_h_high * (1.0 - slack));
+  if (steps < 1.0) steps = 1.0;
+  h = (hz_real)(H / steps);
+  if (fabs((double)h - (double)hz_h) <= slack * (double)hz_h) h = hz_h;
+  if ((double)h < (double)hz_h_low * (1.0 - slack)) {
     snprintf(text, sizeof text, "A communication step of %.9g cannot be made of steps between %.9g and %.9g, which the "
              "model was fitted for.", H, (double)hz_h_low, (double)hz_h_high);
-    *now = then;
     return fmu_said(it, fmu_ERROR, text);
   }
+  now = &it->now;
+  then = *now;
+  now->steps = steps;
+  now->h = h;
   now->before = now->x;
   memcpy(now->acted, now->u, sizeof now->u);
-  for (k = 0.0; k < now->steps; k += 1.0) {
+  for (k = 0.0; k < steps; k += 1.0) {
     hz_real left;
-    int status = hz_before(&now->x, now->h);
-    if (!status) status = hz_advance(&now->x, &now->track, now->h, hz_WITH_U(now->acted) &left);
+    int status = hz_before(&now->x, h);
+    if (!status) status = hz_advance(&now->x, &now->track, h, hz_WITH_U(now->acted) &left);
     if (status) {
       snprintf(text, sizeof text, "The step at time %.9g failed with status %d of the header; nothing has moved.", time,
                status);
