@@ -1,5 +1,6 @@
 """The C file for CasADi: its step beside Python's, its derivatives, and what it does where there is no step."""
 
+import ctypes
 import shutil
 import subprocess
 
@@ -101,6 +102,20 @@ def test_casadi_differentiates_through_many_steps(tmp_path):
     assert np.isfinite(slopes).all()
     zero = np.array(step(x=at[0])["x1"])  # no u: zeros; h: that of the model
     assert abs(zero - np.array(step(at[0], [0, 0], 0.1))).max() == 0
+
+
+def test_null_arguments_are_zeros_and_null_results_are_left_out(tmp_path):
+    # fails if code that CasADi generated, which passes null for zeros and for what nobody asks for, ends the process
+    step, path = function(MODELS["inputs"](), tmp_path)
+    library, x1 = ctypes.CDLL(str(path.with_suffix(".so"))), (ctypes.c_double * 3)()
+    x, h = (ctypes.c_double * 3)(0.2, 0.3, 0.0), (ctypes.c_double * 1)(0.1)
+    pointer = ctypes.POINTER(ctypes.c_double)
+    given = (pointer * 4)(x, pointer(), h, pointer())
+    assert library.arm_step(given, (pointer * 1)(x1), None, None, 0) == 0
+    assert list(x1) == np.array(step([0.2, 0.3, 0.0], 0, 0.1)).ravel().tolist()
+    assert library.arm_step(given, (pointer * 1)(), None, None, 0) == 0
+    assert library.jac_arm_step(given, (pointer * 3)(), None, None, 0) == 0
+    assert library.arm_step((pointer * 4)(), (pointer * 1)(), None, None, 0) == 1  # h = 0
 
 
 def test_a_step_that_does_not_exist_is_an_error(tmp_path):
