@@ -106,7 +106,7 @@ def lock() -> str:
     wanted = project()
     extras = wanted["optional-dependencies"]
     # pip cannot give a hash for the package's own folder: its requirements instead
-    lines = [*wanted["build"], *wanted["dependencies"], *extras["dev"], *extras["export"]]
+    lines = [*wanted["build"], *wanted["dependencies"], *extras["dev"], *extras["export"], *extras["control"]]
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         ours = ("--report", str(report), "--constraint", str(ROOT / "constraints.txt"))

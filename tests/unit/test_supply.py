@@ -115,7 +115,7 @@ def test_the_lock_is_not_checked_without_its_package_index(monkeypatch, capsys):
     for lacks in (lambda _: True, lambda name: name[0] < "p"):
         pip_that_lacks(monkeypatch, lacks)
         supply.check_lock()
-        assert "not checked: no package index, or not the lock's: it lacks contourpy==" in capsys.readouterr().out
+        assert "not checked: no package index, or not the lock's: it lacks attrs==" in capsys.readouterr().out
 
 
 def test_a_version_that_is_nowhere_fails(monkeypatch, tmp_path):

@@ -11,7 +11,14 @@ from herglotz.errors import InputError
 
 # File extension of each format.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
-FORMAT = {".pt2": "pt2", ".onnx": "onnx", ".h": "c"}  # of a file whose format is not named
+SUFFIX |= {"casadi": ".c", "acados": ".c", "fmu": ".fmu", "fmu2": ".fmu"}
+FORMAT = {
+    ".pt2": "pt2",
+    ".onnx": "onnx",
+    ".h": "c",
+    ".c": "casadi",
+    ".fmu": "fmu",
+}  # of a file whose format is not named
 DESCRIPTION = """\
 Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
 
@@ -20,19 +27,23 @@ Write the model of a run as one file; every format checks its own steps and repo
   onnx  K steps (q, p, s, h) for onnxruntime and numpy, without PyTorch; a start from two positions in its metadata
   aoti  K steps and a start compiled to machine code (needs g++ or clang++, one or two minutes): fast batches
   c     one C99 header that steps with <math.h> alone: the fastest single steps
+  casadi, acados  one C file for casadi.external, or for acados' discrete dynamics: step and Jacobian
+  fmu, fmu2  an FMU for co-simulation, FMI 3.0 or 2.0, with C sources and a binary for this machine
 
 examples:
   herglotz export runs/pendulum --out pendulum.pt2
   herglotz export runs/pendulum --out stepper.onnx
   herglotz export runs/pendulum --format aoti --out stepper.aoti.pt2
   herglotz export runs/pendulum --out stepper.h
+  herglotz export runs/pendulum --format casadi --out pendulum.c
+  herglotz export runs/pendulum --out pendulum.fmu
 """
 
 
 HELP = "write a model as one file"
 FLAGS = (
     flag("source", "folder that `herglotz fit` wrote", metavar="RUN", type=Path),
-    flag("--out", "file to write, ending in .pt2, .onnx or (C) .h", required=True, type=Path, metavar="FILE"),
+    flag("--out", "file to write, ending in .pt2, .onnx, .fmu or (C) .h, .c", required=True, type=Path, metavar="FILE"),
     flag("--format", "kind of file (default: as the name says)", choices=tuple(SUFFIX)),
     flag("--h-range", "range of steps h (default: that of the data); C flags other steps, Python refuses them",
          type=positive, nargs=2, metavar=("LOW", "HIGH")),
@@ -59,12 +70,13 @@ def run(arguments: argparse.Namespace) -> int:
     result = load_run(arguments.source)
 
     from herglotz.export import export_run, load_exported
-    from herglotz.export.c_header import read_metadata
+    from herglotz.export.load import read_header
 
     warn_of_misfit(result, "the file will not step as the recorded system does")
     export_run(result, arguments.out, form, h_range=arguments.h_range, name=arguments.name)
-    if form == "c":  # the header is read, not compiled: no compiler is needed to write it
-        found = read_metadata(arguments.out.read_text(), arguments.out)
+    in_c = form not in ("pt2", "aoti", "onnx")
+    if in_c:  # the header is read, not compiled: no compiler is needed to write it
+        _, found = read_header(arguments.out)
     else:
         found = load_exported(arguments.out).metadata
     size = arguments.out.stat().st_size
@@ -75,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} {plural}, h {result.h:g}")
         if kicks.is_file():
             print(f"tune chose kicks, which exist in C only (--format c); {arguments.out} holds the run's own model")
-        if form != "c" and (tol := result.setting.get("tol")):
+        if not in_c and (tol := result.setting.get("tol")):
             print(f"The tolerance {tol:g} of tune applies to PyTorch and C only; this file solves to rounding")
         if form == "c":
             say(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")

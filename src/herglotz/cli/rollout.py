@@ -36,7 +36,7 @@ examples:
 """
 
 
-SUFFIXES = (".pt2", ".onnx", ".h")
+SUFFIXES = (".pt2", ".onnx", ".h", ".c", ".fmu")
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Source:
 
 HELP = "step a model and write the motion"
 FLAGS = (
-    flag("source", "folder of a run, or an exported model: .pt2, .onnx or a C header .h",
+    flag("source", "folder of a run, or an exported model: .pt2, .onnx, C (.h, .c) or .fmu",
          metavar="RUN|FILE", type=Path),
     flag("--steps", "number of steps, at least 2", required=True, type=count, metavar="K"),
     flag("--out", "file to write: .csv or .npz", required=True, type=Path, metavar="FILE"),

@@ -95,12 +95,12 @@ def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: 
 def _opened(path: Path, arguments: argparse.Namespace) -> Any:
     """Open a file; a C header of a run that is at hand is generated again, and opened where it is the same text."""
     from herglotz.export import load_c, load_exported
-    from herglotz.export.load import read_header
+    from herglotz.export.load import WITH_HEADER, read_header
     from herglotz.training import load_run
 
     if path.suffix.lower() in (".csv", ".npz", ".txt"):
         raise InputError(f"{path}: is data, not a model; fit it first: herglotz fit {path} --out RUN")
-    if path.suffix.lower() != ".h":
+    if path.suffix.lower() not in WITH_HEADER:
         found = load_exported(path, trust_code=arguments.trust_code)
         arguments.against = arguments.against or _exported_from(found.metadata, path)
         return found

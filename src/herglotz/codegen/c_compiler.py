@@ -21,7 +21,8 @@ from herglotz.errors import InputError
 
 # No -ffast-math: a shared library built with it flushes denormals of the whole process, and drops the compensation of
 # rounding. Fused multiply-adds are what -std=c99 alone would turn off.
-FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast")
+NATIVE = "-march=native"
+FLAGS = ("-std=c99", "-O3", NATIVE, "-fno-math-errno", "-ffp-contract=fast")
 SOURCE = "loops.c"
 # By the variable that names a compiler: its language, the names that are looked for, and the one to install.
 COMPILERS = {"CC": ("C", ("cc", "gcc", "clang"), "gcc"), "CXX": ("C++", ("g++", "clang++", "c++"), "g++")}
@@ -67,6 +68,14 @@ def built(key: str, sources: Callable[[], Mapping[str, str]], level: str | None 
         raise InputError(f"{library}: cannot be loaded ({error}); check the compiler {words[0]}") from None
 
 
+def portable_library(sources: Mapping[str, str]) -> bytes:
+    """The library of these files, of which `SOURCE` is compiled, for every processor of this kind.
+
+    Raise InputError if there is no compiler, or it does not compile the files.
+    """
+    return _compile(compiler(), sources, [flag for flag in FLAGS if flag != NATIVE])
+
+
 def _is_whole(library: Path) -> bool:
     """Whether a library is there as it was written: loading half of one would end the process."""
     try:
@@ -83,7 +92,7 @@ def _compile(words: list[str], sources: Mapping[str, str], flags: Sequence[str])
         source, library = Path(folder, SOURCE), Path(folder, "loops.so")
         for name, text in sources.items():
             Path(folder, name).write_text(text)
-        for options in (flags, [f for f in flags if f != "-march=native"]):
+        for options in (flags, [f for f in flags if f != NATIVE]):
             command = [*words, *options, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"]
             try:
                 done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)

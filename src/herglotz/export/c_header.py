@@ -156,7 +156,7 @@ def export_c(
         If an argument is not usable, a weight is not finite, or the file cannot be written.
     """
     path = Path(path)
-    name = _identifier(path.stem) if name is None else name
+    name = identifier(path.stem) if name is None else name
     extra = dict(metadata or {})
     extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
@@ -232,7 +232,7 @@ def described(
     return entries | {"name": name, "dtype": dtype, "newton_tolerance": least if tolerance is None else tolerance}
 
 
-def _identifier(stem: str) -> str:
+def identifier(stem: str) -> str:
     """A C identifier from the name of a file."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", stem)[:41]
     return name if re.match("[A-Za-z]", name) else f"model_{name}"[:41]

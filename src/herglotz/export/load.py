@@ -16,21 +16,23 @@ import torch
 from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
-from herglotz.data.seal import check_seal, sealed_text
+from herglotz.data.seal import TEXT, check_seal, sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_header import c_source, read_metadata
 from herglotz.export.c_stepper import compiled
 from herglotz.export.exported import ExportedStepper, Program
+from herglotz.export.fmu import header_in
 from herglotz.export.metadata import AOTI, KEY, METADATA, from_json, weights_digest
 from herglotz.export.programs import quiet
 from herglotz.export.trusted import check_trusted
 from herglotz.models import ContactLagrangian
 
+WITH_HEADER = (".h", ".c", ".fmu")
 MODELS, EXTRA = "models/", f"extra/{METADATA}"  # in the archive that torch writes
 
 
 def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
-    """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or a C header `.h`.
+    """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or one with a C header: `.h`, `.c`, `.fmu`.
 
     Parameters
     ----------
@@ -52,7 +54,7 @@ def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedSteppe
     suffix = Path(path).suffix.lower()
     if suffix == ".onnx":
         return load_onnx(path)
-    return (load_c if suffix == ".h" else load_pt2)(path, trust_code=trust_code)
+    return (load_c if suffix in WITH_HEADER else load_pt2)(path, trust_code=trust_code)
 
 
 def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
@@ -115,12 +117,12 @@ def load_onnx(path: PathLike) -> ExportedStepper:
 
 
 def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian | None = None) -> ExportedStepper:
-    """Compile a header that `export_c` wrote, and load it.
+    """Compile a header that `export_c` wrote, and load it; also that in a file for CasADi or acados, or in an FMU.
 
     Parameters
     ----------
     path
-        The header.
+        The header, or the file that holds it.
     trust_code
         Compile a header that was not written by this user on this machine: that runs what stands in it.
     model
@@ -136,8 +138,9 @@ def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian
     InputError
         If the file cannot be read, was changed, is no such header or not trusted, or there is no compiler.
     """
-    text, _ = read_header(path)
-    check_trusted(text.encode(), path, trust_code or (model is not None and _is_of(text, path, model)))
+    content = _sealed(path, text=not _is_fmu(path))
+    text = _header(content, path)
+    check_trusted(content, path, trust_code or (model is not None and _is_of(text, path, model)))
     return compiled(text, path)
 
 
@@ -146,8 +149,21 @@ def read_header(path: PathLike) -> tuple[str, dict[str, Any]]:
 
     Raise InputError if the file cannot be read, was changed or is no such header.
     """
-    text = _sealed(path, text=True).decode("utf-8", "replace")
+    text = _header(_sealed(path, text=not _is_fmu(path)), path)
     return text, read_metadata(text, path)
+
+
+def _is_fmu(path: PathLike) -> bool:
+    return Path(path).suffix.lower() == ".fmu"
+
+
+def _header(content: bytes, path: PathLike) -> str:
+    """The header, up to its own seal: what stands around it is not compiled here."""
+    if _is_fmu(path):
+        return header_in(content, path)
+    text = content.decode("utf-8", "replace").replace("\r\n", "\n")
+    seal = re.search(r"^.*" + re.escape(TEXT[0].decode()) + ".*\n", text, re.MULTILINE)
+    return text[: seal.end()] if seal else text
 
 
 def _sealed(path: PathLike, text: bool = False) -> bytes:

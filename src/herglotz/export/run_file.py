@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from herglotz.errors import InputError
 from herglotz.export.c_header import export_c
+from herglotz.export.c_wrappers import export_acados, export_casadi
+from herglotz.export.fmu import export_fmu
 from herglotz.export.lower.aoti import export_aoti
 from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
 from herglotz.training import Run
 from herglotz.training.summary import model_card
 
-WRITERS = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx, "c": export_c}
-KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c"}  # of a file, by the end of its name
+IN_C: dict[str, Callable[..., Path]] = {
+    "c": export_c,
+    "casadi": export_casadi,
+    "acados": export_acados,
+    "fmu": export_fmu,
+    "fmu2": partial(export_fmu, version="2.0"),
+}
+WRITERS = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx} | IN_C
+KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c", ".c": "casadi", ".fmu": "fmu"}  # of a file, by the end of its name
 
 
 def export_run(
@@ -33,26 +44,26 @@ def export_run(
     run
         What `fit` returned.
     path
-        File ending in .pt2, .onnx or .h.
+        File ending in .pt2, .onnx, .h, .c or .fmu.
     kind
-        "pt2", "aoti", "onnx" or "c"; None: by the end of the name.
+        "pt2", "aoti", "onnx", "c", "casadi", "acados", "fmu" (FMI 3.0) or "fmu2" (2.0); None: by the end of the name.
     h_range
         Steps that the file is for; None: those of the fit and of the recording, which a fit may cross in several of
         its own. An end that agrees with the run's own step to six digits is taken for it: recorded times carry
         rounding, and 0.2 means a step of 0.2000000000000002 too.
     name
-        Prefix of every name in a C header, as of `export_c`; None: that of the file.
+        Prefix of every name in C, as of `export_c`, and the identifier of an FMU; None: that of the file.
 
     Raises
     ------
     InputError
-        If the name has another end, the format cannot hold the model, or a prefix is given for another format than C.
+        If the name has another end, the format cannot hold the model, or a prefix is given for a format without C.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
     if kind not in WRITERS:
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
-    if name is not None and kind != "c":
+    if name is not None and kind not in IN_C:
         raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or _steps(run)]
@@ -67,7 +78,7 @@ def export_run(
         **({"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]} if run.model.inputs else {}),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
-    if run.setting and kind == "c":
+    if run.setting and kind in IN_C:
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
     if name is not None:
         described["name"] = name

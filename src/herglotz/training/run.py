@@ -280,9 +280,9 @@ class Run:
         Parameters
         ----------
         path
-            The file; .pt2, .onnx and .h say what is written.
+            The file; .pt2, .onnx, .h, .c and .fmu say what is written.
         kind
-            pt2, onnx, aoti or c, where the name of the file does not say it.
+            pt2, onnx, aoti, c, casadi, acados, fmu or fmu2, where the name of the file does not say it.
         **settings
             Of the writer of that kind, such as `name` in C.
 

@@ -136,7 +136,9 @@ def named(target: Any) -> Any:
         return load_exported(path)
     known = scene_names()
     near = did_you_mean(str(target), known)
-    raise InputError(f"{target}: no such scene ({', '.join(known)}), run folder or .pt2, .onnx or .h file{near}")
+    raise InputError(
+        f"{target}: no such scene ({', '.join(known)}), run folder or .pt2, .onnx, .h, .c or .fmu file{near}"
+    )
 
 
 def _file(target: ExportedStepper, states: State, h: float) -> Subject:

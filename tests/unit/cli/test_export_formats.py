@@ -1,7 +1,9 @@
 """`export`, `verify` and `rollout` on a file that is not `.pt2`."""
 
 import json
+import re
 import shutil
+import zipfile
 from argparse import Namespace
 from functools import partial
 from pathlib import Path
@@ -176,3 +178,30 @@ def test_a_file_made_by_hand_is_one_message(tiny_onnx, tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert said.startswith(f"herglotz: error: {path}: metadata: columns must be list[tuple[str, str, str]], got ")
     assert said.endswith("export the model again")
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+@pytest.mark.parametrize("form", ["casadi", "acados", "fmu", "fmu2"])
+def test_files_around_the_header(form, tiny_run, tmp_path, capsys):
+    # fails if a file lacks the run's names, start or prefix, or what compiles the header in it does not find it
+    out = tmp_path / ("a.fmu" if form.startswith("fmu") else "a.c")
+    assert main(["export", str(tiny_run), "--format", form, "--name", "arm", "--out", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["metadata"]["name"].startswith("arm")
+    assert said["metadata"]["names"] == ["theta"]
+    assert main(["rollout", str(out), "--steps", "5", "--out", str(tmp_path / "b.npz")]) == 0
+    assert main(["rollout", str(tiny_run), "--steps", "5", "--out", str(tmp_path / "a.npz")]) == 0
+    torch.testing.assert_close(load(tmp_path / "b.npz").q, load(tmp_path / "a.npz").q, rtol=0, atol=1e-12)
+    if form == "fmu":
+        description = zipfile.ZipFile(out).read("modelDescription.xml").decode()
+        (start,) = re.findall(r'name="q.theta"[^>]*start="([^"]*)"', description)
+        assert float(start) == said["metadata"]["start"]["q"][0]
+        few = ["--samples", "4", "--steps", "2", "--against", str(tiny_run)]
+        monkey = "herglotz.export.trusted.private_folder"
+        with pytest.MonkeyPatch.context() as patch:  # a file that another user wrote, beside its run
+            patch.setattr(monkey, lambda name: tmp_path / name)
+            patch.setattr("herglotz.export.trusted._here", set())
+            assert main(["rollout", str(out), "--steps", "5", "--out", str(tmp_path / "c.npz")]) == 2
+            assert "opening it runs code" in capsys.readouterr().err
+            patch.setattr("herglotz.export.compare", partial(compare, steps=20))
+            assert main(["verify", str(out), *few]) == 0  # the header is generated again, and is the same

@@ -1,0 +1,101 @@
+"""The C header as a source file that CasADi or acados takes: the header, and their interface around its step."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.seal import sealed_text
+from herglotz.errors import InputError
+from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, runtime
+from herglotz.export.trusted import remember
+from herglotz.models import ContactLagrangian
+
+INNER = "_c"  # what the prefix of the header ends in: its NAME_step is another function than CasADi's
+
+
+def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None = None, **settings: Any) -> Path:
+    """Write the step as one C file that `casadi.external` loads once it is compiled.
+
+    The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`, and up to 8
+    coordinates its Jacobian; without inputs there is no u. A step that does not exist is an error of CasADi.
+    docs/control.md has an example.
+
+    Parameters
+    ----------
+    model
+        Not changed.
+    path
+        The file to write, atomically; the name should end in `.c`.
+    name
+        Prefix of every name in the file, a C identifier; default that of the file.
+    settings
+        h, box, units, dtype, h_range, tolerance and metadata, as of `export_c`.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    InputError
+        As `export_c`.
+    """
+    return _wrapped(model, Path(path), name, "casadi.c", settings)
+
+
+def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None = None, **settings: Any) -> Path:
+    """Write the step as the C file that acados takes for discrete dynamics (`dyn_generic_source`).
+
+    The file has NAME_disc_fun and NAME_disc_fun_jac: one step of h, x = (q, p, s). docs/control.md has an example.
+
+    Parameters
+    ----------
+    model, path, name, settings
+        As of `export_casadi`; h is the shooting interval.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    InputError
+        As `export_c`, and if the model has more than 8 coordinates: acados needs the Jacobian.
+    """
+    if (n := model.config.dof) > MAX_DERIVATIVES:
+        raise InputError(
+            f"acados needs the Jacobian of a step, which C has up to {MAX_DERIVATIVES} coordinates, not {n}"
+        )
+    return _wrapped(model, Path(path), name, "acados.c", settings)
+
+
+def header_of(model: ContactLagrangian, name: str, settings: dict[str, Any]) -> str:
+    """The header that `export_c` writes."""
+    with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
+        return export_c(model, Path(folder, f"{name}.h"), name=name, **settings).read_text(encoding="utf-8")
+
+
+def prefix(path: Path, name: str | None) -> str:
+    """The name that was given, or that of the file; raise InputError if it is no C identifier."""
+    longest = 41 - len(INNER)
+    name = identifier(path.stem)[:longest] if name is None else name
+    if not re.fullmatch(NAME, name) or len(name) > longest:
+        raise InputError(f"name must be a C identifier of at most {longest} letters, digits and _, got {name!r}")
+    return name
+
+
+def _wrapped(model: ContactLagrangian, path: Path, name: str | None, file: str, settings: dict[str, Any]) -> Path:
+    name = prefix(path, name)
+    inner = name + INNER
+    around = (runtime("unread.h") + runtime(file)).replace("NAME_", f"{name}_")
+    around = re.sub(r"\bhz_", f"{inner}_", around)
+    content = sealed_text(header_of(model, inner, settings) + around).encode()
+    write_atomically(path, content)
+    remember(content)
+    return path

@@ -1,0 +1,131 @@
+"""A model as an FMU for co-simulation, FMI 3.0 or 2.0: the C header, the standard's functions around it, a binary."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import platform
+import re
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from herglotz.codegen.c_compiler import SOURCE, compiler, portable_library
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.seal import sealed_zip
+from herglotz.errors import InputError
+from herglotz.export.c_header import read_metadata, runtime
+from herglotz.export.c_numbers import numbers
+from herglotz.export.c_wrappers import header_of, prefix
+from herglotz.export.fmu_description import VERSIONS, build_description, model_description
+from herglotz.export.trusted import remember
+from herglotz.models import ContactLagrangian
+
+SYSTEM = {"Linux": "linux", "Darwin": "darwin", "Windows": "windows"}
+MACHINE = {"AMD64": "x86_64", "arm64": "aarch64"}  # as the standard spells it
+FMI2_FOLDER = {"x86_64-linux": "linux64", "x86_64-darwin": "darwin64", "x86_64-windows": "win64"}
+ENDING = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
+EPOCH = (1980, 1, 1, 0, 0, 0)  # of every entry: the same model gives the same bytes
+
+
+def export_fmu(
+    model: ContactLagrangian, path: PathLike, *, name: str | None = None, version: str = "3.0", **settings: Any
+) -> Path:
+    """Write the model as an FMU for co-simulation: inputs u, outputs q, p, s, C sources and a binary.
+
+    A communication step is one step of the header, or as few equal ones as the steps that the model was fitted for
+    allow. The binary is for the system and kind of processor that it was made on; where there is no C compiler, a
+    warning says so, and the FMU holds the sources alone. docs/control.md says what the FMU does with each call.
+
+    Parameters
+    ----------
+    model
+        Not changed.
+    path
+        The file to write, atomically; the name should end in `.fmu`.
+    name
+        The model's identifier, a C identifier; default that of the file.
+    version
+        "3.0" or "2.0", of FMI.
+    settings
+        h, box, units, dtype, h_range, tolerance and metadata, as of `export_c`. Of the metadata, names, columns, start
+        and time_unit name the variables, their starts and units.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    InputError
+        As `export_c`, and if the version is another one.
+    """
+    if version not in VERSIONS:
+        raise InputError(f"version must be one of {', '.join(VERSIONS)} (of FMI), got {version!r}")
+    path = Path(path)
+    name = prefix(path, name)
+    header = header_of(model, name, settings)
+    entries = read_metadata(header, path)
+    token = hashlib.sha256(header.encode()).hexdigest()[:32]
+    source = _source(entries, version, token)
+    file = f"fmi{version[0]}.c"
+    content = {
+        "modelDescription.xml": model_description(entries, version, token, file),
+        f"sources/{name}.h": header.encode(),
+        f"sources/{file}": source.encode(),
+    }
+    if version == "3.0":
+        content["sources/buildDescription.xml"] = build_description(name, file)
+    try:
+        compiler()
+    except InputError as error:
+        warnings.warn(f"{path}: C sources without a binary: {error}", RuntimeWarning, stacklevel=2)
+    else:
+        content[_binary(name, version)] = portable_library({f"{name}.h": header, SOURCE: source})
+    archive = sealed_zip(_zipped(content))
+    write_atomically(path, archive)
+    remember(archive)
+    return path
+
+
+def header_in(content: bytes, path: PathLike) -> str:
+    """The C header in an FMU; raise InputError if there is none."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for name in archive.namelist():
+                if re.fullmatch(r"sources/\w+\.h", name):
+                    return archive.read(name).decode("utf-8", "replace")
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise InputError(f"{path}: is no readable FMU ({error}); export the model again") from None
+    raise InputError(f"{path}: holds no header that herglotz wrote; export the model again")
+
+
+def _source(entries: Mapping[str, Any], version: str, token: str) -> str:
+    """The functions of the standard around the header."""
+    zero = [*entries["input_zero"], 0.0]
+    given = {"HEADER": f"{entries['name']}.h", "TOKEN": token, "INPUTS": numbers(zero, entries["dtype"])}
+    text = runtime("fmu.c") + runtime(f"fmi{version[0]}.c")
+    text = re.sub(r"@(\w+)@", lambda m: given[m[1]], text)
+    return re.sub(r"\bhz_", f"{entries['name']}_", text)
+
+
+def _binary(name: str, version: str) -> str:
+    """Where the binary for this machine stands in an FMU."""
+    system = SYSTEM.get(platform.system(), platform.system().lower())
+    folder = f"{MACHINE.get(platform.machine(), platform.machine())}-{system}"
+    folder = FMI2_FOLDER.get(folder, folder) if version == "2.0" else folder
+    return f"binaries/{folder}/{name}{ENDING.get(system, '.so')}"
+
+
+def _zipped(content: Mapping[str, bytes]) -> bytes:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in content.items():
+            entry = zipfile.ZipInfo(name, EPOCH)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
+            archive.writestr(entry, data)
+    return made.getvalue()

@@ -1,0 +1,166 @@
+"""The C file for CasADi: its step beside Python's, its derivatives, and what it does where there is no step."""
+
+import ctypes
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from export_models import beside, damped, model_of, near, states_of, with_terms
+
+from herglotz.errors import InputError
+from herglotz.export import export_casadi, load_exported
+from herglotz.stepping import State
+
+ca = pytest.importorskip("casadi", reason="casadi is not installed (extra: control)")
+CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
+pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
+WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
+MODELS = {
+    "network": lambda: damped("full", torch.float64),
+    "inputs": lambda: damped("forced", torch.float64, inputs=2),
+    "mass m(q)": lambda: with_terms("m(q), coupled"),
+    "sticking": lambda: with_terms("sticking"),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def function(model, folder, **settings):
+    """The model as a function of CasADi, and the file."""
+    path = export_casadi(model, folder / "arm.c", h=0.1, **settings)
+    library = path.with_suffix(".so")
+    flags = ["-std=c99", "-O0", "-fPIC", "-shared", *WARNINGS]
+    built = subprocess.run([str(CC), *flags, str(path), "-o", str(library), "-lm"], capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr[:2000]
+    return ca.external("arm_step", str(library)), path
+
+
+def arguments(model, state, h=0.1):
+    """x, u where the model takes inputs, and h of one sample."""
+    x = torch.cat([state.q[0], state.p[0], state.s[:1]]).double().numpy()
+    u = 0.3 + 0.1 * np.arange(model.inputs)
+    return [x, *([u] if model.inputs else []), h]
+
+
+def eager(model, x, u, h):
+    n = model.config.dof
+    state = State(*(torch.tensor(part, dtype=torch.float64) for part in (x[None, :n], x[None, n:-1], x[-1:])))
+    inputs = None if u is None else torch.tensor(u, dtype=torch.float64)[None]
+    with torch.no_grad():
+        step = beside(model).step(state, h, u=inputs)
+    assert not step.status.any()
+    return torch.cat([step.state.q[0], step.state.p[0], step.state.s]).numpy()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_step_and_its_jacobian(name, tmp_path):
+    # fails if q, p and s are mixed up, rows and columns of a block are exchanged, u is read from the place of h, or a
+    # compiler warns
+    model = MODELS[name]()
+    step, _ = function(model, tmp_path)
+    given = arguments(model, near(model.config.dof, 1))
+    u = given[1] if model.inputs else None
+    ours, theirs = np.array(step(*given)).ravel(), eager(model, given[0], u, 0.1)
+    assert abs(ours - theirs).max() <= 1e-10 * abs(theirs).max()
+    assert step.name_in() == ["x", *(["u"] if model.inputs else []), "h"]
+    blocks = step.jacobian()(*given, 0)
+    blocks = blocks if isinstance(blocks, (tuple, list)) else (blocks,)
+    for k, block in enumerate(blocks):
+        block = np.array(block)
+        for j in range(block.shape[1]):
+            ends = []
+            for sign in (1, -1):
+                moved = [np.array(x, dtype=float, copy=True).reshape(-1) for x in given]
+                moved[k][j] += sign * 1e-5
+                ends.append(np.array(step(*moved)).ravel())
+            slope = (ends[0] - ends[1]) / 2e-5
+            assert abs(block[:, j] - slope).max() <= 1e-7 * max(1.0, abs(block).max()), (k, j)
+
+
+def test_casadi_differentiates_through_many_steps(tmp_path):
+    # fails if CasADi does not find the Jacobian, its own sparsities do not fit, or a null argument or output is read
+    model = MODELS["inputs"]()
+    step, _ = function(model, tmp_path)
+    x, u, h = ca.MX.sym("x", 3), ca.MX.sym("u", 2, 5), ca.MX.sym("h")
+    end = x
+    for k in range(5):
+        end = step(end, u[:, k], h)
+    whole = ca.Function("whole", [x, u, h], [ca.jacobian(end, ca.veccat(x, u, h)), end])
+    at = [np.array([0.2, 0.3, 0.0]), 0.1 * np.ones((2, 5)), 0.1]
+    slopes = np.array(whole(*at)[0])
+    moved = [at[0], at[1].copy(), at[2]]
+    moved[1][1, 2] += 1e-5
+    difference = (np.array(whole(*moved)[1]) - np.array(whole(*at)[1])).ravel() / 1e-5
+    assert abs(slopes[:, 3 + 5] - difference).max() <= 1e-5
+    assert np.isfinite(slopes).all()
+    zero = np.array(step(x=at[0])["x1"])  # no u: zeros; h: that of the model
+    assert abs(zero - np.array(step(at[0], [0, 0], 0.1))).max() == 0
+
+
+def test_null_arguments_are_zeros_and_null_results_are_left_out(tmp_path):
+    # fails if code that CasADi generated, which passes null for zeros and for what nobody asks for, ends the process
+    step, path = function(MODELS["inputs"](), tmp_path)
+    library, x1 = ctypes.CDLL(str(path.with_suffix(".so"))), (ctypes.c_double * 3)()
+    x, h = (ctypes.c_double * 3)(0.2, 0.3, 0.0), (ctypes.c_double * 1)(0.1)
+    pointer = ctypes.POINTER(ctypes.c_double)
+    given = (pointer * 4)(x, pointer(), h, pointer())
+    assert library.arm_step(given, (pointer * 1)(x1), None, None, 0) == 0
+    assert list(x1) == np.array(step([0.2, 0.3, 0.0], 0, 0.1)).ravel().tolist()
+    assert library.arm_step(given, (pointer * 1)(), None, None, 0) == 0
+    assert library.jac_arm_step(given, (pointer * 3)(), None, None, 0) == 0
+    assert library.arm_step((pointer * 4)(), (pointer * 1)(), None, None, 0) == 1  # h = 0
+
+
+def test_a_step_that_does_not_exist_is_an_error(tmp_path):
+    # fails if a failed step hands out its start, or NaN without a word
+    step, _ = function(MODELS["mass m(q)"](), tmp_path)
+    x = np.ones(5)
+    for bad in (-0.1, 0.0, float("nan")):
+        with pytest.raises(RuntimeError):
+            step(x, bad)
+        with pytest.raises(RuntimeError):
+            step.jacobian()(x, bad, 0)
+    with pytest.raises(RuntimeError):
+        step(np.array([1, 1, 1, np.inf, 1]), 0.1)
+
+
+def test_float32_and_many_coordinates(tmp_path):
+    # fails if a header of floats hands floats to CasADi, or one without derivatives has a Jacobian that is none
+    model = damped("linear", torch.float32)
+    step, _ = function(model, tmp_path, dtype="float32")
+    given = arguments(model, states_of(1, 1))
+    assert abs(np.array(step(*given)).ravel() - eager(model.double(), given[0], None, 0.1)).max() <= 1e-6
+    (tmp_path / "many").mkdir()
+    many, _ = function(model_of(9, "linear"), tmp_path / "many")
+    assert np.isfinite(np.array(many(0.1 * np.ones(19), 0.1))).all()
+    with pytest.raises(RuntimeError):
+        many.jacobian()
+
+
+def test_the_file_is_read_as_a_header_is(tmp_path):
+    # fails if `herglotz verify arm.c` compiles CasADi's part, finds no metadata, or takes a changed file
+    model = MODELS["inputs"]()
+    _, path = function(model, tmp_path)
+    state = states_of(1, 3)
+    ours = load_exported(path).step(state, 0.1)
+    with torch.no_grad():
+        theirs = beside(model).step(state, 0.1)
+    torch.testing.assert_close(ours.state.p, theirs.state.p, rtol=0, atol=1e-12)
+    path.write_bytes(path.read_bytes().replace(b"sz_arg) *sz_arg", b"sz_arg) *sz_res"))
+    with pytest.raises(InputError, match="damaged or changed"):
+        load_exported(path)
+
+
+def test_names_that_cannot_be(tmp_path):
+    # fails if a name reaches the compiler that is none
+    for bad in ("2 arms", "", "a" * 40):
+        with pytest.raises(InputError, match="name must be a C identifier of at most 39"):
+            export_casadi(MODELS["inputs"](), tmp_path / "a.c", h=0.1, name=bad)
+    assert "model_2_arms_step(" in export_casadi(MODELS["inputs"](), tmp_path / "2 arms.c", h=0.1).read_text()
