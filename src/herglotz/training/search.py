@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 from torch import Tensor
 
@@ -30,7 +29,7 @@ from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import differing_zeros
 from herglotz.training.task import LEAST_GRIP, build_model
-from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Compared, Fitter, Trial, Variant, is_precise, moved
+from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
 FEW = 5  # iterations of a trial's fit, in the place of `ITERATIONS`, on more samples than a search is made of
@@ -234,27 +233,6 @@ class Search:
                 break
             trial = other.grow(fit)
         return trial
-
-    def compared(self, trial: Trial) -> list[dict[str, Any]]:
-        """The models that were compared with this one over segments of its length, as plain values, by their size."""
-        rows: dict[frozenset[str], Compared] = {}
-        for fitter in self.fitters.values():
-            for row in fitter.compared:
-                before = rows.get(row.taken)
-                better = math.isfinite(row.held_out) and (before is None or row.held_out < before.held_out)
-                if row.length == trial.length and better:
-                    rows[row.taken] = row
-        rows[trial.taken] = Compared(trial.length, trial.problem.P, trial.score.rms, trial.taken)
-        order = [offer.name for offer in (*trial.fitter.offers, *trial.fitter.loads)]
-        return [
-            {
-                "numbers": row.numbers,
-                "held_out": row.held_out,
-                "offers": [name for name in order if name in row.taken],
-                "taken": row.taken == trial.taken,
-            }
-            for row in sorted(rows.values(), key=lambda row: (row.numbers, row.held_out))
-        ]
 
     def better_on_a_line(self, trial: Trial | None) -> bool:
         """Whether angles that are taken for positions on a line, as of a free spring, give a better model."""

@@ -24,6 +24,7 @@ from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
 from herglotz.training.baseline import Baseline
+from herglotz.training.compared_models import compared_models
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.distributed import of_first
@@ -65,7 +66,7 @@ class Structure(NamedTuple):
     zeros: tuple[float, ...] = ()  # (B · n) of the sensors, which differ between recordings; found terms are without
     why_zeros: str = ""  # them in words
     turning: bool = True  # angles turn; False: these terms are those of positions on a line, as of a free spring
-    compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`Search.compared`)
+    compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`compared_models`)
     input_terms: tuple[str, ...] = ()  # of inputs, which these terms ask for beside the recorded ones
     hold: str = ""  # of inputs, with which these terms miss the data by far less than with the one that was tried
 
@@ -166,7 +167,7 @@ def search(
     least = least if math.isfinite(noise) else "unknown"
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
-    zeros, why, compared = (), "", read.compared(found)
+    zeros, why, compared = (), "", compared_models(read.fitters.values(), found)
     if differ is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     return Structure(settings, base, words, found.rms, zeros, why, True, compared, more, hold)

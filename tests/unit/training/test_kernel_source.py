@@ -48,7 +48,8 @@ def test_sines_of_multiples_follow_from_one(k):
 def test_sines_of_sums_and_differences_follow_from_those_of_the_angles():
     # fails if only multiples of one number are known
     program, x = program_of("x")
-    wave(program, x[0], 1.0, 0.0), wave(program, x[1], 2.0, 0.0)
+    wave(program, x[0], 1.0, 0.0)
+    wave(program, x[1], 2.0, 0.0)
     minus = add(program, x[0], multiply(program, x[1], -2.0))
     plus = add(program, multiply(program, x[1], 2.0), x[0])
     row = [*program.angles.waves(minus), *program.angles.waves(plus)]

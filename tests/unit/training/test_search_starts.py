@@ -116,6 +116,7 @@ class Asked:
 
     def __init__(self, data, base, config, *, told, seen, name="whole", **_):
         self.data, self.base, self.config, self.told, self.seen, self.name = data, base, config, told, seen, name
+        self.fitters = {}
         self.part = self if name != "whole" or not told.get("long") else self.of(data, "part")
 
     def of(self, data, name=None):
@@ -153,8 +154,12 @@ class Asked:
         wanted = self.answer(f"hold of {best.names[0]}", "")
         return wanted if wanted in holds else ""
 
-    def compared(self, _):
-        return ()
+    def input_terms(self, _):
+        return self.answer("terms", ())
+
+    def driven_by(self, terms):
+        self.seen.append((self.name, f"driven by {', '.join(terms)}"))
+        return self.of(self.data)
 
 
 @pytest.fixture
@@ -162,6 +167,7 @@ def asked(monkeypatch):
     module = sys.modules["herglotz.training.structure"]
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=2)
     base, config = estimate_baseline(data), FitConfig().resolved(data)
+    monkeypatch.setattr(module, "compared_models", lambda *_: ())
     monkeypatch.setattr(module, "settings_of_trial", lambda _, config: (config, base))
 
     def ask(**told):
@@ -180,7 +186,7 @@ def test_the_zeros_of_a_part_are_those_of_all(asked):
     assert found.zeros == pytest.approx((0.0, 0.1))
     assert seen == [
         ("part", "run"), ("part", "zeros"), ("part'", "run"), ("part'", "line"), ("part'", "hold of cos(q1)"),
-        ("part'", "functions"), ("whole", "of_part, True"),
+        ("part'", "terms"), ("part'", "functions"), ("whole", "of_part, True"),
     ]  # fmt: skip
     on_a_line, seen = asked(zeros=zeros, line=True)
     assert not on_a_line.turning
@@ -208,3 +214,13 @@ def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(ask
     found, seen = asked(**{"hold of cos(q1)": "smooth"})
     assert found.hold == "smooth"
     assert [name for name, question in seen if question == "run"] == ["whole", "whole'"]
+
+
+def test_terms_of_inputs_are_those_of_all_data(asked):
+    # fails if functions are asked for where a term of the input is what is missing, or the part alone is driven by it
+    found, seen = asked(long=True, terms=("u^2",))
+    assert found.input_terms == ("u^2",)
+    assert seen[-5:] == [
+        ("part", "terms"), ("whole", "driven by u^2"), ("part", "driven by u^2"), ("part'", "run"),
+        ("part'", "functions"),
+    ]  # fmt: skip
