@@ -137,13 +137,13 @@ def test_a_million_samples():
 
 
 def test_a_million_samples_are_fitted_thinned_or_not_at_all():
-    # fails if `fit` starts what ends in a killed process (a matrix of 10^11 numbers), or its advice does not help
+    # fails if `fit` starts what ends in a killed process, or its advice does not help
     data = Trajectories.of(*motion(torch.arange(1_000_000) * 1e-3))
     begin = time.process_time()
-    with pytest.raises(InputError, match=r"667000 samples to fit, at most 100000 .*--every 7,"):
+    with pytest.raises(InputError, match=r"667000 samples to fit, at most 300000 .*--every 3,"):
         herglotz.fit(data)
     many = replace(data, t=torch.arange(100, dtype=torch.float64).repeat(10_000), lengths=(100,) * 10_000)
-    with pytest.raises(InputError, match=r"--every 5,"):  # many short trajectories are as many states
+    with pytest.raises(InputError, match=r"--every 2,"):  # many short trajectories are as many states
         herglotz.fit(many, FitConfig(train_fraction=0.5))
     assert time.process_time() - begin < 20
     run = herglotz.fit(data.thinned(2000), FitConfig(iterations=5))

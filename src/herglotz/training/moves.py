@@ -18,7 +18,7 @@ from herglotz.training.score import Score, scores
 from herglotz.training.trials import Trial
 
 AT_ONCE = 8  # offers of which one leaves at once: of 80 ten, of fewer than 16 one
-MEMORY = 10_000_000  # numbers in the curvatures of sets that are compared at once: 80 MB
+MEMORY = 10_000_000  # numbers in the curvatures, and in the residuals, of sets that are compared at once: 80 MB
 
 Offers = frozenset[str]
 
@@ -51,7 +51,8 @@ class Moves:
         """Of models with these sets of offers."""
         sets = list(sets)
         new = [own for own in dict.fromkeys(sets) if own not in self.known]
-        many = max(1, MEMORY // (BLOCKS * (1 + max(map(len, new), default=0)) ** 2))
+        curvatures = BLOCKS * (1 + max(map(len, new), default=0)) ** 2
+        many = max(1, MEMORY // max(curvatures, self.trial.problem.data.q.numel()))
         for k in range(0, len(new), many):
             part = new[k : k + many]
             self.known.update(zip(part, self.foretold(part), strict=True))
