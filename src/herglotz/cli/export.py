@@ -38,6 +38,9 @@ FLAGS = (
          type=positive, nargs=2, metavar=("LOW", "HIGH")),
     flag("--name", "what every name in a C header begins with, so that headers of two models fit into one program "
          "(default: the name of the file)", metavar="PREFIX"),
+    flag("--parameters", "numbers of the model that a C program sets at run time, friction.viscous[0] or "
+         "friction.viscous for all of them, with bounds if wanted: damping.rate=0:2", nargs="+",
+         metavar="NAME[=LOW:HIGH]"),
     FORCE,
     flag("--json", "print what was written as JSON", action="store_true"),
 )  # fmt: skip
@@ -52,6 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
     if kicks.is_file() and form == "c":
         if arguments.name is not None:
             raise InputError("--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out")
+        if arguments.parameters is not None:
+            raise InputError("--parameters: kicks that tune chose have fixed numbers; leave --parameters out")
         return _kicks(arguments, kicks)
 
     from herglotz.training import load_run
@@ -60,9 +65,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.export import export_run, load_exported
     from herglotz.export.c_header import read_metadata
+    from herglotz.export.parameters import parsed
 
     warn_of_misfit(result, "the file will not step as the recorded system does")
-    export_run(result, arguments.out, form, h_range=arguments.h_range, name=arguments.name)
+    parameters = parsed(arguments.parameters or ())
+    export_run(result, arguments.out, form, h_range=arguments.h_range, name=arguments.name, parameters=parameters)
     if form == "c":  # the header is read, not compiled: no compiler is needed to write it
         found = read_metadata(arguments.out.read_text(), arguments.out)
     else:

@@ -21,7 +21,9 @@ from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, as_lanes, model_source
+from herglotz.export.lower.c_parameters import constants as parameter_constants, inputs_source, without_parameters
 from herglotz.export.metadata import check_metadata, describe, from_json
+from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.export.step_parts import pushed
 from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
@@ -111,6 +113,7 @@ def export_c(
     dtype: str = "float64",
     h_range: tuple[float, float] | None = None,
     tolerance: float | None = None,
+    parameters: Chosen = (),
     metadata: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
@@ -142,6 +145,10 @@ def export_c(
     tolerance
         Of Newton, relative to the size of q: where the model is no more exact than this, fewer iterations serve as
         well. Default: 16 machine epsilons.
+    parameters
+        Numbers of the model that are set at run time, in its own units: names as of `numbers_of`, those of several
+        numbers (`friction.viscous`) too, or names with (low, high), None without a bound. Their values in the model are
+        the defaults.
     metadata
         Further JSON-ready entries for the comment at the top.
 
@@ -159,6 +166,8 @@ def export_c(
     name = _identifier(path.stem) if name is None else name
     extra = dict(metadata or {})
     extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
+    if parameters:
+        extra["parameters"] = described_parameters(model, parameters)
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     check_metadata(entries, path)
     content = sealed_text(c_source(model, entries, path.name)).encode()
@@ -173,13 +182,19 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     Without `derivatives`, and beyond 8 coordinates, NAME_step_jacobian is left out: it is most of the work.
     """
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
-    equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
+    chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
+    equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)  # rounded once, when numbers are written
     step = StepInC(equations)
+    inputs, parameters = _inputs(model, entries["dtype"]), ""
+    if chosen:
+        inputs = inputs_source(copy.deepcopy(model).double(), chosen, step.program.tables)
+        parameters = parameter_constants(entries["parameters"], entries["dtype"]) + runtime("parameters.h")
     emitted = model_source(step, equations, derivatives)
-    types, number_tests, functions, products, checks, one_step, run, api = map(runtime, RUNTIME)
+    shown = (lambda text: text) if chosen else without_parameters
+    types, number_tests, functions, products, checks, one_step, run, api = (shown(runtime(x)) for x in RUNTIME)
     dtype = entries["dtype"]
-    parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests, functions, products]
-    parts += [emitted.tables, _inputs(model, dtype), checks, as_scalars(emitted.step + one_step + run)]
+    parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests + parameters]
+    parts += [functions, products, emitted.tables, inputs, checks, as_scalars(emitted.step + one_step + run)]
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
     parts += [as_scalars(emitted.slopes), api, "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
@@ -251,7 +266,7 @@ def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
     return TOP.format(
         version=entries["herglotz_version"],
         file="@FILE@",
-        no_u="0, " if inputs else "",
+        no_u="0, " * ((inputs > 0) + ("parameters" in entries)),
         arrival=_arrival(entries),
         mark=MARK,
         comment="@METADATA@",

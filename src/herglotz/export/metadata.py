@@ -79,6 +79,7 @@ class Metadata(_Needed, total=False):
     arrival: _Arrival
     columns: list[tuple[str, str, str]]  # name, role, unit
     name: str
+    parameters: dict[str, tuple[float, float | None, float | None]]  # set at run time: default, low, high
 
 
 def describe(

@@ -11,6 +11,7 @@ from herglotz.export.c_header import export_c
 from herglotz.export.lower.aoti import export_aoti
 from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
+from herglotz.export.parameters import Chosen
 from herglotz.training import Run
 from herglotz.training.summary import model_card
 
@@ -25,6 +26,7 @@ def export_run(
     *,
     h_range: tuple[float, float] | None = None,
     name: str | None = None,
+    parameters: Chosen = (),
 ) -> Path:
     """Write the model of a run as one file that steps without this package.
 
@@ -41,11 +43,14 @@ def export_run(
         is taken for it: recorded times carry rounding, and 0.2 means a step of 0.2000000000000002 too.
     name
         Prefix of every name in a C header, as of `export_c`; None: that of the file.
+    parameters
+        Numbers that a C header takes at run time, as of `export_c`.
 
     Raises
     ------
     InputError
-        If the name has another end, the format cannot hold the model, or a prefix is given for another format than C.
+        If the name has another end, the format cannot hold the model, or a prefix or parameters are given for another
+        format than C.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
@@ -53,6 +58,8 @@ def export_run(
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
     if name is not None and kind != "c":
         raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
+    if parameters and kind != "c":
+        raise InputError(f"{path}: parameters at run time are of C headers only, not of {kind}; leave them out")
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or run.h_range]
     metadata = {
@@ -70,5 +77,7 @@ def export_run(
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
     if name is not None:
         described["name"] = name
+    if parameters:
+        described["parameters"] = parameters
     WRITERS[kind](run.model, path, **described)
     return path
