@@ -114,6 +114,7 @@ def export_c(
     h_range: tuple[float, float] | None = None,
     tolerance: float | None = None,
     parameters: Chosen = (),
+    extras: Sequence[str] = (),
     metadata: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
@@ -149,6 +150,8 @@ def export_c(
         Numbers of the model that are set at run time, in its own units: names as of `numbers_of`, those of several
         numbers (`friction.viscous`) too, or names with (low, high), None without a bound. Their values in the model are
         the defaults.
+    extras
+        What else the header holds: "adjoint" (`NAME_step_vjp`, `NAME_rollout_vjp`), "filter" (`NAME_filter_…`).
     metadata
         Further JSON-ready entries for the comment at the top.
 
@@ -168,6 +171,8 @@ def export_c(
     extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
     if parameters:
         extra["parameters"] = described_parameters(model, parameters)
+    if extras:
+        extra["extras"] = list(extras)
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     check_metadata(entries, path)
     content = sealed_text(c_source(model, entries, path.name)).encode()
@@ -189,7 +194,8 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     if chosen:
         inputs = inputs_source(copy.deepcopy(model).double(), chosen, step.program.tables)
         parameters = parameter_constants(entries["parameters"], entries["dtype"]) + runtime("parameters.h")
-    emitted = model_source(step, equations, derivatives)
+    extras = entries.get("extras", ())
+    emitted = model_source(step, equations, derivatives, "adjoint" in extras)
     shown = (lambda text: text) if chosen else without_parameters
     types, number_tests, functions, products, checks, one_step, run, api = (shown(runtime(x)) for x in RUNTIME)
     dtype = entries["dtype"]
@@ -197,7 +203,8 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     parts += [functions, products, emitted.tables, inputs, checks, as_scalars(emitted.step + one_step + run)]
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
-    parts += [as_scalars(emitted.slopes), api, "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+    parts += [as_scalars(emitted.slopes), api, *(shown(runtime(f"{name}.h")) for name in extras)]
+    parts += ["#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     last = {

@@ -18,7 +18,7 @@ from herglotz.models.numbers import WithNumbers
 from herglotz.stepping import State
 from herglotz.stepping.equation import StepOfModel, model_equation
 from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
+from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian, step_pull
 from herglotz.stepping.partials_equation import End, PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip
@@ -139,6 +139,22 @@ class Equations:
             return dense(step_jacobian(functions, State(q, p, s), h, delta, u, theta=theta))
 
         return traced(slopes, (q, p, s, h, 0.1 * p, *u, *self.theta))
+
+    @cached_property
+    def pull(self) -> Graph:
+        """`step_pull` of a solved step at Δ, side by side: (2n+2+m+K,) of the derivatives (B, 2n+1) by what follows."""
+        q, p, s, h, *u = example(self.model, 0.1)
+        functions = self.of_numbers(step_functions(self.model))
+
+        def pull(
+            q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, after: Tensor, *more: Tensor
+        ) -> tuple[Tensor, ...]:
+            u, theta = more[0] if self.model.inputs else None, more[-1] if self.numbers else None
+            rows, by_theta = step_pull(functions, State(q, p, s), h, delta, u, after, theta)
+            return (dense(rows),) if by_theta is None else (dense(rows), dense(by_theta))
+
+        after = torch.cat([0.3 * q, 0.2 * p, s[:, None] + 1], -1)
+        return traced(pull, (q, p, s, h, 0.1 * p, after, *u, *self.theta))
 
     def _traced(self, function: Callable[..., Any]) -> Graph:
         q, p, s, h, *u = example(self.model, 0.1)

@@ -126,6 +126,38 @@ def step_jacobian(
     return torch.cat([ddelta + start[:n], ends[..., :n, :], ends[..., n:, :] + start[2 * n :]], -2)
 
 
+def step_pull(
+    functions: StepFunctions,
+    state: State,  # (..., n), (..., n), (...)
+    h: Tensor,  # (...)
+    delta: Tensor,  # (..., n) the solution of F = 0
+    u: Tensor | None,  # (..., m)
+    after: Tensor,  # (..., 2n+1) derivatives of a number by (q, p, s) after the step
+    theta: Tensor | None = None,  # (K,) shared by all samples: the last argument of `functions`
+) -> tuple[Tensor, Tensor | None]:
+    """Its derivatives by (q, p, s, h, u), (..., 2n+2+m), and by θ, (K,) summed over samples: `step_jacobian`ᵀ times it.
+
+    In reverse mode: with r = ∂/∂q1 + p1_Δᵀ ∂/∂p1 + L_Δ ∂/∂s1 and F_Δᵀ λ = r, they are those of p1ᵀ∂/∂p1 + L ∂/∂s1 − λᵀF.
+    """
+    q, p, s = state
+    n, more = q.shape[-1], () if theta is None else (theta,)
+    by_q, by_p, by_s = after[..., :n], after[..., n : 2 * n], after[..., 2 * n]
+
+    def values(q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+        return functions(q, p, s, h, delta, None if u is None else rest[0], *rest[u is not None :])
+
+    arguments = (q, p, s, h, delta, *(() if u is None else (u,)), *more)
+    pull = torch.func.vjp(values, *arguments)[1]
+    r = by_q + pull((torch.zeros_like(q), by_p, by_s))[4]
+    rest = arguments[5:]
+    F_delta = forward_slopes(lambda *x: values(*x[:4], x[-1], *x[4:-1])[0], q, p, s, h, *rest, delta)
+    lam = eliminate(F_delta.mT, r[..., None])[..., 0]
+    found = pull((-lam, by_p, by_s))
+    inputs = () if u is None else (found[5],)
+    rows = [found[0] + by_q, found[1], (found[2] + by_s)[..., None], found[3][..., None], *inputs]
+    return torch.cat(rows, -1), None if theta is None else found[-1]
+
+
 def forward_slopes(values: Callable[..., Tensor], *points: Tensor) -> Tensor:
     """The Jacobian (..., m, k) of `values`(..., x) → (..., m) by its last point, (..., k) or (k,), in forward mode."""
     *first, point = points

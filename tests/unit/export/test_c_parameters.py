@@ -34,6 +34,7 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
     "dry, drag": (2, {"level": "forced", "inputs": 1, "coulomb": True, "drag": ("|v1| v1", "load 2")}),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
 }
+QUICK = ("conservative", "affine", "viscous, motors", "sticking")  # the others take 5 s and more each
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -78,7 +79,7 @@ def blocks(found):
     return torch.cat([x for x in parts if x is not None], -1)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.slow) for x in CASES])
 def test_steps_at_other_numbers_are_those_of_the_model_with_them(case):
     # fails if a number stays what it was when the header was written, in a step, a guess, a start, the map of inputs,
     # V at q0 or a derivative; if lanes have other numbers than a sample by itself; or a derivative is another number's

@@ -149,7 +149,7 @@ class Emitted(NamedTuple):
     slopes: str  # the derivative of a step
 
 
-def model_source(step: StepInC, equations: Equations, derivatives: bool) -> Emitted:
+def model_source(step: StepInC, equations: Equations, derivatives: bool, adjoint: bool = False) -> Emitted:
     """The emitted parts of a header, with constants as `R(0.5)`."""
     program, K = Program(tables=step.program.tables), len(equations.numbers or ())
     given = [program.given("q", step.n), *([program.given("theta", K)] if K else [])]
@@ -165,6 +165,7 @@ def model_source(step: StepInC, equations: Equations, derivatives: bool) -> Emit
     texts = TYPES.format(push=push, problem=step.members("P"),
                          terms=step.members("t")) + whole(program, head, outputs) + step.source()  # fmt: skip
     slopes = _slopes_source(equations, step) if derivatives else ""
+    slopes += _pull_source(equations, step) if adjoint else ""
     tables = "".join(
         f"static const hz_real {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
         for row, name in step.program.tables.items()
@@ -212,3 +213,15 @@ def _slopes_source(equations: Equations, step: StepInC) -> str:
     head = "\n/* d(q, p, s)' / d(q, p, s, h, push) at the solution q1 = q0 + move, row by row. */\n"
     head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
     return whole(program, head, {"slopes": list(slopes.ravel())})
+
+
+def _pull_source(equations: Equations, step: StepInC) -> str:
+    """The derivative of a solved step, transposed and times a vector, as a C function."""
+    program = Program(tables=step.program.tables)
+    n, m = step.n, step.m
+    sizes = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "move": n, "of": 2 * n + 1, **({"P->push": m} if m else {})}
+    sizes |= equations_theta(equations)
+    rows = interpret(program, equations.pull, [program.given(name, size) for name, size in sizes.items()])
+    head = "\n/* The derivatives by (q, p, s, h, push) before a solved step from those `of` (q, p, s)' after it. */\n"
+    head += "static inline void FN_pull(const FN_problem *P, const REAL move[hz_N], const REAL *of, REAL *pulled)"
+    return whole(program, head, {"pulled": [x for row in rows for x in row.ravel()]})
