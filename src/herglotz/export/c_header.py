@@ -18,6 +18,7 @@ from herglotz.data.files import PathLike, write_atomically
 from herglotz.data.holds import Arrival
 from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
+from herglotz.export.c_extras import check_extras, extras_source
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, as_lanes, model_source
@@ -172,6 +173,7 @@ def export_c(
     if parameters:
         extra["parameters"] = described_parameters(model, parameters)
     if extras:
+        check_extras(extras, model.dof, MAX_DERIVATIVES)
         extra["extras"] = list(extras)
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     check_metadata(entries, path)
@@ -190,12 +192,11 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
     equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)  # rounded once, when numbers are written
     step = StepInC(equations)
-    inputs, parameters = _inputs(model, entries["dtype"]), ""
+    inputs, parameters = inputs_constants(model, entries["dtype"]), ""
     if chosen:
         inputs = inputs_source(copy.deepcopy(model).double(), chosen, step.program.tables)
         parameters = parameter_constants(entries["parameters"], entries["dtype"]) + runtime("parameters.h")
-    extras = entries.get("extras", ())
-    emitted = model_source(step, equations, derivatives, "adjoint" in extras)
+    emitted = model_source(step, equations, derivatives, "adjoint" in entries.get("extras", ()))
     shown = (lambda text: text) if chosen else without_parameters
     types, number_tests, functions, products, checks, one_step, run, api = (shown(runtime(x)) for x in RUNTIME)
     dtype = entries["dtype"]
@@ -203,7 +204,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     parts += [functions, products, emitted.tables, inputs, checks, as_scalars(emitted.step + one_step + run)]
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
-    parts += [as_scalars(emitted.slopes), api, *(shown(runtime(f"{name}.h")) for name in extras)]
+    parts += [as_scalars(emitted.slopes), api, *extras_source(model, entries, lambda name: shown(runtime(name)))]
     parts += ["#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
@@ -314,19 +315,6 @@ def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
         box=_box_constants(entries["box"], dtype),
         start=_start_constant(entries, dtype),
     )
-
-
-def _inputs(model: ContactLagrangian, dtype: str) -> str:
-    """The matrix G of the inputs and −G u₀, where the model takes some."""
-    if not model.config.inputs or model.friction is None:
-        return ""
-    map_, offset = (
-        numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype)
-        for x in (model.friction.input_map, model.friction.offset())
-    )
-    lines = ["/* The forces of inputs u are input_map u + input_offset. */"]
-    lines.append(f"static const hz_real hz_input_map[hz_N * hz_M] = {{{map_}}};")
-    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_N] = {{{offset}}};\n"])
 
 
 def _box_constants(box: Mapping[str, list[float]] | None, dtype: str) -> str:

@@ -81,6 +81,7 @@ class Metadata(_Needed, total=False):
     columns: list[tuple[str, str, str]]  # name, role, unit
     name: str
     extras: list[str]  # of `EXTRAS`
+    noise: dict[str, list[float]]  # of a filter: standard deviations of position, momentum and theta
     parameters: dict[str, tuple[float, float | None, float | None]]  # set at run time: default, low, high
 
 

@@ -137,7 +137,7 @@ def step_pull(
 ) -> tuple[Tensor, Tensor | None]:
     """Its derivatives by (q, p, s, h, u), (..., 2n+2+m), and by θ, (K,) summed over samples: `step_jacobian`ᵀ times it.
 
-    In reverse mode: with r = ∂/∂q1 + p1_Δᵀ ∂/∂p1 + L_Δ ∂/∂s1 and F_Δᵀ λ = r, they are those of p1ᵀ∂/∂p1 + L ∂/∂s1 − λᵀF.
+    Reverse mode: with r = ∂/∂q1 + p1_Δᵀ ∂/∂p1 + L_Δ ∂/∂s1 and F_Δᵀ λ = r, they are those of p1ᵀ∂/∂p1 + L ∂/∂s1 − Fᵀλ.
     """
     q, p, s = state
     n, more = q.shape[-1], () if theta is None else (theta,)

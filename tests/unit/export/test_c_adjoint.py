@@ -1,12 +1,11 @@
 """Vector–Jacobian products in C against autograd through the eager stepper, over one step and over a rollout."""
 
-import ctypes
 import re
 import shutil
 
 import pytest
 import torch
-from test_c_parameters import CASES, H, _quick_compiler, join, named, problem  # noqa: F401  the fixture
+from test_c_parameters import CASES, H, _quick_compiler, address, join, named, problem  # noqa: F401  the fixture
 
 from herglotz.codegen.c_compiler import build
 from herglotz.export.c_header import c_source, described
@@ -51,10 +50,6 @@ def library_of(model, names):
     extra = {"h_range": None, "parameters": described_parameters(model, names), "extras": ["adjoint"]}
     entries = described(model, describe(model, H, None, (), 30, extra), "arm", "float64", None)
     return build(c_source(model, entries, "stepper.h", derivatives=False), loops)
-
-
-def address(x):
-    return ctypes.c_void_p(None if x is None else x.data_ptr())
 
 
 @pytest.mark.parametrize("case", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.slow) for x in CASES])

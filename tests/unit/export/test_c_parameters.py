@@ -1,5 +1,6 @@
 """Numbers of a model that a C program sets between steps: steps, derivatives, bounds, and headers without them."""
 
+import ctypes
 import re
 import shutil
 import subprocess
@@ -24,6 +25,7 @@ from herglotz.stepping import State, Stepper
 COMPILER = next((c for c in ("gcc", "clang") if shutil.which(c)), None)
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="neither gcc nor clang in the PATH")
 H = 0.1
+WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 # One to three coordinates, every level; a case has numbers in every term that a level can have.
 CASES: dict[str, tuple[int, dict[str, Any]]] = {
     "conservative": (1, {"level": "conservative"}),
@@ -35,6 +37,10 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
 }
 QUICK = ("conservative", "affine", "viscous, motors", "sticking")  # the others take 5 s and more each
+
+
+def address(x):
+    return ctypes.c_void_p(None if x is None else x.data_ptr())
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -184,9 +190,8 @@ def test_bounds_and_defaults_in_c(tmp_path):
     bounds = {"damping.rate": (0.0, 2.0), "friction.input_map": None, "friction.input_zero": (None, 1.0)}
     export_c(model, tmp_path / "stepper.h", h=H, name="arm", parameters=bounds)
     (tmp_path / "use.c").write_text(PROGRAM)
-    warnings = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
     safe = ("-O0", "-fno-sanitize-recover=all", "-fsanitize=address,undefined")
-    command = [str(COMPILER), "-std=c99", *warnings, *safe, str(tmp_path / "use.c"), "-o", str(tmp_path / "use"), "-lm"]
+    command = [str(COMPILER), "-std=c99", *WARNINGS, *safe, str(tmp_path / "use.c"), "-o", str(tmp_path / "use"), "-lm"]
     built = subprocess.run(command, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr[:2000]
     words = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout.split()

@@ -47,6 +47,19 @@ def identifier(name: str) -> str:
     return re.sub(r"\W+", "_", name).strip("_")
 
 
+def inputs_constants(model: ContactLagrangian, dtype: str) -> str:
+    """The matrix G of the inputs and −G u₀, where the model takes some."""
+    if not model.config.inputs or model.friction is None:
+        return ""
+    map_, offset = (
+        numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype)
+        for x in (model.friction.input_map, model.friction.offset())
+    )
+    lines = ["/* The forces of inputs u are input_map u + input_offset. */"]
+    lines.append(f"static const hz_real hz_input_map[hz_N * hz_M] = {{{map_}}};")
+    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_N] = {{{offset}}};\n"])
+
+
 def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables: dict[tuple[float, ...], str]) -> str:
     """The matrix G of the inputs and −G u₀, and the derivative of G (u − u₀) by θ, as functions of θ."""
     if not model.inputs:
