@@ -22,7 +22,12 @@ from herglotz.export.c_extras import check_extras, extras_source
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, as_lanes, model_source
-from herglotz.export.lower.c_parameters import constants as parameter_constants, inputs_source, without_parameters
+from herglotz.export.lower.c_parameters import (
+    constants as parameter_constants,
+    inputs_constants,
+    inputs_source,
+    without_parameters,
+)
 from herglotz.export.metadata import check_metadata, describe, from_json
 from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.export.step_parts import pushed
