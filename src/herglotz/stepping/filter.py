@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -59,6 +59,8 @@ class KalmanFilter:
         Names of numbers of the model, as of `chosen`, that are estimated too.
     bounds
         (low, high) of some of them, by name; their estimates stay within.
+    stepper
+        What steps and differentiates the model, its numbers set by `with_parameters`; by default `Stepper`.
     """
 
     def __init__(
@@ -67,7 +69,9 @@ class KalmanFilter:
         noise: Noise,
         parameters: Sequence[str] = (),
         bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
+        stepper: Any = None,  # an `ExportedStepper`: this room is below its
     ):
+        self.stepper = stepper
         self.model, self.noise, self.n = model, noise, model.dof
         self.names = chosen(model, parameters)
         self.kept = 2 * self.n + model.s_enters_motion  # of q, p[, s] in the filter's state
@@ -130,29 +134,34 @@ class KalmanFilter:
         theta = torch.minimum(torch.maximum(x[self.kept :], self.low), self.high)
         return Belief(State(x[: self.n], x[self.n : 2 * self.n], s), theta, P), surprise
 
-    def velocity(self, belief: Belief, h: float, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The velocity (n,) and its covariance (n, n): v = 4 d(h/2)/h − d(h)/h from the moves d of steps of h and h/2.
+    def velocity(self, belief: Belief, h: Tensor | float, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The velocity (n,) and its covariance (n, n); of many beliefs at once where no θ is estimated.
 
-        That is exact to order 2 in h. Raise InputError if the model has no step there.
+        v = 4 d(h/2)/h − d(h)/h from the moves d of steps of h and h/2, exact to order 2 in h. Raise InputError if the
+        model has no step there.
         """
         n, kept, P = self.n, self.kept, belief.covariance
-        v, G = P.new_zeros(n), P.new_zeros(n, len(P))
+        v, G = torch.zeros_like(belief.state.q), P.new_zeros(*P.shape[:-2], n, P.shape[-1])
+        h = torch.as_tensor(h, dtype=P.dtype)
         for size, by in ((h, -1 / h), (h / 2, 4 / h)):
             found = self._stepped(belief, size, u)
-            v = v + by * (found.step.state.q - belief.state.q)
-            G[:, :kept] += by * (found.by_state[:n, :kept] - torch.eye(n, kept, dtype=P.dtype))
+            v = v + by[..., None] * (found.step.state.q - belief.state.q)
+            own = found.by_state[..., :n, :kept] - torch.eye(n, kept, dtype=P.dtype)
+            G[..., :kept] += by[..., None, None] * own
             if found.by_parameters is not None:
-                G[:, kept:] += by * found.by_parameters[:n]
-        return v, G @ P @ G.T
+                G[..., kept:] += by[..., None, None] * found.by_parameters[..., :n, :]
+        return v, G @ P @ G.mT
 
-    def _stepped(self, belief: Belief, h: float, u: Tensor | None) -> Linearised:
-        model = self.model
-        if self.names:
-            model = with_values(model, dict(zip(self.names, belief.theta.tolist(), strict=True)))
-        found = Stepper(model).linearise(belief.state, h, u, self.names)
-        if int(found.step.status) != Status.CONVERGED:
-            reason = Status(int(found.step.status)).name
-            raise InputError(
-                f"the model has no step of {h:g} from q = {belief.state.q.tolist()} ({reason}); start nearer"
-            )
+    def _stepped(self, belief: Belief, h: Tensor | float, u: Tensor | None) -> Linearised:
+        values = dict(zip(self.names, belief.theta.tolist(), strict=True)) if self.names else {}
+        if self.stepper is not None:
+            found = (self.stepper.with_parameters(values) if values else self.stepper).linearise(belief.state, h, u)
+        else:
+            model = with_values(self.model, values) if values else self.model
+            found = Stepper(model).linearise(belief.state, h, u, self.names)
+        failed = found.step.status != Status.CONVERGED
+        if bool(failed.any()):
+            at, size = belief.state.q[failed].reshape(-1, self.n)[0], float(torch.as_tensor(h).max())
+            reason = Status(int(found.step.status[failed][0])).name
+            raise InputError(f"the model has no step of {size:g} from q = {at.tolist()} ({reason}); start nearer to it")
         return found
