@@ -41,6 +41,8 @@ FLAGS = (
     flag("--parameters", "numbers of the model that a C program sets at run time, friction.viscous[0] or "
          "friction.viscous for all of them, with bounds if wanted: damping.rate=0:2", nargs="+",
          metavar="NAME[=LOW:HIGH]"),
+    flag("--extras", "what else a C header holds: adjoint (vector-Jacobian products of steps and rollouts), filter "
+         "(a Kalman filter with the noise of the fit)", nargs="+", choices=("adjoint", "filter")),
     FORCE,
     flag("--json", "print what was written as JSON", action="store_true"),
 )  # fmt: skip
@@ -55,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
     if kicks.is_file() and form == "c":
         if arguments.name is not None:
             raise InputError("--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out")
-        if arguments.parameters is not None:
-            raise InputError("--parameters: kicks that tune chose have fixed numbers; leave --parameters out")
+        if arguments.parameters is not None or arguments.extras is not None:
+            raise InputError("--parameters, --extras: kicks that tune chose have neither; leave them out")
         return _kicks(arguments, kicks)
 
     from herglotz.training import load_run
@@ -69,7 +71,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     warn_of_misfit(result, "the file will not step as the recorded system does")
     parameters = parsed(arguments.parameters or ())
-    export_run(result, arguments.out, form, h_range=arguments.h_range, name=arguments.name, parameters=parameters)
+    export_run(
+        result,
+        arguments.out,
+        form,
+        h_range=arguments.h_range,
+        name=arguments.name,
+        parameters=parameters,
+        extras=arguments.extras or (),
+    )
     if form == "c":  # the header is read, not compiled: no compiler is needed to write it
         found = read_metadata(arguments.out.read_text(), arguments.out)
     else:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from herglotz.errors import InputError
 from herglotz.export.c_header import export_c
+from herglotz.export.filtering import noise_of
 from herglotz.export.lower.aoti import export_aoti
 from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
-from herglotz.export.parameters import Chosen
+from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.training import Run
 from herglotz.training.summary import model_card
 
@@ -27,6 +29,7 @@ def export_run(
     h_range: tuple[float, float] | None = None,
     name: str | None = None,
     parameters: Chosen = (),
+    extras: Sequence[str] = (),
 ) -> Path:
     """Write the model of a run as one file that steps without this package.
 
@@ -45,6 +48,8 @@ def export_run(
         Prefix of every name in a C header, as of `export_c`; None: that of the file.
     parameters
         Numbers that a C header takes at run time, as of `export_c`.
+    extras
+        What else a C header holds, as of `export_c`; a filter has the noise of the fit as `NAME_noise_of_fit`.
 
     Raises
     ------
@@ -58,8 +63,8 @@ def export_run(
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
     if name is not None and kind != "c":
         raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
-    if parameters and kind != "c":
-        raise InputError(f"{path}: parameters at run time are of C headers only, not of {kind}; leave them out")
+    if (parameters or extras) and kind != "c":
+        raise InputError(f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out")
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or run.h_range]
     metadata = {
@@ -79,5 +84,10 @@ def export_run(
         described["name"] = name
     if parameters:
         described["parameters"] = parameters
+    if extras:
+        described["extras"] = list(extras)
+    if "filter" in extras:
+        still = (0.0,) * len(described_parameters(run.model, parameters))
+        metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}
     WRITERS[kind](run.model, path, **described)
     return path

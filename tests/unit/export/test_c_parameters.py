@@ -139,8 +139,9 @@ def test_no_trace_of_parameters_in_a_header_that_has_none(tmp_path):
     plain, other = ((tmp_path / name).read_text() for name in ("a.h", "b.h"))
     assert not re.search(r"(?i)theta|arm_P\b|parameter", plain.replace("herglotz-metadata", ""))
     assert "arm_P" in other
-    for name in RUNTIME:
+    for name in (*RUNTIME, "library.c"):
         marked = runtime(name)
+        assert not re.search(r"hz_P\b|THETA|parameters", without_parameters(marked)), name
         lines = without_parameters(marked).splitlines()
         assert set(lines) <= {re.sub(r"hz_TAKES_THETA |hz_WITH_THETA\([^)]*\) | \+ hz_P\b", "", x) for x in
                               marked.splitlines()}, name  # fmt: skip

@@ -27,8 +27,8 @@ static void store(const hz_state *x, long at, hz_real *q_out, hz_real *p_out, hz
 void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
     long h_sample, long h_step, const hz_real *u, long u_sample, hz_TAKES_THETA hz_real *q_out, hz_real *p_out, hz_real *s_out,
     hz_real *sigma_out, unsigned char *status_out, hz_real *residual_out) {
-  const hz_job job = {steps, 1, h, h_sample, h_step, hz_WITH_U(u) hz_WITH_U(u_sample) hz_WITH_THETA(theta)
-                      q_out, p_out, s_out, sigma_out, residual_out, status_out};
+  const hz_job job = {steps, 1, h, h_sample, h_step, hz_WITH_U(u) hz_WITH_U(u_sample)
+                      hz_WITH_THETA(theta) q_out, p_out, s_out, sigma_out, residual_out, status_out};
   hz_state x[hz_SIDE];
   int status[hz_SIDE], w;
   long b;
