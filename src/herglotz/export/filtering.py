@@ -60,7 +60,7 @@ def filter(
     parameters: Mapping[str, tuple[float, float]] | None = None,
     noise: Noise | None = None,
 ) -> Filtered:
-    """Follow a recording by an extended Kalman filter on the run's step: x ← x + P_q (y − q)/S at each sample.
+    """Follow a recording by an extended Kalman filter on the run's step: x = x⁻ + P_q (y − q)/S at each sample.
 
     Each trajectory starts at its first two samples. The same filter stands in a C header that is exported with
     `extras=["filter"]` (`docs/c.md`).

@@ -5,17 +5,21 @@ import re
 import shutil
 import subprocess
 from statistics import NormalDist
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from test_c_parameters import COMPILER, WARNINGS, _quick_compiler, address  # noqa: F401  the fixture
 
+import herglotz as hz
 from herglotz.codegen.c_compiler import build
+from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.export import export_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of
-from herglotz.stepping import State
+from herglotz.stepping import State, Stepper
 from herglotz.stepping.filter import KalmanFilter, Noise
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="neither gcc nor clang in the PATH")
@@ -261,3 +265,32 @@ def test_noise_that_is_none_is_refused(double_pendulum, tmp_path):
         kalman.update(kalman.start(rest, STD), torch.tensor([0.0, torch.nan], dtype=torch.float64))
     with pytest.raises(InputError, match="extras may be"):
         export_c(double_pendulum, tmp_path / "x.h", h=H, extras=["smoother"])
+
+
+def test_a_recording_is_followed_with_the_noise_of_the_fit():
+    # fails if the noise of the fit is not that of the filter (its surprise is then not 1), a gap is one large step, a
+    # recording's input or a number that is estimated is left out, or trajectories run into one another
+    config = ModelConfig((True,), "forced", (1.0,), (2.0,), (4.0,), (0.0,), rate=0.0, potential_width=0)
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        model.friction.viscous.fill_(0.4)  # pyright: ignore[reportOptionalMemberAccess]
+        start = torch.tensor([[1.0], [-0.6]], dtype=torch.float64)
+        exact = Stepper(model).rollout(start, 0 * start, 0 * start[:, 0], h=H, steps=80).q
+    noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    kept = torch.cat([torch.arange(30), torch.arange(34, 81)])  # a gap of five steps
+    t, y = (kept * H).double().repeat(2), (exact + 0.01 * noise)[:, kept].reshape(-1, 1)
+    data = Trajectories.of(t, y, (len(kept),) * 2, names=("a",), units=("rad",), angles=(True,))
+    span = (H * (1 - 1e-7), H * (1 + 1e-7))
+    run: Any = SimpleNamespace(
+        model=model, metrics={"sigma": 0.01}, data=data, h=H, h_range=span, arrival=data.arrival,
+        config=SimpleNamespace(frequencies=()),
+    )  # fmt: skip
+    found = hz.filter(run, data, {"friction.viscous[0]": (0.3, 0.0)})
+    assert 0.7 <= float(found.surprise.nanmean()) <= 1.3
+    assert found.surprise.isnan().nonzero()[:, 0].tolist() == [0, len(kept)]
+    v = (exact[:, 2:] - exact[:, :-2]) / (2 * H)
+    miss = found.v.reshape(2, -1)[:, -30:-1] - v[:, kept[-30:-1] - 1, 0]
+    assert float(miss.square().mean().sqrt()) <= 0.01
+    theta, std = found.theta[-1, 0], found.covariance[-1, -1, -1].sqrt()
+    assert std < 0.1
+    assert abs(float(theta) - 0.4) <= 3 * std
