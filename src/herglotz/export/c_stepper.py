@@ -6,6 +6,7 @@ import copy
 import ctypes
 import re
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any
 
 import torch
@@ -43,8 +44,10 @@ class CLibrary:
         self.parameters: dict[str, Any] = self.metadata.get("parameters", {})
         self.theta = torch.tensor(checked_values(self.parameters, {}), dtype=self.dtype)
         self.library = build(header, library_of(self.metadata))
-        self.whole = whole
-        self.differentiates = self.library if whole is None else None
+        # Built on first use, once for all copies: most steppers are not differentiated.
+        self.differentiates = cache(
+            lambda: self.library if whole is None else build(whole(), library_of(self.metadata))
+        )
 
     def with_values(self, values: Mapping[str, float]) -> CLibrary:
         """The same with other values of the numbers that are set at run time; those not named have their defaults."""
@@ -64,9 +67,6 @@ class CLibrary:
 
     def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
         """A step and its derivative (B, 2n+1, 2n+2+m+K); NaN where the step failed."""
-        if self.differentiates is None:  # built on first use: most steppers are not differentiated
-            assert self.whole is not None
-            self.differentiates = build(self.whole(), library_of(self.metadata))
         count, size = len(s), 2 * self.dof + 1
         widths = ((self.dof,), (self.dof,), (), ())
         *new, sigma = (self._empty(count, *width) for width in widths)
@@ -76,7 +76,7 @@ class CLibrary:
         ]
         written = slopes if self.parameters else (by_state, by_input, by_h)
         outputs = (*new, sigma, status, residual, *written)
-        self.differentiates.herglotz_jacobians(*_arguments(count, q, p, s, h, u, *self._theta, *outputs))
+        self.differentiates().herglotz_jacobians(*_arguments(count, q, p, s, h, u, *self._theta, *outputs))
         return *new, sigma, residual, status, torch.cat([by_state, by_h, by_input, by_theta], -1)
 
     def __call__(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> Track:

@@ -21,6 +21,7 @@ from herglotz.mechanics import legendre_minus
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 from herglotz.stepping.filter import Belief, KalmanFilter, Noise
+from herglotz.stepping.linearise import forward_slopes
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.predict import BELIEVED, of_the_run
 from herglotz.training.problems.grid import segment_grid
@@ -171,7 +172,7 @@ def _started(kalman: KalmanFilter, data: Trajectories, row: int, std: Tensor) ->
 
     with torch.no_grad():
         p = momentum(q1)
-        by_q1 = torch.func.jacfwd(momentum)(q1)
+        by_q1 = forward_slopes(momentum, q1)
     own = q0.new_tensor(kalman.noise.position)
     spread = torch.cat([own, 2**0.5 * (by_q1.square() @ own.square()).sqrt(), zero.expand(kalman.kept - 2 * n), std])
     return kalman.start(State(q0, p, zero), spread)

@@ -285,7 +285,7 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
         model=model, metrics={"sigma": 0.01}, data=data, h=H, h_range=span, arrival=data.arrival,
         config=SimpleNamespace(frequencies=()),
     )  # fmt: skip
-    found = hz.filter(run, data, {"friction.viscous[0]": (0.3, 0.0)})
+    found = hz.filter(run, data, {"friction.viscous": (0.3, 0.0)})
     assert 0.7 <= float(found.surprise.nanmean()) <= 1.3
     assert found.surprise.isnan().nonzero()[:, 0].tolist() == [0, len(kept)]
     v = (exact[:, 2:] - exact[:, :-2]) / (2 * H)
