@@ -171,3 +171,19 @@ def test_a_file_made_by_hand_is_one_message(tiny_onnx, tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert said.startswith(f"herglotz: error: {path}: metadata: columns must be list[tuple[str, str, str]], got ")
     assert said.endswith("export the model again")
+
+
+def test_parameters_and_extras_of_a_header(tiny_run, tmp_path, capsys):
+    # fails if the command loses a bound or an extra, the filter has no noise of the fit, or another format takes them
+    path = tmp_path / "arm.h"
+    asked = ["--parameters", "damping.rate=:9", "--extras", "adjoint", "filter"]
+    assert main(["export", str(tiny_run), "--out", str(path), *asked]) == 0
+    text, found = read_header(path)
+    assert [row[1:] for row in found["parameters"].values()] == [[None, 9.0]]
+    assert found["extras"] == ["adjoint", "filter"]
+    assert all(x > 0 for x in found["noise"]["position"] + found["noise"]["momentum"])
+    for name in ("arm_rollout_vjp", "arm_filter_update", "arm_noise_of_fit", "arm_set_parameter"):
+        assert name in text
+    capsys.readouterr()
+    assert main(["export", str(tiny_run), "--out", str(tmp_path / "arm.onnx"), *asked]) == 2
+    assert "C headers only" in capsys.readouterr().err
