@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from herglotz.data import Trajectories, load, save, simulate
     from herglotz.errors import InputError
-    from herglotz.export import compile, export_pt2, load_pt2
+    from herglotz.export import compile, export_pt2, filter, load_pt2
     from herglotz.mechanics import partials
     from herglotz.models import ContactLagrangian, ModelConfig
     from herglotz.scenes import scene, scene_names
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _ROOMS = {
     "data": ("Trajectories", "load", "save", "simulate"),
     "errors": ("InputError",),
-    "export": ("compile", "export_pt2", "load_pt2"),
+    "export": ("compile", "export_pt2", "filter", "load_pt2"),
     "mechanics": ("partials",),
     "models": ("ContactLagrangian", "ModelConfig"),
     "scenes": ("scene", "scene_names"),
@@ -52,6 +52,7 @@ __all__ = [
     "Trajectories",
     "compile",
     "export_pt2",
+    "filter",
     "fit",
     "load",
     "load_pt2",

@@ -49,6 +49,11 @@ FLAGS = (
          type=positive, nargs=2, metavar=("LOW", "HIGH")),
     flag("--name", "what every name in a C header begins with, so that headers of two models fit into one program "
          "(default: the name of the file)", metavar="PREFIX"),
+    flag("--parameters", "numbers of the model that a C program sets at run time, friction.viscous[0] or "
+         "friction.viscous for all of them, with bounds if wanted: damping.rate=0:2", nargs="+",
+         metavar="NAME[=LOW:HIGH]"),
+    flag("--extras", "what else a C header holds: adjoint (vector-Jacobian products of steps and rollouts), filter "
+         "(a Kalman filter with the noise of the fit)", nargs="+", choices=("adjoint", "filter")),
     FORCE,
     flag("--json", "print what was written as JSON", action="store_true"),
 )  # fmt: skip
@@ -63,6 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
     if kicks.is_file() and form == "c":
         if arguments.name is not None:
             raise InputError("--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out")
+        if arguments.parameters is not None or arguments.extras is not None:
+            raise InputError("--parameters, --extras: kicks that tune chose have neither; leave them out")
         return _kicks(arguments, kicks)
 
     from herglotz.training import load_run
@@ -71,9 +78,18 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.export import export_run, load_exported
     from herglotz.export.load import read_header
+    from herglotz.export.parameters import parsed
 
     warn_of_misfit(result, "the file will not step as the recorded system does")
-    export_run(result, arguments.out, form, h_range=arguments.h_range, name=arguments.name)
+    export_run(
+        result,
+        arguments.out,
+        form,
+        h_range=arguments.h_range,
+        name=arguments.name,
+        parameters=parsed(arguments.parameters or ()),
+        extras=arguments.extras or (),
+    )
     in_c = form not in ("pt2", "aoti", "onnx")
     if in_c:  # the header is read, not compiled: no compiler is needed to write it
         _, found = read_header(arguments.out)

@@ -291,7 +291,7 @@ class _Numbers:
 def _put_slice(g: np.ndarray, shape: Sequence[int], dim: int, where: int | slice) -> np.ndarray:
     """Zeros of this shape with g at `where` of one axis."""
     out = _full(shape, 0)
-    out[(*(slice(None),) * (dim % len(shape)), where)] = g
+    out[(*(slice(None),) * (dim % len(shape)), where)] = g if g.ndim else g[()]  # an array would be kept as one
     return out
 
 

@@ -6,6 +6,7 @@ from herglotz.export.c_wrappers import export_acados as export_acados, export_ca
 from herglotz.export.compare import compare as compare
 from herglotz.export.differences import DifferencedStepper as DifferencedStepper
 from herglotz.export.exported import ExportedStepper as ExportedStepper
+from herglotz.export.filtering import Filtered as Filtered, filter as filter, noise_of as noise_of
 from herglotz.export.fmu import export_fmu as export_fmu
 from herglotz.export.load import (
     load_c as load_c,

@@ -16,6 +16,7 @@ from herglotz.export.c_stepper import compiled
 from herglotz.export.exported import ExportedStepper
 from herglotz.export.load import load_c
 from herglotz.export.metadata import describe
+from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 
@@ -85,6 +86,7 @@ def compile_c(
     units: Sequence[str] = (),
     dtype: str | None = None,
     tolerance: float | None = None,
+    parameters: Chosen = (),
 ) -> ExportedStepper:
     """Compile a model's C and load it; `load_c` does so with a header.
 
@@ -95,8 +97,8 @@ def compile_c(
     ----------
     model
         Not changed.
-    h, box, units, dtype, tolerance
-        As in `export_c`; dtype defaults to the model's.
+    h, box, units, dtype, tolerance, parameters
+        As in `export_c`; dtype defaults to the model's. `with_parameters` of the stepper sets the last ones.
 
     Returns
     -------
@@ -111,7 +113,8 @@ def compile_c(
     if not isinstance(model, ContactLagrangian):
         raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
-    entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None})
+    extra = {"parameters": described_parameters(model, parameters)} if parameters else {}
+    entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None, **extra})
     entries = described(model, entries, "model", dtype, tolerance)
     kept = copy.deepcopy(model)  # the model may be trained on
     header = c_source(kept, entries, "stepper.h", derivatives=False)

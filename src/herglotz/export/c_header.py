@@ -18,10 +18,18 @@ from herglotz.data.files import PathLike, write_atomically
 from herglotz.data.holds import Arrival
 from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
+from herglotz.export.c_extras import check_extras, extras_source
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, as_lanes, model_source
+from herglotz.export.lower.c_parameters import (
+    constants as parameter_constants,
+    inputs_constants,
+    inputs_source,
+    without_parameters,
+)
 from herglotz.export.metadata import check_metadata, describe, from_json
+from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.export.step_parts import pushed
 from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
@@ -111,6 +119,8 @@ def export_c(
     dtype: str = "float64",
     h_range: tuple[float, float] | None = None,
     tolerance: float | None = None,
+    parameters: Chosen = (),
+    extras: Sequence[str] = (),
     metadata: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
@@ -142,6 +152,12 @@ def export_c(
     tolerance
         Of Newton, relative to the size of q: where the model is no more exact than this, fewer iterations serve as
         well. Default: 16 machine epsilons.
+    parameters
+        Numbers of the model that are set at run time, in its own units: names as of `numbers_of`, those of several
+        numbers (`friction.viscous`) too, or names with (low, high), None without a bound. Their values in the model are
+        the defaults.
+    extras
+        What else the header holds: "adjoint" (`NAME_step_vjp`, `NAME_rollout_vjp`), "filter" (`NAME_filter_…`).
     metadata
         Further JSON-ready entries for the comment at the top.
 
@@ -159,6 +175,11 @@ def export_c(
     name = identifier(path.stem) if name is None else name
     extra = dict(metadata or {})
     extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
+    if parameters:
+        extra["parameters"] = described_parameters(model, parameters)
+    if extras:
+        check_extras(extras, model.dof, MAX_DERIVATIVES)
+        extra["extras"] = list(extras)
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     check_metadata(entries, path)
     content = sealed_text(c_source(model, entries, path.name)).encode()
@@ -171,21 +192,28 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     """The text of the header.
 
     Without `derivatives` NAME_step_jacobian, NAME_init_qv and NAME_velocity are left out. Beyond 8 coordinates the
-    first one is: it is most of the work.
+    first one is: it is most of the work. With numbers that are set at run time the other two are.
     """
-    velocities = derivatives
+    velocities = derivatives and not entries.get("parameters")
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
-    equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
+    chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
+    equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)  # rounded once, when numbers are written
     step = StepInC(equations)
-    emitted = model_source(step, equations, derivatives, velocities)
-    types, number_tests, functions, products, checks, one_step, run, api = map(runtime, RUNTIME)
+    inputs, parameters = inputs_constants(model, entries["dtype"]), ""
+    if chosen:
+        inputs = inputs_source(copy.deepcopy(model).double(), chosen, step.program.tables)
+        parameters = parameter_constants(entries["parameters"], entries["dtype"]) + runtime("parameters.h")
+    emitted = model_source(step, equations, derivatives, velocities, "adjoint" in entries.get("extras", ()))
+    shown = (lambda text: text) if chosen else without_parameters
+    types, number_tests, functions, products, checks, one_step, run, api = (shown(runtime(x)) for x in RUNTIME)
     dtype = entries["dtype"]
-    parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests, functions, products]
-    parts += [emitted.tables, _inputs(model, dtype), checks, as_scalars(emitted.step + one_step + run)]
+    parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests + parameters]
+    parts += [functions, products, emitted.tables, inputs, checks, as_scalars(emitted.step + one_step + run)]
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
     parts += [as_scalars(emitted.slopes), api]
     parts += [as_scalars(emitted.momentum), runtime("velocity.h")] if velocities else []
+    parts += extras_source(model, entries, lambda name: shown(runtime(name)))
     parts += ["#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
@@ -260,7 +288,7 @@ def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
     return TOP.format(
         version=entries["herglotz_version"],
         file="@FILE@",
-        no_u="0, " if inputs else "",
+        no_u="0, " * ((inputs > 0) + ("parameters" in entries)),
         arrival=_arrival(entries),
         mark=MARK,
         comment="@METADATA@",
@@ -302,19 +330,6 @@ def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
         box=_box_constants(entries["box"], dtype),
         start=_start_constant(entries, dtype),
     )
-
-
-def _inputs(model: ContactLagrangian, dtype: str) -> str:
-    """The matrix G of the inputs and −G u₀, where the model takes some."""
-    if not model.config.inputs or model.friction is None:
-        return ""
-    map_, offset = (
-        numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype)
-        for x in (model.friction.input_map, model.friction.offset())
-    )
-    lines = ["/* The forces of inputs u are input_map u + input_offset. */"]
-    lines.append(f"static const hz_real hz_input_map[hz_N * hz_M] = {{{map_}}};")
-    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_N] = {{{offset}}};\n"])
 
 
 def _box_constants(box: Mapping[str, list[float]] | None, dtype: str) -> str:

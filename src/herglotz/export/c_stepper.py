@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any
 
 import torch
@@ -14,13 +16,17 @@ from herglotz.codegen.c_compiler import build
 from herglotz.data.files import PathLike
 from herglotz.export.c_header import MAX_DERIVATIVES, read_metadata, runtime
 from herglotz.export.exported import ExportedStepper
+from herglotz.export.lower.c_parameters import without_parameters
+from herglotz.export.parameters import checked_values
 from herglotz.stepping import Status
 from herglotz.stepping.rollout import Track
 
 
-def library_of(name: str) -> str:
-    """The loops around a header whose prefix is `name`."""
-    return re.sub(r"\bhz_", f"{name}_", runtime("library.c"))
+def library_of(metadata: Mapping[str, Any]) -> str:
+    """The loops around a header with this metadata."""
+    text = runtime("library.c")
+    text = text if metadata.get("parameters") else without_parameters(text)
+    return re.sub(r"\bhz_", f"{metadata['name']}_", text)
 
 
 class CLibrary:
@@ -35,46 +41,55 @@ class CLibrary:
         self.dof: int = self.metadata["dof"]
         self.inputs: int = self.metadata["inputs"]
         self.dtype: torch.dtype = getattr(torch, self.metadata["dtype"])
-        self.library = build(header, library_of(self.metadata["name"]))
-        self.whole = whole
-        self.differentiates = self.library if whole is None else None
+        self.parameters: dict[str, Any] = self.metadata.get("parameters", {})
+        self.theta = torch.tensor(checked_values(self.parameters, {}), dtype=self.dtype)
+        self.library = build(header, library_of(self.metadata))
+        # Built on first use, once for all copies: most steppers are not differentiated.
+        self.differentiates = cache(
+            lambda: self.library if whole is None else build(whole(), library_of(self.metadata))
+        )
+
+    def with_values(self, values: Mapping[str, float]) -> CLibrary:
+        """The same with other values of the numbers that are set at run time; those not named have their defaults."""
+        other = copy.copy(self)
+        other.theta = torch.tensor(checked_values(self.parameters, values), dtype=self.dtype)
+        return other
+
+    @property
+    def _theta(self) -> tuple[Tensor, ...]:
+        return (self.theta,) if self.parameters else ()
 
     def init(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(p1, s1) at q1; NaN where there is none."""
         p, s, status = self._empty(len(s0), self.dof), self._empty(len(s0)), self._failed(len(s0))
-        self.library.herglotz_inits(*_arguments(len(s0), q0, q1, s0, h, u, p, s, status))
+        self.library.herglotz_inits(*_arguments(len(s0), q0, q1, s0, h, u, *self._theta, p, s, status))
         return p, s
 
     def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """The momenta p of velocities, NaN where there is none, and statuses."""
         p, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self._differentiating().herglotz_momenta(*_arguments(len(s), q, v, s, h, p, status))
+        self.differentiates().herglotz_momenta(*_arguments(len(s), q, v, s, h, p, status))
         return p, status
 
     def velocity(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """The velocities v of momenta, NaN where there is none, and statuses."""
         v, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self._differentiating().herglotz_velocities(*_arguments(len(s), q, p, s, h, v, status))
+        self.differentiates().herglotz_velocities(*_arguments(len(s), q, p, s, h, v, status))
         return v, status
 
-    def _differentiating(self) -> Any:
-        """The library with derivatives and velocities, built on first use: most steppers are asked for neither."""
-        if self.differentiates is None:
-            assert self.whole is not None
-            self.differentiates = build(self.whole(), library_of(self.metadata["name"]))
-        return self.differentiates
-
     def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
-        """A step and its derivative (B, 2n+1, 2n+2+m); NaN where the step failed."""
+        """A step and its derivative (B, 2n+1, 2n+2+m+K); NaN where the step failed."""
         count, size = len(s), 2 * self.dof + 1
         widths = ((self.dof,), (self.dof,), (), ())
         *new, sigma = (self._empty(count, *width) for width in widths)
         status, residual = self._failed(count), self._empty(count)
-        slopes = [self._empty(count, size, width) for width in (size, self.inputs, 1)]
-        outputs = (*new, sigma, status, residual, *slopes)
-        self._differentiating().herglotz_jacobians(*_arguments(count, q, p, s, h, u, *outputs))
-        by_state, by_input, by_h = slopes
-        return *new, sigma, residual, status, torch.cat([by_state, by_h, by_input], -1)
+        by_state, by_input, by_theta, by_h = slopes = [
+            self._empty(count, size, width) for width in (size, self.inputs, len(self.parameters), 1)
+        ]
+        written = slopes if self.parameters else (by_state, by_input, by_h)
+        outputs = (*new, sigma, status, residual, *written)
+        self.differentiates().herglotz_jacobians(*_arguments(count, q, p, s, h, u, *self._theta, *outputs))
+        return *new, sigma, residual, status, torch.cat([by_state, by_h, by_input, by_theta], -1)
 
     def __call__(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> Track:
         """K steps: h (B, K) and u (B, K, m) may be expanded over samples, and h over steps."""
@@ -94,7 +109,7 @@ class CLibrary:
             self._empty(count, steps + 1), self._failed(count, steps), self._empty(count, steps),
         )  # fmt: skip
         u_stride = 0 if u is None else u.stride(0)
-        keep = (*(x.contiguous() for x in (q, p, s)), h, *h.stride(), u, u_stride, *outputs)
+        keep = (*(x.contiguous() for x in (q, p, s)), h, *h.stride(), u, u_stride, *self._theta, *outputs)
         arguments = _arguments(count, steps, *keep)
         function = self.library.herglotz_rollouts
         return lambda keep=keep: function(*arguments), outputs  # noqa: ARG005  the tensors live as long as the call
@@ -115,10 +130,15 @@ def _arguments(*values: Tensor | int | None) -> list[Any]:
 
 def compiled(header: str, path: PathLike = "header", whole: Callable[[], str] | None = None) -> ExportedStepper:
     """The stepper of a header; arguments and errors as of `CLibrary`."""
-    library = CLibrary(header, path, whole)
+    return stepper_of(CLibrary(header, path, whole), str(path), whole is not None or "_VELOCITIES" in header)
+
+
+def stepper_of(library: CLibrary, path: str, velocities: bool) -> ExportedStepper:
+    """The stepper of a compiled header."""
     programs: dict[str, Any] = {"init": library.init}
     if library.dof <= MAX_DERIVATIVES:
         programs["linearise"] = library.linearise
-    if whole is not None or "_VELOCITIES" in header:
+    if velocities and not library.parameters:
         programs |= {"momentum": library.momentum, "velocity": library.velocity}
-    return ExportedStepper(programs, library.metadata, str(path), "c", library)
+    again = lambda values: stepper_of(library.with_values(values), path, velocities)  # noqa: E731
+    return ExportedStepper(programs, library.metadata, path, "c", library, again)

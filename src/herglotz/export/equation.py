@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -14,10 +14,11 @@ from torch import Tensor
 from herglotz.codegen.trace import Graph, example_batch, traced
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
+from herglotz.models.numbers import WithNumbers
 from herglotz.stepping import State
 from herglotz.stepping.equation import StepOfModel, model_equation
 from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
+from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian, step_pull
 from herglotz.stepping.partials_equation import End, PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip
@@ -80,20 +81,38 @@ def first_order(model: ContactLagrangian, *x: Tensor) -> tuple[Tensor, ...]:
 
 @dataclass(frozen=True)
 class Equations:
-    """A model's equations, each traced once however many programs hold it."""
+    """A model's equations, each traced once however many programs hold it.
+
+    `numbers` of the model, with their values, are the last argument θ (K,) of each: those that are set at run time.
+    """
 
     model: ContactLagrangian
+    numbers: Mapping[str, float] | None = None
 
     @classmethod
-    def of(cls, model: ContactLagrangian) -> Equations:
+    def of(cls, model: ContactLagrangian, numbers: Mapping[str, float] | None = None) -> Equations:
         """Those of a copy of the model, which no export can change or train."""
-        return cls(copy.deepcopy(model).eval().requires_grad_(False))
+        return cls(copy.deepcopy(model).eval().requires_grad_(False), numbers)
+
+    @property
+    def theta(self) -> tuple[Tensor, ...]:
+        """The values of `numbers`, (K,), where there are some."""
+        like = next(self.model.parameters())
+        return (like.new_tensor([*self.numbers.values()]),) if self.numbers else ()
+
+    def of_numbers(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function of the model as one of θ too, its last argument, where there are some."""
+        return WithNumbers(self.model, function, [*self.numbers]).at if self.numbers else function
+
+    def traced(self, function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph:
+        """Such a function as a graph."""
+        return traced(self.of_numbers(function), (*arguments, *self.theta))
 
     @cached_property
     def potential(self) -> Graph:
         """V (B,) and V′ (B, n) at a position."""
         q = example(self.model, 0.1)[0]
-        return traced(lambda q: tuple(map(dense, FieldOf(self.model.potential)(q))), (q,))
+        return self.traced(lambda q: tuple(map(dense, FieldOf(self.model.potential)(q))), (q,))
 
     @property
     def field(self) -> Graph | None:
@@ -112,13 +131,31 @@ class Equations:
 
     @cached_property
     def jacobian(self) -> Graph:
-        """The derivative of a solved step at Δ, d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m)."""
+        """The derivative of a solved step at Δ, d(q, p, s)′ / d(q, p, s, h, u, θ), (B, 2n+1, 2n+2+m+K)."""
         q, p, s, h, *u = example(self.model, 0.1)
+        functions = self.of_numbers(step_functions(self.model))
 
-        def slopes(q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *u: Tensor) -> Tensor:
-            return dense(step_jacobian(step_functions(self.model), State(q, p, s), h, delta, u[0] if u else None))
+        def slopes(q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> Tensor:
+            u, theta = more[0] if self.model.inputs else None, more[-1] if self.numbers else None
+            return dense(step_jacobian(functions, State(q, p, s), h, delta, u, theta=theta))
 
-        return traced(slopes, (q, p, s, h, 0.1 * p, *u))
+        return traced(slopes, (q, p, s, h, 0.1 * p, *u, *self.theta))
+
+    @cached_property
+    def pull(self) -> Graph:
+        """`step_pull` of a solved step at Δ, side by side: (2n+2+m+K,) of the derivatives (B, 2n+1) by what follows."""
+        q, p, s, h, *u = example(self.model, 0.1)
+        functions = self.of_numbers(step_functions(self.model))
+
+        def pull(
+            q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, after: Tensor, *more: Tensor
+        ) -> tuple[Tensor, ...]:
+            u, theta = more[0] if self.model.inputs else None, more[-1] if self.numbers else None
+            rows, by_theta = step_pull(functions, State(q, p, s), h, delta, u, after, theta)
+            return (dense(rows),) if by_theta is None else (dense(rows), dense(by_theta))
+
+        after = torch.cat([0.3 * q, 0.2 * p, s[:, None] + 1], -1)
+        return traced(pull, (q, p, s, h, 0.1 * p, after, *u, *self.theta))
 
     @cached_property
     def momentum(self) -> Graph:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.export.box import Box, s_matters
+from herglotz.export.parameters import checked_values
 from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
 from herglotz.stepping.events import Watch
 from herglotz.stepping.rollout import Plan, Track, without_lost_factors
@@ -39,7 +40,9 @@ class ExportedStepper(OneStepMethod):
         path: str = "exported model",  # where it came from, for messages
         kind: str = "pt2",  # or "aoti", "onnx", "c"
         loop: Loop | None = None,
+        again: Callable[[Mapping[str, float]], ExportedStepper] | None = None,  # with other parameters
     ):
+        self._again = again
         self.programs = dict(programs)
         self.metadata = metadata
         self.path = path
@@ -64,6 +67,20 @@ class ExportedStepper(OneStepMethod):
     def differentiable(self) -> bool:
         """Whether autograd goes through `step`."""
         return "model" in self.programs
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The defaults of the numbers that are set at run time, by name."""
+        return {name: value for name, (value, *_) in self.metadata.get("parameters", {}).items()}
+
+    def with_parameters(self, values: Mapping[str, float]) -> ExportedStepper:
+        """The stepper with other values of numbers that are set at run time; the others have their defaults.
+
+        `parameters` has the names, in the model's own units. Raise InputError if the file has no such number, or a
+        value is not finite or outside its bounds.
+        """
+        checked_values(self.metadata.get("parameters", {}), values)
+        return self if self._again is None else self._again(values)
 
     def init(
         self, q0: Tensor, q1: Tensor, s0: Tensor | None = None, h: Tensor | float = 1.0, u: Tensor | None = None
@@ -144,8 +161,9 @@ class ExportedStepper(OneStepMethod):
             state = State(*(x.detach() for x in state))
             *out, J = self.programs["linearise"](*map(plain, self._flat(state, h, u)))
         J, size = J.reshape(*state.s.shape, *J.shape[1:]), 2 * self.dof + 1
-        by_input = J[..., size + 1 :] if self.inputs else None
-        return Linearised(self._step(out, state), J[..., :size], J[..., size], by_input)
+        by_input = J[..., size + 1 : size + 1 + self.inputs] if self.inputs else None
+        by_theta = J[..., size + 1 + self.inputs :] if self.parameters else None
+        return Linearised(self._step(out, state), J[..., :size], J[..., size], by_input, by_theta)
 
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.

@@ -26,6 +26,7 @@ AOTI = {
 }  # our names of the programs in a compiled package, and the package's
 BOX_KEYS = tuple(f"{name}_{end}" for name in "qps" for end in ("low", "high"))
 REMEDY = "export the model again"
+EXTRAS = ("adjoint", "filter")  # what a C header may hold beside its steps: files of `export/runtime`
 TOLERANCE = 4  # machine epsilons, of Δ = q1 − q0: what is left of it goes into p divided by h, and adds up
 
 
@@ -83,6 +84,9 @@ class Metadata(_Needed, total=False):
     arrival: _Arrival
     columns: list[tuple[str, str, str]]  # name, role, unit
     name: str
+    extras: list[str]  # of `EXTRAS`
+    noise: dict[str, list[float]]  # of a filter: standard deviations of position, momentum and theta
+    parameters: dict[str, tuple[float, float | None, float | None]]  # set at run time: default, low, high
 
 
 def describe(
@@ -189,6 +193,7 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
         "h_range": span is None or (len(span) == 2 and 0 <= span[0] <= span[1]),
         "start": start is None or len(start["q"]) == len(start["p"]) == n,
         "arrival": set(arrival) <= set(Arrival._fields),
+        "extras": set(entries.get("extras", ())) <= set(EXTRAS),
     }
     wrong = [name for name, fine in good.items() if not fine]
     if wrong:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,12 @@ from typing import Any
 from herglotz.errors import InputError
 from herglotz.export.c_header import export_c
 from herglotz.export.c_wrappers import export_acados, export_casadi
+from herglotz.export.filtering import noise_of
 from herglotz.export.fmu import export_fmu
 from herglotz.export.lower.aoti import export_aoti
 from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
+from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.training import Run
 from herglotz.training.summary import model_card
 
@@ -36,6 +38,8 @@ def export_run(
     *,
     h_range: tuple[float, float] | None = None,
     name: str | None = None,
+    parameters: Chosen = (),
+    extras: Sequence[str] = (),
 ) -> Path:
     """Write the model of a run as one file that steps without this package.
 
@@ -53,11 +57,16 @@ def export_run(
         rounding, and 0.2 means a step of 0.2000000000000002 too.
     name
         Prefix of every name in C, as of `export_c`, and the identifier of an FMU; None: that of the file.
+    parameters
+        Numbers that a C header takes at run time, as of `export_c`.
+    extras
+        What else a C header holds, as of `export_c`; a filter has the noise of the fit as `NAME_noise_of_fit`.
 
     Raises
     ------
     InputError
-        If the name has another end, the format cannot hold the model, or a prefix is given for a format without C.
+        If the name has another end, the format cannot hold the model, a prefix is given for a format without C, or
+        parameters for another one than a C header.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
@@ -65,6 +74,8 @@ def export_run(
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
     if name is not None and kind not in IN_C:
         raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
+    if (parameters or extras) and kind != "c":
+        raise InputError(f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out")
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or _steps(run)]
     metadata = {
@@ -82,6 +93,13 @@ def export_run(
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
     if name is not None:
         described["name"] = name
+    if parameters:
+        described["parameters"] = parameters
+    if extras:
+        described["extras"] = list(extras)
+    if "filter" in extras:
+        still = (0.0,) * len(described_parameters(run.model, parameters))
+        metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}
     WRITERS[kind](run.model, path, **described)
     return path
 

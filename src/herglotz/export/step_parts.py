@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from herglotz.codegen.trace import Graph, traced
-from herglotz.export.equation import example, field_like
+from herglotz.codegen.trace import Graph
+from herglotz.export.equation import Equations, example, field_like
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
@@ -31,12 +31,12 @@ Ends = tuple[Field, Field]  # the potential at q0 and q1
 Parts = tuple[Tensor, ...]  # what `StepParts` gives
 
 
-def step_parts(model: ContactLagrangian) -> Graph:
+def step_parts(equations: Equations) -> Graph:
     """`StepParts`, traced."""
-    q, p, s, h, *u = example(model, 0.1)
+    q, p, s, h, *u = example(equations.model, 0.1)
     V, slope = field_like(q)
     more = (V, slope, 0.1 * p, 0.2 * p, V + 1, slope + 1)
-    return traced(StepParts(model), (q, p, s, h, *more, *u))
+    return equations.traced(StepParts(equations.model), (q, p, s, h, *more, *u))
 
 
 def pushed(model: ContactLagrangian) -> ContactLagrangian:

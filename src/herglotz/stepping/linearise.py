@@ -12,22 +12,24 @@ model: no model has a line of its own.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian, join
 from herglotz.models import ContactLagrangian
+from herglotz.models.numbers import WithNumbers, chosen, values_of
 from herglotz.stepping.equation import model_equation
 from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import State, Step
 
-# (q0, p0, s0, h, Δ, u) → F (..., n), p1 (..., n), L (...)
-StepFunctions = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor, Tensor]]
+# (q0, p0, s0, h, Δ, u[, θ]) → F (..., n), p1 (..., n), L (...)
+StepFunctions = Callable[..., tuple[Tensor, Tensor, Tensor]]
 Slopes = Callable[[Callable[[Tensor], Tensor], Tensor], Tensor]
 
 
@@ -38,10 +40,23 @@ class Linearised(NamedTuple):
     by_state: Tensor  # (..., 2n+1, 2n+1) d(q, p, s)′ / d(q, p, s)
     by_h: Tensor  # (..., 2n+1)
     by_input: Tensor | None  # (..., 2n+1, m), where the step has an input
+    by_parameters: Tensor | None = None  # (..., 2n+1, K), where numbers of the model were named
 
 
-def linearise(L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, step: Step) -> Linearised:
-    """The derivatives of a solved step of L_d from `state`; h is a scalar or (...), u is (m,) or (..., m)."""
+def linearise(
+    L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, step: Step, numbers: Sequence[str] = ()
+) -> Linearised:
+    """The derivatives of a solved step of L_d from `state`; h is a scalar or (...), u is (m,) or (..., m).
+
+    By `numbers` of a model too, K names of `chosen`. Raise InputError if L_d is no model that has them.
+    """
+    functions, theta = step_functions(L_d), None
+    if numbers:
+        if not isinstance(L_d, ContactLagrangian):
+            raise InputError(f"parameters are numbers of a model, and {type(L_d).__name__} is none; leave them out")
+        names = chosen(L_d, numbers)
+        theta = state.q.new_tensor(values_of(L_d, names))
+        functions = WithNumbers(L_d, functions, names).at
     q, p, s = (x.detach() for x in state)
     h = h.detach().expand(s.shape)
     u = None if u is None else u.detach().expand(*s.shape, u.shape[-1])
@@ -49,9 +64,12 @@ def linearise(L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None
     # In reverse mode, row by row, where L_d itself may be differentiated by autograd.
     slopes = forward_slopes if isinstance(L_d, ContactLagrangian) else lambda values, x: jacobian(values, x)[1]
     with torch.no_grad():
-        J = step_jacobian(step_functions(L_d), State(q, p, s), h, delta, u, slopes)
-    size = 2 * q.shape[-1] + 1
-    return Linearised(step, J[..., :size], J[..., size], None if u is None else J[..., size + 1 :])
+        J = step_jacobian(functions, State(q, p, s), h, delta, u, slopes, theta)
+    size, m = 2 * q.shape[-1] + 1, 0 if u is None else u.shape[-1]
+    by_input, by_parameters = J[..., size + 1 : size + 1 + m], J[..., size + 1 + m :]
+    return Linearised(
+        step, J[..., :size], J[..., size], None if u is None else by_input, by_parameters if numbers else None
+    )
 
 
 def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
@@ -84,30 +102,69 @@ def step_jacobian(
     delta: Tensor,  # (..., n) the solution of F = 0
     u: Tensor | None,  # (..., m)
     slopes: Slopes | None = None,  # how to differentiate; default `forward_slopes`
+    theta: Tensor | None = None,  # (K,) shared by all samples: the last argument of `functions`
 ) -> Tensor:
-    """d(q, p, s)′ / d(q, p, s, h, u) at a solved step, (..., 2n+1, 2n+2+m): a pure function of tensors."""
+    """d(q, p, s)′ / d(q, p, s, h, u, θ) at a solved step, (..., 2n+1, 2n+2+m+K): a pure function of tensors."""
     q, p, s = state
     n = q.shape[-1]
     sizes = [n, n, 1, 1, *(() if u is None else (u.shape[-1],)), n]
     point = torch.cat([q, p, s[..., None], h[..., None], *(() if u is None else (u,)), delta], -1)
 
-    def values(z: Tensor) -> Tensor:
+    def values(z: Tensor, *theta: Tensor) -> Tensor:
         q, p, s, h, *u, delta = z.split(sizes, -1)
-        F, p1, L = functions(q, p, s[..., 0], h[..., 0], delta, u[0] if u else None)
+        F, p1, L = functions(q, p, s[..., 0], h[..., 0], delta, u[0] if u else None, *theta)
         return join(F, p1, L)
 
-    rows = (slopes or forward_slopes)(values, point)  # (..., 2n+1, 3n+2+m) of F, p1 and L
+    at = values if theta is None else lambda z: values(z, theta)
+    rows = (slopes or forward_slopes)(at, point)  # (..., 2n+1, 3n+2+m) of F, p1 and L
     by_start, by_delta = rows[..., :-n], rows[..., -n:]
+    if theta is not None:
+        by_start = torch.cat([by_start, forward_slopes(values, point, theta)], -1)
     ddelta = -eliminate(by_delta[..., :n, :], by_start[..., :n, :])
     ends = by_start[..., n:, :] + by_delta[..., n:, :] @ ddelta
     start = torch.eye(2 * n + 1, by_start.shape[-1], dtype=q.dtype, device=q.device)  # of (q, p, s) itself
     return torch.cat([ddelta + start[:n], ends[..., :n, :], ends[..., n:, :] + start[2 * n :]], -2)
 
 
-def forward_slopes(values: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
-    """The Jacobian (..., m, k) of `values` (..., k) → (..., m) in forward mode, sample by sample."""
+def step_pull(
+    functions: StepFunctions,
+    state: State,  # (..., n), (..., n), (...)
+    h: Tensor,  # (...)
+    delta: Tensor,  # (..., n) the solution of F = 0
+    u: Tensor | None,  # (..., m)
+    after: Tensor,  # (..., 2n+1) derivatives of a number by (q, p, s) after the step
+    theta: Tensor | None = None,  # (K,) shared by all samples: the last argument of `functions`
+) -> tuple[Tensor, Tensor | None]:
+    """Its derivatives by (q, p, s, h, u), (..., 2n+2+m), and by θ, (K,) summed over samples: `step_jacobian`ᵀ times it.
+
+    Reverse mode: with r = ∂/∂q1 + p1_Δᵀ ∂/∂p1 + L_Δ ∂/∂s1 and F_Δᵀ λ = r, they are those of p1ᵀ∂/∂p1 + L ∂/∂s1 − Fᵀλ.
+    """
+    q, p, s = state
+    n, more = q.shape[-1], () if theta is None else (theta,)
+    by_q, by_p, by_s = after[..., :n], after[..., n : 2 * n], after[..., 2 * n]
+
+    def values(q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+        return functions(q, p, s, h, delta, None if u is None else rest[0], *rest[u is not None :])
+
+    arguments = (q, p, s, h, delta, *(() if u is None else (u,)), *more)
+    pull = torch.func.vjp(values, *arguments)[1]
+    r = by_q + pull((torch.zeros_like(q), by_p, by_s))[4]
+    rest = arguments[5:]
+    F_delta = forward_slopes(lambda *x: values(*x[:4], x[-1], *x[4:-1])[0], q, p, s, h, *rest, delta)
+    lam = eliminate(F_delta.mT, r[..., None])[..., 0]
+    found = pull((-lam, by_p, by_s))
+    inputs = () if u is None else (found[5],)
+    rows = [found[0] + by_q, found[1], (found[2] + by_s)[..., None], found[3][..., None], *inputs]
+    return torch.cat(rows, -1), None if theta is None else found[-1]
+
+
+def forward_slopes(values: Callable[..., Tensor], *points: Tensor) -> Tensor:
+    """The Jacobian (..., m, k) of `values`(..., x) → (..., m) by its last point, (..., k) or (k,), in forward mode."""
+    *first, point = points
     directions = torch.eye(point.shape[-1], dtype=point.dtype, device=point.device)
-    along = lambda tangent: torch.func.jvp(values, (point,), (tangent.expand_as(point),))[1]  # noqa: E731
+    # torch 2.x ends the process in `addcmul` where only one of its arguments has a tangent: the others get zeros.
+    still = [torch.zeros_like(x) for x in first]
+    along = lambda t: torch.func.jvp(values, points, (*still, t.expand_as(point)))[1]  # noqa: E731
     with warnings.catch_warnings():  # torch's own use of torch.jit, when it first loads forward-mode derivatives
         warnings.filterwarnings("ignore", "`torch.jit.script` is", DeprecationWarning)
         return torch.func.vmap(along)(directions).movedim(0, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -194,8 +195,10 @@ class Stepper(OneStepMethod):
         self._check_step(step, state, h, u)
         return step
 
-    def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
-        """One step with its derivatives d(q, p, s)′ / d(q, p, s), d/dh and d/du, by the implicit-function theorem.
+    def linearise(
+        self, state: State, h: Tensor | float, u: Tensor | None = None, parameters: Sequence[str] = ()
+    ) -> Linearised:
+        """One step with its derivative d(q, p, s)′ / d(q, p, s, h, u, θ), by the implicit-function theorem.
 
         That is ∂q1/∂p = −c M⁻¹ and what follows from it (erratum E4 of `docs/mathematics.md`).
 
@@ -203,21 +206,24 @@ class Stepper(OneStepMethod):
         ----------
         state, h, u
             As in `step`, units too: q, p (..., n) and s (...); () or (...); (..., m).
+        parameters
+            Names of K numbers θ of the model, `friction.viscous[1]`, or `friction.viscous` for all that begin so.
 
         Returns
         -------
         Linearised
-            `by_state` (..., 2n+1, 2n+1), `by_h` (..., 2n+1), `by_input` (..., 2n+1, m) or None, and the step itself;
+            `by_state` (..., 2n+1, 2n+1), `by_h` (..., 2n+1), `by_input` (..., 2n+1, m) or None, `by_parameters`
+            (..., 2n+1, K), or None where none are named, and the step itself;
             a derivative has the unit of what is derived over that of what it is derived by.
 
         Raises
         ------
         InputError
-            As `step`.
+            As `step`, and if L_d is no model that has these numbers.
         """
         with torch.no_grad():
             step = self.step(state, h, u=u)
-        return linearise(self.L_d, state, check_h(h, state.q), u, step)
+        return linearise(self.L_d, state, check_h(h, state.q), u, step, parameters)
 
     def step_pair(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h0: Tensor | float, h1: Tensor | float | None = None

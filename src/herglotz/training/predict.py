@@ -159,7 +159,7 @@ def predict(
     """
     if isinstance(warmup, bool) or not isinstance(warmup, int) or warmup < 3:
         raise InputError(f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}")
-    data = _of_the_run(run, data).unwrapped().to(dtype=next(run.model.parameters()).dtype, device="cpu")
+    data = of_the_run(run, data).unwrapped().to(dtype=next(run.model.parameters()).dtype, device="cpu")
     low, high = run.h_range
     every = max(1, int(high / data.typical_step + 1e-6)) if data.typical_step < low else 1
     if every > 1:
@@ -197,7 +197,7 @@ def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:
     return [(), *(zero for zero in every if any(zero))]
 
 
-def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
+def of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
     """The coordinates of the run among those of the data, by name; a single one may be called otherwise."""
     wanted, where = run.data, data.source or "data"
     if data.dof == wanted.dof == 1:

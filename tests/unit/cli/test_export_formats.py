@@ -205,3 +205,19 @@ def test_files_around_the_header(form, tiny_run, tmp_path, capsys):
             assert "opening it runs code" in capsys.readouterr().err
             patch.setattr("herglotz.export.compare", partial(compare, steps=20))
             assert main(["verify", str(out), *few]) == 0  # the header is generated again, and is the same
+
+
+def test_parameters_and_extras_of_a_header(tiny_run, tmp_path, capsys):
+    # fails if the command loses a bound or an extra, the filter has no noise of the fit, or another format takes them
+    path = tmp_path / "arm.h"
+    asked = ["--parameters", "damping.rate=:9", "--extras", "adjoint", "filter"]
+    assert main(["export", str(tiny_run), "--out", str(path), *asked]) == 0
+    text, found = read_header(path)
+    assert [row[1:] for row in found["parameters"].values()] == [[None, 9.0]]
+    assert found["extras"] == ["adjoint", "filter"]
+    assert all(x > 0 for x in found["noise"]["position"] + found["noise"]["momentum"])
+    for name in ("arm_rollout_vjp", "arm_filter_update", "arm_noise_of_fit", "arm_set_parameter"):
+        assert name in text
+    capsys.readouterr()
+    assert main(["export", str(tiny_run), "--out", str(tmp_path / "arm.onnx"), *asked]) == 2
+    assert "C headers only" in capsys.readouterr().err

@@ -153,7 +153,7 @@ def _traced_once(monkeypatch):
     """One trace of a model's equations for all formats; where there are inputs, C has another model."""
     of, made = Equations.of, {}
 
-    def once(model):
+    def once(model, _=None):
         if model.inputs:
             return of(model)
         return made.get(model.config) or made.setdefault(model.config, of(model))

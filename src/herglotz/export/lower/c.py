@@ -35,10 +35,10 @@ class StepInC:
         self.n, self.m = n, m = equations.model.dof, equations.model.inputs
         names = {
             "P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "P->V0.value": 0, "P->V0.slope": n, "t->move": n, "x": n,
-            "V1->value": 0, "V1->slope": n, **({"P->push": m} if m else {}),
+            "V1->value": 0, "V1->slope": n, **({"P->push": m} if m else {}), **equations_theta(equations),
         }  # fmt: skip
         given = {name: self.program.given(name, size) for name, size in names.items()}
-        graph = step_parts(equations.model)
+        graph = step_parts(equations)
         arrays = interpret(self.program, graph, list(given.values()))
         guess, F, J, dp, ds, E, *bound = (list(x.ravel()) for x in arrays)
         self.sticks = bool(bound)
@@ -52,7 +52,14 @@ class StepInC:
 
     def _earliest(self, given: Mapping[str, int]) -> list[int]:
         """The first piece in which each statement could run."""
-        of_input = {"P->h": PREPARE, "t->move": EVALUATE, "x": GAINS, "V1->value": GAINS, "V1->slope": GAINS}
+        of_input = {
+            "P->h": PREPARE,
+            "P->theta": PREPARE,
+            "t->move": EVALUATE,
+            "x": GAINS,
+            "V1->value": GAINS,
+            "V1->slope": GAINS,
+        }
         known = {number: of_input.get(name, BEGIN) for name, number in given.items()}
         earliest: list[int] = []
         for i, statement in enumerate(self.program.statements):
@@ -143,20 +150,25 @@ class Emitted(NamedTuple):
     slopes: str  # the derivative of a step
 
 
-def model_source(step: StepInC, equations: Equations, derivatives: bool, velocities: bool = True) -> Emitted:
+def model_source(
+    step: StepInC, equations: Equations, derivatives: bool, velocities: bool = True, adjoint: bool = False
+) -> Emitted:
     """The emitted parts of a header, with constants as `R(0.5)`."""
-    program = Program(tables=step.program.tables)
-    q = program.given("q", step.n)
+    program, K = Program(tables=step.program.tables), len(equations.numbers or ())
+    given = [program.given("q", step.n), *([program.given("theta", K)] if K else [])]
     V, slope = (np.full(n, 0.0, object) for n in (1, step.n))
     if equations.model.config.baseline:
-        V, slope = interpret(program, equations.potential, [q])
+        V, slope = interpret(program, equations.potential, given)
     outputs = {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())}
-    head = "\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], FN_potential_t *V)"
+    by = "const REAL theta[hz_P], " if K else ""
+    head = f"\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], {by}FN_potential_t *V)"
     push = "  REAL push[hz_N]; /* G (u - u0) */\n" if step.m else ""
+    push += "  REAL theta[hz_P];\n" if K else ""
     push += "  REAL bound[hz_N]; /* up to which dry friction holds the move */\n" if step.sticks else ""
     texts = TYPES.format(push=push, problem=step.members("P"),
                          terms=step.members("t")) + whole(program, head, outputs) + step.source()  # fmt: skip
     slopes = _slopes_source(equations, step) if derivatives else ""
+    slopes += _pull_source(equations, step) if adjoint else ""
     momentum = _momentum_source(equations, step) if velocities else ""
     tables = "".join(
         f"static const hz_real {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
@@ -185,6 +197,11 @@ typedef struct {{
 """
 
 
+def equations_theta(equations: Equations) -> dict[str, int]:
+    """The input θ of the traced functions, where they have it."""
+    return {"P->theta": len(equations.numbers)} if equations.numbers else {}
+
+
 def as_lanes(text: str) -> str:
     """The same for a register of samples."""
     return text.replace("SPREAD(", "hz_spread(").replace("FN_", "hz_wide_").replace("REAL", "hz_lanes")
@@ -195,6 +212,7 @@ def _slopes_source(equations: Equations, step: StepInC) -> str:
     program = Program(tables=step.program.tables)
     n, m = step.n, step.m
     sizes = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "move": n, **({"P->push": m} if m else {})}
+    sizes |= equations_theta(equations)
     (slopes,) = interpret(program, equations.jacobian, [program.given(name, size) for name, size in sizes.items()])
     head = "\n/* d(q, p, s)' / d(q, p, s, h, push) at the solution q1 = q0 + move, row by row. */\n"
     head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
@@ -212,3 +230,15 @@ def _momentum_source(equations: Equations, step: StepInC) -> str:
     head += "static inline void FN_momentum(const REAL q[hz_N], const REAL v[hz_N], REAL s, REAL h,\n    "
     head += ", ".join(f"REAL {name}[{'hz_N * hz_N' if name == 'by_v' else 'hz_N'}]" for name in outputs)
     return whole(program, f"{head})", outputs)
+
+
+def _pull_source(equations: Equations, step: StepInC) -> str:
+    """The derivative of a solved step, transposed and times a vector, as a C function."""
+    program = Program(tables=step.program.tables)
+    n, m = step.n, step.m
+    sizes = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "move": n, "of": 2 * n + 1, **({"P->push": m} if m else {})}
+    sizes |= equations_theta(equations)
+    rows = interpret(program, equations.pull, [program.given(name, size) for name, size in sizes.items()])
+    head = "\n/* The derivatives by (q, p, s, h, push) before a solved step from those `of` (q, p, s)' after it. */\n"
+    head += "static inline void FN_pull(const FN_problem *P, const REAL move[hz_N], const REAL *of, REAL *pulled)"
+    return whole(program, head, {"pulled": [x for row in rows for x in row.ravel()]})

@@ -8,16 +8,16 @@ static inline int hz_advance(hz_state *state, hz_track *track, hz_real h, hz_TAK
   return status[0];
 }
 
-static inline int hz_alone(hz_state *state, hz_real h, hz_TAKES_U hz_real *residual) {
+static inline int hz_alone(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual) {
   hz_track track;
-  hz_track_start(state, &track);
+  hz_track_start(state, hz_WITH_THETA(theta) &track);
   return hz_advance(state, &track, h, hz_WITH_U(u) residual);
 }
 
 /* The state at q1 from two positions h apart: (q1, D2 L_d, s0 + L_d); sigma starts at 1. `out` is written on success
    only. Returns a status. */
 static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_real s0, hz_real h,
-    hz_TAKES_U hz_state *out) {
+    hz_TAKES_U hz_TAKES_THETA hz_state *out) {
   hz_problem P;
   hz_terms t;
   hz_potential_t V1;
@@ -34,11 +34,16 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
   P.h = h;
   next.sigma = hz_R(1.0);
   if (hz_before(&next, h) || !hz_all_finite(q0) || hz_BAD_U(u)) return hz_BAD_INPUT;
+#if hz_P
+  if (!theta) theta = &hz_defaults;
+  if (!hz_in_bounds(theta)) return hz_BAD_INPUT;
+  for (i = 0; i < hz_P; i++) P.theta[i] = theta->value[i];
+#endif /* hz_P */
 #if hz_INPUTS
-  hz_push(u, P.push);
+  hz_push(u, hz_WITH_THETA(theta) P.push);
 #endif
-  hz_potential(q0, &P.V0);
-  hz_potential(q1, &V1);
+  hz_potential(q0, hz_WITH_THETA(P.theta) &P.V0);
+  hz_potential(q1, hz_WITH_THETA(P.theta) &V1);
   hz_prepare(&P);
   for (pass = 0; pass < 2; pass++) { /* first c, and the momentum p0 that the step starts with; then the step's end */
     hz_begin(&P, move);
@@ -62,13 +67,16 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
 /* One step of h > 0. The state changes on success only. `residual` (may be null) receives what is left of the step
    equation, |J^-1 F| in units of q. Returns a status, with hz_OUTSIDE_BOX added where the step starts or ends outside
    the box and hz_OUTSIDE_H where h is not one of the range the model was fitted for. */
-static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_real *residual) {
+static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual) {
   hz_real left = hz_R(0.0);
   int status = hz_before(state, h);
+#if hz_P
+  if (!status && theta && !hz_in_bounds(theta)) status = hz_BAD_INPUT;
+#endif /* hz_P */
   if (!status && hz_BAD_U(u)) status = hz_DIVERGED;
   if (!status) {
     status = hz_outside_box(state) | hz_outside_h(h);
-    status |= hz_alone(state, h, hz_WITH_U(u) &left) | hz_outside_box(state);
+    status |= hz_alone(state, h, hz_WITH_U(u) hz_WITH_THETA(theta) &left) | hz_outside_box(state);
   }
   if (residual) *residual = left;
   return status;
@@ -83,14 +91,17 @@ static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_real *residu
 
    Any of them and `residual` may be null; they are written on success only. A derivative that is not finite is
    hz_DIVERGED, and the state stays. */
-static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_real *residual, hz_real *by_state,
-    hz_WITH_U(hz_real *by_input) hz_real *by_h) {
-  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS * hz_N };
+static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual, hz_real *by_state,
+    hz_WITH_U(hz_real *by_input) hz_WITH_THETA(hz_real *by_theta) hz_real *by_h) {
+  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS * hz_N + hz_P };
   const hz_state before = *state;
   hz_problem P;
   hz_real slopes[SIZE * WIDTH], move[hz_N];
   int i, j;
-  const int status = hz_step(state, h, hz_WITH_U(u) residual);
+  const int status = hz_step(state, h, hz_WITH_U(u) hz_WITH_THETA(theta) residual);
+#if hz_P && hz_INPUTS
+  hz_real hz_input_map[hz_N * hz_M], hz_input_offset[hz_N], push_by_theta[hz_N * hz_P];
+#endif /* hz_P */
   if (status & 15) return status;
   for (i = 0; i < hz_N; i++) {
     P.q0[i] = before.q[i];
@@ -99,9 +110,17 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_rea
   }
   P.s0 = before.s;
   P.h = h;
+#if hz_P
+  if (!theta) theta = &hz_defaults;
+  for (i = 0; i < hz_P; i++) P.theta[i] = theta->value[i];
+#endif /* hz_P */
 #if hz_INPUTS
-  hz_push(u, P.push);
+  hz_push(u, hz_WITH_THETA(theta) P.push);
 #endif
+#if hz_P && hz_INPUTS
+  hz_inputs_at(theta->value, hz_input_map, hz_input_offset);
+  if (u) hz_push_slopes(u, theta->value, push_by_theta);
+#endif /* hz_P */
   hz_slopes(&P, move, slopes);
   for (i = 0; i < SIZE * WIDTH; i++)
     if (!hz_finite(slopes[i])) { /* the step exists, but a derivative is beyond the largest number */
@@ -111,6 +130,18 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_rea
   for (i = 0; i < SIZE; i++) {
     for (j = 0; by_state && j < SIZE; j++) by_state[i * SIZE + j] = slopes[i * WIDTH + j];
     if (by_h) by_h[i] = slopes[i * WIDTH + SIZE];
+#if hz_P
+    for (j = 0; by_theta && j < hz_P; j++) {
+#if hz_INPUTS
+      int k;
+#endif
+      by_theta[i * hz_P + j] = slopes[i * WIDTH + WIDTH - hz_P + j];
+#if hz_INPUTS
+      for (k = 0; u && k < hz_N; k++)
+        by_theta[i * hz_P + j] += slopes[i * WIDTH + SIZE + 1 + k] * push_by_theta[k * hz_P + j];
+#endif
+    }
+#endif /* hz_P */
 #if hz_INPUTS
     for (j = 0; by_input && j < hz_M; j++) {
       int k;
@@ -143,10 +174,14 @@ static inline int hz_run_some(hz_state *states, long b, long count, const hz_job
    Inputs u are (count, steps, hz_M). The outputs hold one sample after the other; statuses[b] receives what hz_rollout
    would return. Any but `states` may be null. Returns the status of the first sample that failed, or 0, with the flags
    of any. */
-static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_TAKES_U long steps, long every,
+static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_TAKES_U hz_TAKES_THETA long steps, long every,
     hz_real *q_out, hz_real *p_out, hz_real *s_out, int *statuses) {
-  const hz_job job = {steps, every, &h, 0, 0, hz_WITH_U(u) hz_WITH_U(steps * hz_M) q_out, p_out, s_out, 0, 0, 0};
+  const hz_job job = {steps, every, &h, 0, 0, hz_WITH_U(u) hz_WITH_U(steps * hz_M) hz_WITH_THETA(theta) q_out, p_out, s_out, 0, 0, 0};
+#if hz_P
+  const int possible = steps >= 0 && every > 0 && (!theta || hz_in_bounds(theta));
+#else
   const int possible = steps >= 0 && every > 0;
+#endif /* hz_P */
   int worst = 0, flagged = 0, status[hz_SIDE], flags[hz_SIDE], some, w;
   long b;
   for (b = 0; b < count; b += some) {
@@ -169,12 +204,12 @@ static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_T
    1 + steps / every entries (q, p: hz_N numbers each) and may be null. Stops at the first failed step and returns its
    status: `state` is then the last good one and the entries not reached are NaN. Leaving the box stops nothing:
    hz_OUTSIDE_BOX is added to what is returned. */
-static inline int hz_rollout(hz_state *state, hz_real h, hz_TAKES_U long steps, long every, hz_real *q_out,
+static inline int hz_rollout(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA long steps, long every, hz_real *q_out,
     hz_real *p_out, hz_real *s_out) {
-  return hz_rollout_batch(1, state, h, hz_WITH_U(u) steps, every, q_out, p_out, s_out, 0);
+  return hz_rollout_batch(1, state, h, hz_WITH_U(u) hz_WITH_THETA(theta) steps, every, q_out, p_out, s_out, 0);
 }
 
 /* hz_step of `count` samples; `statuses` may be null. Returns as hz_rollout_batch. */
-static inline int hz_step_batch(long count, hz_state *states, hz_real h, hz_TAKES_U int *statuses) {
-  return hz_rollout_batch(count, states, h, hz_WITH_U(u) 1, 1, 0, 0, 0, statuses);
+static inline int hz_step_batch(long count, hz_state *states, hz_real h, hz_TAKES_U hz_TAKES_THETA int *statuses) {
+  return hz_rollout_batch(count, states, h, hz_WITH_U(u) hz_WITH_THETA(theta) 1, 1, 0, 0, 0, statuses);
 }

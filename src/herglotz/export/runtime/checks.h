@@ -39,8 +39,12 @@ static inline void hz_lose(hz_state *state) {
 #define hz_WITH_U(argument) argument,
 
 /* G (u - u0); no inputs where u is null. */
-static inline void hz_push(const hz_real *u, hz_real push[hz_N]) {
+static inline void hz_push(const hz_real *u, hz_TAKES_THETA hz_real push[hz_N]) {
   int i, j;
+#if hz_P
+  hz_real hz_input_map[hz_N * hz_M], hz_input_offset[hz_N];
+  hz_inputs_at(theta->value, hz_input_map, hz_input_offset);
+#endif /* hz_P */
   for (i = 0; i < hz_N; i++) {
     push[i] = u ? hz_input_offset[i] : hz_R(0.0);
     for (j = 0; u && j < hz_M; j++) push[i] += hz_input_map[i * hz_M + j] * u[j];
@@ -70,7 +74,7 @@ enum { hz_SIDE = 1 };
 #endif
 
 /* One step of a state by itself, with its checks done. */
-static inline int hz_alone(hz_state *state, hz_real h, hz_TAKES_U hz_real *residual);
+static inline int hz_alone(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual);
 
 /* A run of steps: h of sample b and step k is h[b * h_sample + k * h_step]. What is stored after every so many steps,
    and status and residual after each; any may be null. */
@@ -82,6 +86,9 @@ typedef struct {
   const hz_real *u; /* null: none act */
   long u_sample;
 #endif
+#if hz_P
+  const hz_parameters *theta;
+#endif /* hz_P */
   hz_real *q, *p, *s, *sigma, *residual;
   unsigned char *status;
 } hz_job;

@@ -25,10 +25,10 @@ static void store(const hz_state *x, long at, hz_real *q_out, hz_real *p_out, hz
 /* Rollouts of `batch` samples; outputs are (batch, steps + 1, ...), statuses and residuals (batch, steps). The statuses
    arrive full of hz_DIVERGED: nothing is written after a failure but its own status. */
 void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
-    long h_sample, long h_step, const hz_real *u, long u_sample, hz_real *q_out, hz_real *p_out, hz_real *s_out,
+    long h_sample, long h_step, const hz_real *u, long u_sample, hz_TAKES_THETA hz_real *q_out, hz_real *p_out, hz_real *s_out,
     hz_real *sigma_out, unsigned char *status_out, hz_real *residual_out) {
   const hz_job job = {steps, 1, h, h_sample, h_step, hz_WITH_U(u) hz_WITH_U(u_sample)
-                      q_out, p_out, s_out, sigma_out, residual_out, status_out};
+                      hz_WITH_THETA(theta) q_out, p_out, s_out, sigma_out, residual_out, status_out};
   hz_state x[hz_SIDE];
   int status[hz_SIDE], w;
   long b;
@@ -46,8 +46,8 @@ void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *
 #if hz_DERIVATIVES
 /* Steps of `batch` samples with their derivatives; h and u are one a sample. Outputs arrive full of NaN. */
 void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
-    const hz_real *u, hz_real *q_out, hz_real *p_out, hz_real *s_out, hz_real *sigma_out, unsigned char *status_out,
-    hz_real *residual_out, hz_real *by_state, hz_real *by_input, hz_real *by_h) {
+    const hz_real *u, hz_TAKES_THETA hz_real *q_out, hz_real *p_out, hz_real *s_out, hz_real *sigma_out, unsigned char *status_out,
+    hz_real *residual_out, hz_real *by_state, hz_real *by_input, hz_WITH_THETA(hz_real *by_theta) hz_real *by_h) {
   const long size = 2 * hz_N + 1;
   long b;
   (void)u;
@@ -56,8 +56,8 @@ void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz
     hz_state x;
     int status;
     load(q, p, s, b, &x);
-    status = hz_step_jacobian(&x, h[b], hz_WITH_U(u ? u + b * hz_M : 0) residual_out + b, by_state + b * size * size,
-        hz_WITH_U(by_input + b * size * hz_M) by_h + b * size);
+    status = hz_step_jacobian(&x, h[b], hz_WITH_U(u ? u + b * hz_M : 0) hz_WITH_THETA(theta) residual_out + b, by_state + b * size * size,
+        hz_WITH_U(by_input + b * size * hz_M) hz_WITH_THETA(by_theta + b * size * hz_P) by_h + b * size);
     status_out[b] = (unsigned char)(status & 15);
     if (!(status & 15)) store(&x, b, q_out, p_out, s_out, sigma_out);
   }
@@ -66,14 +66,14 @@ void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz
 
 /* States from two positions; h and u are one a sample. */
 void herglotz_inits(long batch, const hz_real *q0, const hz_real *q1, const hz_real *s0, const hz_real *h,
-    const hz_real *u, hz_real *p_out, hz_real *s_out, unsigned char *status_out) {
+    const hz_real *u, hz_TAKES_THETA hz_real *p_out, hz_real *s_out, unsigned char *status_out) {
   long b;
   int i;
   (void)u;
   for (b = 0; b < batch; b++) {
     hz_state x;
     const int status =
-        15 & hz_init(q0 + b * hz_N, q1 + b * hz_N, s0[b], h[b], hz_WITH_U(u ? u + b * hz_M : 0) &x);
+        15 & hz_init(q0 + b * hz_N, q1 + b * hz_N, s0[b], h[b], hz_WITH_U(u ? u + b * hz_M : 0) hz_WITH_THETA(theta) &x);
     status_out[b] = (unsigned char)status;
     if (status) continue;
     for (i = 0; i < hz_N; i++) p_out[b * hz_N + i] = x.p[i];

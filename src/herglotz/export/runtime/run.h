@@ -17,7 +17,7 @@ static inline void FN_run(hz_state *states, long b, int count, const hz_job *job
     FN_set(&x, w, states + (w < count ? w : count - 1));
     if (w >= count) status[w] = status[count - 1];
   }
-  FN_track_start(&x, &track);
+  FN_track_start(&x, hz_WITH_THETA(job->theta) &track);
   for (k = 0; k <= job->steps; k++) {
     for (w = 0; w < FN_WIDTH; w++) {
       const long sample = b + (w < count ? w : count - 1);

@@ -14,10 +14,13 @@ typedef struct {
 #endif
 } FN_track;
 
-static inline void FN_track_start(const FN_state *state, FN_track *track) {
+static inline void FN_track_start(const FN_state *state, hz_TAKES_THETA FN_track *track) {
   const REAL zero = SPREAD(hz_R(0.0));
   int i;
-  FN_potential(state->q, &track->P.V0);
+#if hz_P
+  for (i = 0; i < hz_P; i++) track->P.theta[i] = SPREAD(theta ? theta->value[i] : hz_defaults.value[i]);
+#endif /* hz_P */
+  FN_potential(state->q, hz_WITH_THETA(track->P.theta) &track->P.V0);
   track->P.h = zero;
   for (i = 0; i < hz_N; i++) track->low_q[i] = track->low_p[i] = zero;
   track->low_s = track->low_sigma = zero;
@@ -255,6 +258,17 @@ static inline void FN_set(FN_state *x, int w, const hz_state *one) {
   FN_LANE(x->sigma, w) = one->sigma;
 }
 
+#if hz_P
+/* The parameters of sample w. */
+static inline hz_parameters FN_theta(const FN_problem *P, int w) {
+  hz_parameters theta;
+  int i;
+  (void)w;
+  for (i = 0; i < hz_P; i++) theta.value[i] = FN_LANE(P->theta[i], w);
+  return theta;
+}
+
+#endif /* hz_P */
 /* One step of every sample whose status is 0; one that fails gets its status and keeps its state. What several samples
    side by side cannot solve is solved alone. */
 static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_WIDTH],
@@ -287,7 +301,10 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
 #if hz_INPUTS
   for (w = 0; w < FN_WIDTH; w++) {
     hz_real push[hz_N];
-    hz_push(u[w], push);
+#if hz_P
+    const hz_parameters theta = FN_theta(P, w);
+#endif /* hz_P */
+    hz_push(u[w], hz_WITH_THETA(&theta) push);
     for (i = 0; i < hz_N; i++) FN_LANE(P->push[i], w) = push[i];
   }
 #endif
@@ -305,7 +322,7 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
     low[i] = track->low_q[i];
     q1[i] = FN_add(P->q0[i], FN_moved(P, i, x[i]), &low[i]);
   }
-  FN_potential(q1, &V1);
+  FN_potential(q1, hz_WITH_THETA(P->theta) &V1);
   FN_gains(P, &t, x, &V1, dp, &ds, &E);
   for (i = 0; i < hz_N; i++) sum += (P->p0[i] + dp[i]) + q1[i]; /* what is not finite stays so in a sum */
   sum += (P->s0 + ds) + (sigma + E * sigma);
@@ -318,6 +335,9 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
   state->sigma = FN_add(sigma, E * sigma, &track->low_sigma);
   for (w = 0; w < FN_WIDTH; w++) {
     hz_state one;
+#if hz_P
+    const hz_parameters theta = FN_theta(P, w);
+#endif /* hz_P */
     if (!failed[w] && !hz_finite(FN_LANE(sum, w))) failed[w] = hz_DIVERGED;
     if (!failed[w] && !(hz_R(1.0) + FN_LANE(E, w) > hz_R(0.0))) failed[w] = hz_SINGULAR;
     if (!failed[w]) continue;
@@ -334,9 +354,9 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
     track->known[w] = 0;
 #endif
     if (FN_WIDTH == 1) status[w] = failed[w];
-    else if (status[w] == hz_CONVERGED) status[w] = hz_alone(&one, h[w], hz_WITH_U(u[w]) &residual[w]);
+    else if (status[w] == hz_CONVERGED) status[w] = hz_alone(&one, h[w], hz_WITH_U(u[w]) hz_WITH_THETA(&theta) &residual[w]);
     FN_set(state, w, &one);
   }
-  if (again) FN_potential(state->q, &V1);
+  if (again) FN_potential(state->q, hz_WITH_THETA(P->theta) &V1);
   P->V0 = V1;
 }

@@ -1,0 +1,187 @@
+"""`hz.filter`: states, velocities and chosen numbers of a model, sample by sample as a controller would have them."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.codegen.c_compiler import compiler
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.export.c_compile import compile_c
+from herglotz.export.c_header import MAX_DERIVATIVES
+from herglotz.export.exported import ExportedStepper
+from herglotz.mechanics import legendre_minus
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State
+from herglotz.stepping.filter import Belief, KalmanFilter, Noise
+from herglotz.stepping.linearise import forward_slopes
+from herglotz.training.fitted_run import FittedRun
+from herglotz.training.predict import BELIEVED, of_the_run
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.smoothing import SmoothingProblem
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What a filter knows after each sample, N in all, in the units of the data and of the model."""
+
+    t: Tensor  # (N,)
+    state: State  # (N, n), (N, n), (N,)
+    v: Tensor  # (N, n)
+    theta: Tensor  # (N, K) the numbers that are estimated too
+    names: list[str]  # theirs
+    covariance: Tensor  # (N, F, F) of q, p, s where the motion depends on it, and θ
+    covariance_of_v: Tensor  # (N, n, n)
+    surprise: Tensor  # (N,) squared innovation over its variance, n on average; NaN at the first of a trajectory
+
+
+def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
+    """The noise of positions that the fit found, and of the forces that it lets a smoothed motion leave the model by.
+
+    `theta` are the standard deviations of numbers that wander. Raise InputError if the fit found no noise.
+    """
+    problem, h = _problem(run), run.h
+    n = problem.n
+    momentum = problem.process * problem.mass * problem.deviations * problem.speed / problem.scale / math.sqrt(h)
+    if not bool((problem.deviations[:n] > 0).all()):
+        raise InputError("the run's metrics have no noise (sigma) > 0; give noise to the filter")
+    return Noise(problem.deviations.tolist(), momentum.tolist(), theta)
+
+
+def filter(
+    run: FittedRun,
+    recording: Trajectories,
+    parameters: Mapping[str, tuple[float, float]] | None = None,
+    noise: Noise | None = None,
+) -> Filtered:
+    """Follow a recording by an extended Kalman filter on the run's step: x = x⁻ + P_q (y − q)/S at each sample.
+
+    Each trajectory starts at its first two samples. The same filter stands in a C header that is exported with
+    `extras=["filter"]` (`docs/c.md`).
+
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    recording
+        Positions of the same coordinates, in the same units, with inputs where the model takes them.
+    parameters
+        Numbers of the model that are estimated too: by name, the standard deviation that each starts with, and how far
+        it wanders in the root of a unit of time, in the number's own unit.
+    noise
+        Standard deviations in the units of the data; by default those of the fit (`noise_of`).
+
+    Returns
+    -------
+    Filtered
+        States, velocities and their covariance at every sample, in the units of the data.
+
+    Raises
+    ------
+    InputError
+        If the recording is not of the run, has trajectories of fewer than two samples, or leaves where the model has
+        steps.
+    """
+    chosen = dict(parameters or {})
+    model = copy.deepcopy(run.model).double()
+    data = of_the_run(run, recording).unwrapped().to(dtype=torch.float64, device="cpu")
+    wander = tuple(each for _, each in chosen.values())
+    kalman = KalmanFilter(model, noise or noise_of(run, wander), list(chosen), stepper=_compiled(model, list(chosen)))
+    if len(kalman.names) != len(chosen):
+        raise InputError(f"{', '.join(chosen)} stand for several numbers of the model; name each of them")
+    std = torch.tensor([first for first, _ in chosen.values()], dtype=torch.float64)
+    beliefs, surprises, steps = [], [], []
+    for first, length in zip(data.offsets, data.lengths, strict=True):
+        if length < 2:
+            raise InputError(f"{data.source or 'data'}: a trajectory has {length} sample; a filter starts at two")
+        belief, surprise = _started(kalman, data, first, std), math.nan
+        for row in range(first, first + length):
+            h = float(data.t[row] - data.t[row - 1]) if row > first else float(data.t[row + 1] - data.t[row])
+            if row > first:
+                parts = max(1, math.ceil(h / run.h_range[1] - 1e-6))
+                for k in range(parts):
+                    part = torch.tensor((k + 0.5) / parts, dtype=torch.float64)
+                    belief = kalman.predict(belief, h / parts, _input(model, data, row - 1, part))
+                belief, surprise = kalman.update(belief, data.q[row])
+            beliefs.append(belief)
+            surprises.append(surprise)
+            steps.append(min(h, run.h_range[1]))
+    return _told(kalman, model, data, beliefs, surprises, steps)
+
+
+def _compiled(model: ContactLagrangian, names: list[str]) -> ExportedStepper | None:
+    """The model in C, at a hundredth of the time; None where there is no compiler or no C of it."""
+    if model.dof > MAX_DERIVATIVES:
+        return None
+    with suppress(InputError):
+        compiler()
+        return compile_c(model, parameters=names)
+    return None
+
+
+def _told(
+    kalman: KalmanFilter, model: ContactLagrangian, data: Trajectories, beliefs: list[Belief], surprises: list[float],
+    steps: list[float],
+) -> Filtered:  # fmt: skip
+    states, thetas, covariances = (torch.stack(x) for x in zip(*(_flat(belief) for belief in beliefs), strict=True))
+    n = kalman.n
+    state = State(states[:, :n], states[:, n:-1], states[:, -1])
+    u = data.u if model.inputs else None
+    if kalman.names:  # each sample has its own model
+        found = [
+            kalman.velocity(belief, h, None if u is None else u[i])
+            for i, (belief, h) in enumerate(zip(beliefs, steps, strict=True))
+        ]
+        v, spread = (torch.stack(x) for x in zip(*found, strict=True))
+    else:
+        v, spread = kalman.velocity(Belief(state, thetas, covariances), data.t.new_tensor(steps), u)
+    surprise = data.t.new_tensor(surprises)
+    return Filtered(data.t, state, v, thetas, kalman.names, covariances, spread, surprise)
+
+
+def _flat(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
+    q, p, s = belief.state
+    return torch.cat([q, p, s[None]]), belief.theta, belief.covariance
+
+
+def _input(model: ContactLagrangian, data: Trajectories, row: int, part: Tensor) -> Tensor | None:
+    """The input (m,) at this part of the recorded step that starts at a row."""
+    if not model.inputs:
+        return None
+    u = data.inputs_of_steps(torch.tensor([row]), part[None])
+    assert u is not None  # `of_the_run` has checked
+    return u[0]
+
+
+def _started(kalman: KalmanFilter, data: Trajectories, row: int, std: Tensor) -> Belief:
+    """At the first sample, with the momentum that FL⁻ gives the first two: its noise is m √2 σ/h."""
+    n, model = kalman.n, kalman.model
+    q0, q1, h = data.q[row], data.q[row + 1], data.t[row + 1] - data.t[row]
+    u = _input(model, data, row, torch.tensor(0.5, dtype=torch.float64))
+    zero = torch.zeros((), dtype=torch.float64)
+
+    def momentum(q1: Tensor) -> Tensor:
+        return legendre_minus(model if u is None else model.at(u), q0, q1, zero, h)[1]
+
+    with torch.no_grad():
+        p = momentum(q1)
+        by_q1 = forward_slopes(momentum, q1)
+    own = q0.new_tensor(kalman.noise.position)
+    spread = torch.cat([own, 2**0.5 * (by_q1.square() @ own.square()).sqrt(), zero.expand(kalman.kept - 2 * n), std])
+    return kalman.start(State(q0, p, zero), spread)
+
+
+def _problem(run: FittedRun) -> SmoothingProblem:
+    """The smoothing of the run's own data, for the noise that it assumes."""
+    data, config, high = run.data.unwrapped(), run.model.config, run.h_range[1]
+    turn = run.h * max(v / x for v, x in zip(config.speed, config.scale, strict=True))
+    process = run.metrics.get("process") or BELIEVED * min(1.0, turn) ** 0.5
+    sigma = run.metrics.get("sigma") or 0.0
+    return SmoothingProblem(run.model, data, segment_grid(data, data.samples, high), sigma=sigma, process=process)

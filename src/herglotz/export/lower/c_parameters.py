@@ -1,0 +1,94 @@
+"""Numbers of a model that are set at run time, in C: their structure, and what depends on them beside the step."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from herglotz.codegen.c_function import as_scalars, whole
+from herglotz.codegen.interpret import interpret
+from herglotz.codegen.program import Program
+from herglotz.codegen.trace import traced
+from herglotz.export.c_numbers import numbers, text_constant
+from herglotz.export.equation import Equations, dense, example
+from herglotz.models import ContactLagrangian
+from herglotz.stepping.linearise import forward_slopes
+
+MARKED = re.compile(r"#if hz_P\b[^\n]*\n(?:.*?)(?:#else\n(.*?))?#endif /\* hz_P \*/\n", re.DOTALL)
+TOKENS = re.compile(r"hz_TAKES_THETA |hz_WITH_THETA\([^()]*\) | \+ hz_P\b")
+
+
+def without_parameters(text: str) -> str:
+    """A text of the runtime for a header without parameters: not a trace of them is left."""
+    return TOKENS.sub("", MARKED.sub(lambda m: m[1] or "", text))
+
+
+def constants(entries: Mapping[str, Sequence[float | None]], dtype: str) -> str:
+    """The structure, its indices, and names, defaults and bounds."""
+    largest = torch.finfo(getattr(torch, dtype)).max
+    missing = {"defaults": 0.0, "lowest": -largest, "highest": largest}
+    columns = zip(missing.items(), zip(*entries.values(), strict=True), strict=True)
+    rows = {key: [none if x is None else x for x in row] for (key, none), row in columns}
+    indices = ", ".join(f"hz_{identifier(name)} = {i}" for i, name in enumerate(entries))
+    names = ", ".join(map(text_constant, entries))
+    lines = [f"#define hz_P {len(entries)} /* numbers that are set at run time */"]
+    lines += ["/* One of these numbers is theta.value[i], with i of this list. */", f"enum {{ {indices} }};"]
+    lines += [f"typedef struct {{\n  hz_real value[{len(entries)}];\n}} hz_parameters;"]
+    lines += [f"static const hz_parameters hz_{key} = {{{{{numbers(row, dtype)}}}}};" for key, row in rows.items()]
+    lines += [f"static const char *const hz_parameter_names[hz_P] = {{{names}}};"]
+    return "\n".join(lines) + "\n"
+
+
+def identifier(name: str) -> str:
+    """The name of a number in C, after the prefix."""
+    return re.sub(r"\W+", "_", name).strip("_")
+
+
+def inputs_constants(model: ContactLagrangian, dtype: str) -> str:
+    """The matrix G of the inputs and −G u₀, where the model takes some."""
+    if not model.config.inputs or model.friction is None:
+        return ""
+    map_, offset = (
+        numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype)
+        for x in (model.friction.input_map, model.friction.offset())
+    )
+    lines = ["/* The forces of inputs u are input_map u + input_offset. */"]
+    lines.append(f"static const hz_real hz_input_map[hz_N * hz_M] = {{{map_}}};")
+    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_N] = {{{offset}}};\n"])
+
+
+def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables: dict[tuple[float, ...], str]) -> str:
+    """The matrix G of the inputs and −G u₀, and the derivative of G (u − u₀) by θ, as functions of θ."""
+    if not model.inputs:
+        return ""
+    equations, program = Equations.of(model, values), Program(tables=tables)
+    friction = equations.model.friction
+    assert friction is not None  # a model with inputs is a forced one
+
+    def forces(u: Tensor) -> tuple[Tensor, ...]:
+        shared = (friction.input_map, friction.offset())
+        return *(x.expand(len(u), *x.shape) for x in shared), friction.applied(u)
+
+    at = equations.of_numbers(forces)
+
+    def parts(u: Tensor, theta: Tensor) -> tuple[Tensor, ...]:
+        by_theta = forward_slopes(lambda theta: at(u, theta)[2], theta)
+        return tuple(map(dense, (*at(u, theta)[:2], by_theta)))
+
+    graph = traced(parts, (example(equations.model, 0.1)[-1], *equations.theta))
+    arrays = interpret(program, graph, [program.given("u", model.inputs), program.given("theta", len(values))])
+    G, offset, by_theta = (list(x.ravel()) for x in arrays)
+    return as_scalars(
+        whole(program, INPUTS_AT, {"map": G, "offset": offset}) + whole(program, PUSH_SLOPES, {"slopes": by_theta})
+    )
+
+
+INPUTS_AT = """
+/* The forces of inputs u are map u + offset. */
+static inline void FN_inputs_at(const REAL theta[hz_P], REAL map[hz_N * hz_M], REAL offset[hz_N])"""
+PUSH_SLOPES = """
+/* Their derivatives by theta, row by row. */
+static inline void FN_push_slopes(const REAL *u, const REAL theta[hz_P], REAL slopes[hz_N * hz_P])"""

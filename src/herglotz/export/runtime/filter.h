@@ -1,0 +1,187 @@
+
+/* An extended Kalman filter on the model's step: positions in; (q, p, s), velocities and their covariance out, and the
+   numbers of hz_parameters as slow states. Nothing is allocated, and nothing is kept but hz_filter. */
+
+/* What the covariance is of: q, p, s where the motion depends on it, and theta. */
+#define hz_F (2 * hz_N + hz_CARRIES_S + hz_P)
+
+typedef struct {
+  hz_state x;
+#if hz_P
+  hz_parameters theta;
+#endif /* hz_P */
+  hz_real P[hz_F][hz_F];
+} hz_filter;
+
+/* Standard deviations: of a measured position; of the momentum that unknown forces add in a unit of time, growing with
+   its root; and, in the same way, of how far each number of theta wanders. */
+typedef struct {
+  hz_real position[hz_N], momentum[hz_N];
+#if hz_P
+  hz_real theta[hz_P];
+#endif /* hz_P */
+} hz_noise;
+
+/* Start at a state with standard deviations `std` of q, p, s where the motion depends on it, and theta, hz_F numbers.
+   theta null: hz_defaults. hz_BAD_INPUT where something is not finite, a deviation is negative, or theta is out of
+   bounds; `filter` is written on success only. */
+static inline int hz_filter_start(hz_filter *filter, const hz_state *x, hz_TAKES_THETA const hz_real std[hz_F]) {
+  int i, j;
+  if (hz_before(x, hz_R(1.0))) return hz_BAD_INPUT;
+#if hz_P
+  if (theta && !hz_in_bounds(theta)) return hz_BAD_INPUT;
+#endif /* hz_P */
+  for (i = 0; i < hz_F; i++)
+    if (!(hz_finite(std[i]) && std[i] >= hz_R(0.0))) return hz_BAD_INPUT;
+  filter->x = *x;
+#if hz_P
+  filter->theta = theta ? *theta : hz_defaults;
+#endif /* hz_P */
+  for (i = 0; i < hz_F; i++)
+    for (j = 0; j < hz_F; j++) filter->P[i][j] = i == j ? std[i] * std[i] : hz_R(0.0);
+  return hz_CONVERGED;
+}
+
+static inline int hz_noise_usable(const hz_noise *noise) {
+  int i, good = 1;
+  for (i = 0; i < hz_N; i++) {
+    good &= hz_finite(noise->position[i]) && noise->position[i] > hz_R(0.0);
+    good &= hz_finite(noise->momentum[i]) && noise->momentum[i] >= hz_R(0.0);
+  }
+#if hz_P
+  for (i = 0; i < hz_P; i++) good &= hz_finite(noise->theta[i]) && noise->theta[i] >= hz_R(0.0);
+#endif /* hz_P */
+  return good;
+}
+
+/* Half of what unknown forces add in a step h: before it and after it, so that q and p get their share of each other. */
+static inline void hz_filter_spread(hz_real P[hz_F][hz_F], hz_real h, const hz_noise *noise) {
+  int i;
+  for (i = 0; i < hz_N; i++) P[hz_N + i][hz_N + i] += noise->momentum[i] * noise->momentum[i] * h / hz_R(2.0);
+#if hz_P
+  for (i = 0; i < hz_P; i++)
+    P[hz_F - hz_P + i][hz_F - hz_P + i] += noise->theta[i] * noise->theta[i] * h / hz_R(2.0);
+#endif /* hz_P */
+}
+
+/* One step of h > 0: P becomes A P A' with A the derivative of the step, and what unknown forces add. Returns the status
+   of hz_step_jacobian, or hz_BAD_INPUT for noise that is none; the filter changes on success only. */
+static inline int hz_filter_predict(hz_filter *filter, hz_real h, hz_TAKES_U const hz_noise *noise) {
+  enum { SIZE = 2 * hz_N + 1, KEPT = 2 * hz_N + hz_CARRIES_S };
+  hz_real by_state[SIZE * SIZE], A[hz_F][hz_F], P[hz_F][hz_F], half[hz_F][hz_F];
+#if hz_P
+  hz_real by_theta[SIZE * hz_P];
+#endif /* hz_P */
+  hz_state x = filter->x;
+  int i, j, k, status;
+  if (!hz_noise_usable(noise)) return hz_BAD_INPUT;
+  status = hz_step_jacobian(&x, h, hz_WITH_U(u) hz_WITH_THETA(&filter->theta) 0, by_state,
+      hz_WITH_U(0) hz_WITH_THETA(by_theta) 0);
+  if (status & 15) return status;
+  for (i = 0; i < hz_F; i++)
+    for (j = 0; j < hz_F; j++) {
+      A[i][j] = i == j ? hz_R(1.0) : hz_R(0.0);
+      if (i < KEPT && j < KEPT) A[i][j] = by_state[i * SIZE + j];
+#if hz_P
+      if (i < KEPT && j >= KEPT) A[i][j] = by_theta[i * hz_P + j - KEPT];
+#endif /* hz_P */
+      P[i][j] = filter->P[i][j];
+    }
+  hz_filter_spread(P, h, noise);
+  for (i = 0; i < hz_F; i++)
+    for (j = 0; j < hz_F; j++)
+      for (half[i][j] = hz_R(0.0), k = 0; k < hz_F; k++) half[i][j] += A[i][k] * P[k][j];
+  for (i = 0; i < hz_F; i++)
+    for (j = 0; j <= i; j++) {
+      for (P[i][j] = hz_R(0.0), k = 0; k < hz_F; k++) P[i][j] += half[i][k] * A[j][k];
+      P[j][i] = P[i][j];
+    }
+  hz_filter_spread(P, h, noise);
+  for (i = 0; i < hz_F; i++)
+    for (j = 0; j < hz_F; j++)
+      if (!hz_finite(P[i][j])) return hz_DIVERGED;
+  filter->x = x;
+  for (i = 0; i < hz_F; i++)
+    for (j = 0; j < hz_F; j++) filter->P[i][j] = P[i][j];
+  return status;
+}
+
+/* Take measured positions y in, one after the other, as their noise is independent; angles count modulo a turn.
+   `surprise` (may be null) receives the squared innovation over its variance, summed: hz_N on average. Numbers of theta
+   stay within their bounds. hz_BAD_INPUT where y or the noise is not finite; the filter changes on success only. */
+static inline int hz_filter_update(hz_filter *filter, const hz_real y[hz_N], const hz_noise *noise, hz_real *surprise) {
+  enum { KEPT = 2 * hz_N + hz_CARRIES_S };
+  hz_real gain[hz_F], total = hz_R(0.0);
+  int i, j, k;
+  if (!hz_all_finite(y) || !hz_noise_usable(noise)) return hz_BAD_INPUT;
+  for (i = 0; i < hz_N; i++) {
+    const hz_real own = noise->position[i] * noise->position[i], variance = filter->P[i][i] + own;
+    hz_real miss = y[i] - filter->x.q[i];
+    if (hz_is_angle[i]) {
+      const hz_real turn = hz_R(6.28318530717958647693);
+      miss -= turn * hz_floor_of(miss / turn + hz_R(0.5));
+    }
+    total += miss * miss / variance;
+    for (j = 0; j < hz_F; j++) gain[j] = filter->P[j][i] / variance;
+    for (j = 0; j < hz_N; j++) {
+      filter->x.q[j] += gain[j] * miss;
+      filter->x.p[j] += gain[hz_N + j] * miss;
+    }
+    if (hz_CARRIES_S) filter->x.s += gain[KEPT - 1] * miss;
+#if hz_P
+    for (j = 0; j < hz_P; j++) filter->theta.value[j] += gain[KEPT + j] * miss;
+#endif /* hz_P */
+    for (j = 0; j < hz_F; j++)
+      for (k = 0; k <= j; k++) {
+        /* P - gain variance gain', without cancellation in the row and column of what is measured */
+        if (j != i && k != i) filter->P[j][k] -= gain[j] * gain[k] * variance;
+        filter->P[k][j] = filter->P[j][k];
+      }
+    for (j = 0; j < hz_F; j++) filter->P[i][j] = filter->P[j][i] = gain[j] * own;
+  }
+#if hz_P
+  for (j = 0; j < hz_P; j++) {
+    hz_real *value = filter->theta.value + j;
+    if (*value < hz_lowest.value[j]) *value = hz_lowest.value[j];
+    if (*value > hz_highest.value[j]) *value = hz_highest.value[j];
+  }
+#endif /* hz_P */
+  if (surprise) *surprise = total;
+  return hz_CONVERGED;
+}
+
+/* The velocity v of the filter's state and its covariance, hz_N numbers and (hz_N, hz_N): v = 4 d(h/2)/h - d(h)/h from
+   the moves d of steps of h and h/2, which is exact to order 2 in h. Returns the status of the steps. */
+static inline int hz_filter_velocity(const hz_filter *filter, hz_real h, hz_TAKES_U hz_real v[hz_N],
+    hz_real *covariance) {
+  enum { SIZE = 2 * hz_N + 1, KEPT = 2 * hz_N + hz_CARRIES_S };
+  hz_real by_state[SIZE * SIZE], G[hz_N][hz_F], half[hz_N][hz_F], speed[hz_N];
+#if hz_P
+  hz_real by_theta[SIZE * hz_P];
+#endif /* hz_P */
+  int i, j, k, pass;
+  for (i = 0; i < hz_N; i++)
+    for (speed[i] = hz_R(0.0), j = 0; j < hz_F; j++) G[i][j] = hz_R(0.0);
+  for (pass = 0; pass < 2; pass++) {
+    const hz_real by = (pass ? hz_R(4.0) : hz_R(-1.0)) / h;
+    hz_state x = filter->x;
+    const int status = hz_step_jacobian(&x, pass ? h / hz_R(2.0) : h, hz_WITH_U(u) hz_WITH_THETA(&filter->theta) 0,
+        by_state, hz_WITH_U(0) hz_WITH_THETA(by_theta) 0);
+    if (status & 15) return status;
+    for (i = 0; i < hz_N; i++) {
+      speed[i] += by * (x.q[i] - filter->x.q[i]);
+      for (j = 0; j < KEPT; j++) G[i][j] += by * (by_state[i * SIZE + j] - (i == j ? hz_R(1.0) : hz_R(0.0)));
+#if hz_P
+      for (j = 0; j < hz_P; j++) G[i][KEPT + j] += by * by_theta[i * hz_P + j];
+#endif /* hz_P */
+    }
+  }
+  for (i = 0; i < hz_N; i++)
+    for (v[i] = speed[i], j = 0; j < hz_F; j++)
+      for (half[i][j] = hz_R(0.0), k = 0; k < hz_F; k++) half[i][j] += G[i][k] * filter->P[k][j];
+  for (i = 0; covariance && i < hz_N; i++)
+    for (j = 0; j < hz_N; j++)
+      for (covariance[i * hz_N + j] = hz_R(0.0), k = 0; k < hz_F; k++)
+        covariance[i * hz_N + j] += half[i][k] * G[j][k];
+  return hz_CONVERGED;
+}

@@ -1,0 +1,167 @@
+"""An extended Kalman filter on the step of a model: measured positions in; state, velocity and covariance out.
+
+The twin of `export/runtime/filter.h`, operation by operation. The filter's state x is (q, p), s where the motion
+depends on it, and chosen numbers θ of the model as slow states. Over a step h whose derivative by x is A, forces that
+the model does not know add w²h to the variance of p, half of it before the step and half after it,
+
+    P ← A (P + W/2) Aᵀ + W/2,        W = diag(0, w² h, 0, w_θ² h),
+
+so that q and p get their share of each other. Positions y = q + e are taken in one by one, as e is independent:
+
+    S = P_ii + σ_i²,    x ← x + P_i (y_i − q_i)/S,    P ← P − P_i P_iᵀ/S.
+
+Source: A. Gelb (ed.), Applied optimal estimation (1974), sections 4.2 and 6.1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian
+from herglotz.models.numbers import chosen, values_of, with_values
+from herglotz.stepping.linearise import Linearised
+from herglotz.stepping.state import State, Status
+from herglotz.stepping.stepper import Stepper
+
+
+class Noise(NamedTuple):
+    """Standard deviations, in the units of q, of p a root of time, and of θ a root of time; the last two grow so."""
+
+    position: Sequence[float]  # (n,) of a measured position
+    momentum: Sequence[float]  # (n,) of what unknown forces add to p
+    theta: Sequence[float] = ()  # (K,) of how far the numbers wander
+
+
+class Belief(NamedTuple):
+    """What a filter knows at one time."""
+
+    state: State  # (n,), (n,), ()
+    theta: Tensor  # (K,)
+    covariance: Tensor  # (F, F) of q, p, s where the motion depends on it, and θ
+
+
+class KalmanFilter:
+    """The filter of one model, with the noise and the numbers θ that it estimates.
+
+    Parameters
+    ----------
+    model
+        Not changed.
+    noise
+        Standard deviations.
+    parameters
+        Names of numbers of the model, as of `chosen`, that are estimated too.
+    bounds
+        (low, high) of some of them, by name; their estimates stay within.
+    stepper
+        What steps and differentiates the model, its numbers set by `with_parameters`; by default `Stepper`.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        noise: Noise,
+        parameters: Sequence[str] = (),
+        bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
+        stepper: Any = None,  # an `ExportedStepper`: this room is below its
+    ):
+        self.stepper = stepper
+        self.model, self.noise, self.n = model, noise, model.dof
+        self.names = chosen(model, parameters)
+        self.kept = 2 * self.n + model.s_enters_motion  # of q, p[, s] in the filter's state
+        sizes = {"position": self.n, "momentum": self.n, "theta": len(self.names)}
+        for name, size in sizes.items():
+            row = getattr(noise, name)
+            low = 0.0 if name != "position" else math.ulp(0.0)
+            if len(row) != size or not all(low <= x < math.inf for x in row):
+                raise InputError(f"noise.{name} needs {size} finite standard deviations, got {list(row)}")
+        own = bounds or {}
+        span = [own.get(name, (None, None)) for name in self.names]
+        self.low = torch.tensor([-math.inf if a is None else a for a, _ in span], dtype=torch.float64)
+        self.high = torch.tensor([math.inf if b is None else b for _, b in span], dtype=torch.float64)
+
+    def start(self, state: State, std: Tensor, theta: Tensor | None = None) -> Belief:
+        """A belief at a state, (n,), (n,), (), with standard deviations (F,); θ is by default that of the model."""
+        size = self.kept + len(self.names)
+        if std.shape != (size,) or not bool((std.isfinite() & (std >= 0)).all()):
+            raise InputError(f"std needs {size} finite standard deviations of q, p[, s] and θ, got {std.tolist()}")
+        theta = std.new_tensor(values_of(self.model, self.names)) if theta is None else theta
+        return Belief(state, theta, torch.diag(std.square()))
+
+    def predict(self, belief: Belief, h: float, u: Tensor | None = None) -> Belief:
+        """The belief after a step h with the input u (m,).
+
+        Raise InputError if the model has no step there.
+        """
+        found = self._stepped(belief, h, u)
+        kept, P = self.kept, belief.covariance
+        A = torch.eye(len(P), dtype=P.dtype)
+        A[:kept, :kept] = found.by_state[:kept, :kept]
+        if found.by_parameters is not None:
+            A[:kept, kept:] = found.by_parameters[:kept]
+        W = P.new_zeros(len(P))
+        W[self.n : 2 * self.n] = P.new_tensor(self.noise.momentum).square() * (h / 2)
+        W[kept:] = P.new_tensor(self.noise.theta).square() * (h / 2)
+        P = A @ (P + torch.diag(W)) @ A.T
+        return Belief(found.step.state, belief.theta, (P + P.T) / 2 + torch.diag(W))
+
+    def update(self, belief: Belief, y: Tensor) -> tuple[Belief, float]:
+        """The belief with measured positions y (n,) taken in, and the squared innovation over its variance, summed.
+
+        Angles count modulo a turn; θ stays within its bounds. Raise InputError if y is not finite.
+        """
+        if not bool(y.isfinite().all()):
+            raise InputError(f"measured positions must be finite, got {y.tolist()}; leave that sample out")
+        (q, p, s), theta, P = belief
+        x, surprise = torch.cat([q, p, s[None]])[: self.kept], 0.0
+        x = torch.cat([x, theta])
+        for i in range(self.n):
+            own = self.noise.position[i] ** 2
+            miss, variance = float(y[i] - x[i]), float(P[i, i]) + own
+            if self.model.config.angles[i]:
+                miss -= 2 * math.pi * math.floor(miss / (2 * math.pi) + 0.5)
+            surprise += miss * miss / variance
+            gain = P[:, i] / variance
+            x, P = x + gain * miss, P - torch.outer(gain, gain) * variance
+            P[i] = P[:, i] = gain * own  # without cancellation
+        s = x[2 * self.n] if self.kept > 2 * self.n else s
+        theta = torch.minimum(torch.maximum(x[self.kept :], self.low), self.high)
+        return Belief(State(x[: self.n], x[self.n : 2 * self.n], s), theta, P), surprise
+
+    def velocity(self, belief: Belief, h: Tensor | float, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The velocity (n,) and its covariance (n, n); of many beliefs at once where no θ is estimated.
+
+        v = 4 d(h/2)/h − d(h)/h from the moves d of steps of h and h/2, exact to order 2 in h. Raise InputError if the
+        model has no step there.
+        """
+        n, kept, P = self.n, self.kept, belief.covariance
+        v, G = torch.zeros_like(belief.state.q), P.new_zeros(*P.shape[:-2], n, P.shape[-1])
+        h = torch.as_tensor(h, dtype=P.dtype)
+        for size, by in ((h, -1 / h), (h / 2, 4 / h)):
+            found = self._stepped(belief, size, u)
+            v = v + by[..., None] * (found.step.state.q - belief.state.q)
+            own = found.by_state[..., :n, :kept] - torch.eye(n, kept, dtype=P.dtype)
+            G[..., :kept] += by[..., None, None] * own
+            if found.by_parameters is not None:
+                G[..., kept:] += by[..., None, None] * found.by_parameters[..., :n, :]
+        return v, G @ P @ G.mT
+
+    def _stepped(self, belief: Belief, h: Tensor | float, u: Tensor | None) -> Linearised:
+        values = dict(zip(self.names, belief.theta.tolist(), strict=True)) if self.names else {}
+        if self.stepper is not None:
+            found = (self.stepper.with_parameters(values) if values else self.stepper).linearise(belief.state, h, u)
+        else:
+            model = with_values(self.model, values) if values else self.model
+            found = Stepper(model).linearise(belief.state, h, u, self.names)
+        failed = found.step.status != Status.CONVERGED
+        if bool(failed.any()):
+            at, size = belief.state.q[failed].reshape(-1, self.n)[0], float(torch.as_tensor(h).max())
+            reason = Status(int(found.step.status[failed][0])).name
+            raise InputError(f"the model has no step of {size:g} from q = {at.tolist()} ({reason}); start nearer to it")
+        return found
