@@ -148,7 +148,7 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
         (["select", "OUT.csv", "--out", "OUT", "--levels", "linear,afine"], "unknown level 'afine'; choose some of"),
         (["select", "OUT.csv", "--out", "OUT", "--levels", "linear,afine"], "auto; did you mean affine?"),
         (["simulate", "dufing", "--out", "OUT.csv"], "van_der_pol; did you mean duffing?"),
-        (["verify", "kepller"], ".h file; did you mean kepler?"),
+        (["verify", "kepller"], ".fmu file; did you mean kepler?"),
     ],
 )
 def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, message):  # fails if one of them ends in a traceback

@@ -89,7 +89,7 @@ def test_a_run_says_in_the_file_what_it_is_for(tmp_path):
     assert entries["start"]["q"] == run.last_fitted()[0].q.tolist()
     asked = read_header(export_run(run, tmp_path / "b.h", h_range=(0.1, run.h * (1 - 1e-7)), name="arm"))[1]
     assert (asked["h_range"], asked["name"]) == ([0.1, run.h], "arm")
-    for path, kind in (("a.txt", None), ("a.h", "fmu")):
+    for path, kind in (("a.txt", None), ("a.h", "fmi")):
         with pytest.raises(InputError, match="the name must end in"):
             export_run(run, tmp_path / path, kind)
 

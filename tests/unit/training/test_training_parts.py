@@ -28,6 +28,8 @@ def test_units_of_parameters():  # fails if a power of time or length is another
         "friction.viscous": "1/s",
         "friction.coulomb": "m/s²",
         "friction.breakaway": "m/s²",
+        "friction.log_smooth": "m/s",
+        "friction.log_stribeck": "m/s",
         "friction.input_map": "m/s² per N m",
         "kinetic.log_mass": "",
     }
