@@ -16,8 +16,10 @@ from herglotz.export.c_stepper import compiled
 from herglotz.export.exported import ExportedStepper
 from herglotz.export.load import load_c
 from herglotz.export.metadata import describe
-from herglotz.models import ContactLagrangian
+from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.stepping import Stepper
+
+MODELS = (ContactLagrangian, OwnLagrangian)  # what can be traced
 
 
 def compile(
@@ -52,12 +54,12 @@ def compile(
     model: Any = source
     if eager is not None:
         model = eager.L_d
-    elif not isinstance(source, ContactLagrangian):
+    elif not isinstance(source, MODELS):
         run: Any = source
         model = getattr(run, "model", None)
-        if isinstance(model, ContactLagrangian):
+        if isinstance(model, MODELS):
             described = {"h": run.h, "box": run.box, "units": run.data.units}
-    if not isinstance(model, ContactLagrangian):
+    if not isinstance(model, MODELS):
         if eager is None:
             given = type(source).__name__
             raise InputError(f"compile needs a model, a Stepper, a run or the path of a C header, got {given}")
@@ -108,7 +110,7 @@ def compile_c(
     InputError
         If there is no compiler, or an argument is not usable.
     """
-    if not isinstance(model, ContactLagrangian):
+    if not isinstance(model, MODELS):
         raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None})

@@ -147,6 +147,9 @@ class StepParts:
     def _given(self, ends: Ends) -> Iterator[None]:
         """The model with its potential known at q0 and q1."""
         potential = self.model.potential
+        if potential is None:  # of an L_d of one's own
+            yield
+            return
         self.model.potential = GivenPotential(potential, ends)  # pyright: ignore[reportAttributeAccessIssue]
         try:
             yield
