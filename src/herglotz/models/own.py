@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from types import SimpleNamespace
 from typing import Any, cast
 
 import torch
@@ -68,10 +69,11 @@ class OwnLagrangian(nn.Module):
         If L_d is no function, or lacks `at(u)`.
     """
 
-    friction = damping = potential = kinetic = correction = None
+    friction = damping = kinetic = correction = None
+    potential = SimpleNamespace(network=None, features=None)  # none
     named_terms = ()
     capabilities = UNKNOWN
-    s_enters_motion = True
+    s_enters_motion = True  # unless a fit has looked (`herglotz.training.own_fit`)
     linear_in_q1 = False
 
     def __init__(
