@@ -80,7 +80,7 @@ def _fall_back(eager: Stepper, reason: str) -> Stepper:
 
 
 def compile_c(
-    model: ContactLagrangian,
+    model: Any,  # ContactLagrangian or OwnLagrangian
     *,
     h: float = 1.0,
     box: Mapping[str, Sequence[float]] | None = None,

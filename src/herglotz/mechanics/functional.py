@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -29,7 +29,7 @@ def functional_partials(
     xs = (q0, q1, s0[..., 0])
 
     def first(*x: Tensor) -> tuple[Tensor, Tensor]:
-        L, pull = vjp(lambda *x: checked(L_d, L_d(*x, h), x[2]), *x)
+        L, pull = cast(Any, vjp(lambda *x: checked(L_d, cast(Any, L_d)(*x, h), x[2]), *x))
         D1, D2, D3 = pull(torch.ones_like(L))
         return torch.cat([D1, D2, D3[..., None]], -1), L
 
@@ -51,7 +51,7 @@ def _split(D: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def _rows(function: Callable[..., tuple[Tensor, Any]], xs: tuple[Tensor, ...]) -> tuple[Tensor, list[Tensor], Any]:
     """The value y (..., m), ∂y/∂x of every x (..., m, *), and what else the function gives."""
-    y, pull, rest = vjp(function, *xs, has_aux=True)
+    y, pull, rest = cast(Any, vjp(function, *xs, has_aux=True))
     units = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
     rows = [pull(unit.expand(y.shape)) for unit in units.unbind()]
     return y, [torch.stack(x, y.ndim - 1) for x in zip(*rows, strict=True)], rest
@@ -64,7 +64,7 @@ def _forces(L_d: Forced, xs: tuple[Tensor, Tensor, Tensor], h: Tensor, order: in
         return None if found is None else Forces(*found)
 
     def both(*x: Tensor) -> tuple[Tensor, None]:
-        forces: Any = L_d.forces(*x, h)
+        forces = cast(Any, L_d).forces(*x, h)
         return torch.cat(forces, -1), None
 
     n = xs[0].shape[-1]

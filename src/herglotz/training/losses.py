@@ -201,7 +201,10 @@ def shooting(
     given = None if u is None else u[..., 1 : S * length + 1, :].unflatten(-2, (S, length))
     run = stepper.rollout(*start, h=rows, inputs=given)
     tail = K - 1 - S * length
-    parts = [torch.cat([starts.q0[..., None, :], run.q[..., : length - 1, :]], -2).flatten(-3, -2), run.q[..., -1, -2:, :]]
+    parts = [
+        torch.cat([starts.q0[..., None, :], run.q[..., : length - 1, :]], -2).flatten(-3, -2),
+        run.q[..., -1, -2:, :],
+    ]
     if tail:
         last = State(run.q[..., -1, -1, :], run.p[..., -1, -1, :], run.s[..., -1, -1])
         rest = None if u is None else u[..., -tail:, :]
@@ -211,8 +214,7 @@ def shooting(
 
 def _joints(run: Rollout, starts: Starts) -> Tensor:
     """End of each segment less the start of the next; s by the spread of q over its own change along segments."""
-    here = (x[..., :-1, :, :] for x in (run.q,))
-    (q,) = here
+    q = run.q[..., :-1, :, :]
     positions = [q[..., -2, :] - starts.q0[..., 1:, :], q[..., -1, :] - starts.q1[..., 1:, :]]
     s = run.s[..., :-1, -2] - starts.s[..., 1:]
     with torch.no_grad():

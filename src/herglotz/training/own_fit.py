@@ -26,7 +26,7 @@ from herglotz.training.problems.grid import step_inputs
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.run import Run
 from herglotz.training.stages import Stages
-from herglotz.training.task import NOISY, Task
+from herglotz.training.task import NOISY
 from herglotz.training.trajectory_fit import fit_states, fit_trajectories
 
 # Settings that say how to fit; all others say what the model is made of, or look for terms.
@@ -41,20 +41,23 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
     One-step errors J⁻¹R come first. They are the whole fit where they are no larger than those of exact data
     (`NOISY`), or `config.objective` says so; else multiple shooting goes on from there.
     """
-    model, seen = _prepared(data, L_d, config)
+    own, seen = _prepared(data, L_d, config)
+    model: Any = own  # it stands in for a `ContactLagrangian`
     task = seen.task(stages)
     with stages.bar:
         _try_derivatives(model, task.data)
         problem = ResidualProblem(model, task.data, max_step=task.base.max_step, sigma=task.exact)
-        refuse({"batch: the motion of this L_d depends on s, which is carried along whole trajectories; leave batch "
-                "out, or train in a loop of your own (herglotz.losses)": config.batch and problem.carries_s})  # fmt: skip
+        refuse({
+            "batch: the motion of this L_d depends on s, which is carried along whole trajectories; leave batch out, "
+            "or train in a loop of your own (herglotz.losses)": config.batch and problem.carries_s,
+        })  # fmt: skip
         # A rule of its own leaves errors far above rounding, whose last digits would take hundreds of iterations.
         result, rms = fit_one_step(replace(task, hurried=True), problem, "one-step error", config.iterations)
         notes = {"iterations": result.iterations, "reason": result.reason}
         sigma = max(rms / NOISE_OF_R, task.exact)
         one_step = config.objective == "residual" or (config.objective == "auto" and sigma <= NOISY * task.size)
         chosen = None if one_step else fit_trajectories(task, model, sigma)
-        found = fit_states(task, model, sigma) if chosen is None else chosen.fit
+        found: Any = fit_states(task, model, sigma) if chosen is None else chosen.fit
         notes["follows_data"] = found is not None and (one_step or chosen is not None)
         if chosen is not None:
             chosen.fit.problem.parameters.set(chosen.fit.theta)
@@ -64,7 +67,7 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
         objective = "residual" if one_step else "trajectory"
         fitted = Fitted(model, states, objective, sigma, notes, used)
         run = evaluate(task, seen, None, fitted, replace(config, objective=objective))
-    run.metrics["level"] = "own"
+    run.metrics.update(level=model.config.level, own=model.config.name)
     return run
 
 
@@ -107,7 +110,7 @@ def own_model(L_d: DiscreteLagrangian, data: Trajectories, base: Baseline) -> Ow
     return model
 
 
-def s_enters_motion(model: OwnLagrangian, data: Trajectories) -> bool:
+def s_enters_motion(model: Any, data: Trajectories) -> bool:
     """Whether a derivative of L_d depends on s, at drawn parameters: those at the start of a fit may hide it by a 0."""
     make = torch.Generator().manual_seed(0)
     drawn = {
@@ -124,11 +127,11 @@ def s_enters_motion(model: OwnLagrangian, data: Trajectories) -> bool:
     return not all(torch.equal(x, y) for x, y in ((getattr(first, k), getattr(second, k)) for k in ("D1", "D2", "D3")))
 
 
-def _try_derivatives(model: OwnLagrangian, data: Trajectories) -> None:
+def _try_derivatives(model: Any, data: Trajectories) -> None:
     """Refuse an L_d whose derivatives by parameters cannot be had sample by sample, or that joins no positions."""
     t = data.triples()
     rows: list[Tensor] = [x[:2] for x in (t.q0, t.q1, t.h0)]
-    theta = dict(model.named_parameters())
+    theta: dict[str, Tensor] = dict(model.named_parameters())
     u = step_inputs(model, data)
 
     def one(theta: dict[str, Tensor], q0: Tensor, q1: Tensor, h: Tensor, *u: Tensor) -> Tensor:
