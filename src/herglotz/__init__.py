@@ -39,6 +39,7 @@ _ROOMS = {
     "stepping": ("State", "Status", "Stepper"),
     "training": ("FitConfig", "Run", "fit", "load_run", "save_run"),
 }
+_MODULES = {"losses": "herglotz.training.losses", "theory": "herglotz.theory"}
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 __all__ = [
     "ContactLagrangian",
@@ -71,8 +72,8 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "theory":
-        return import_module("herglotz.theory")
+    if name in _MODULES:
+        return import_module(_MODULES[name])
     if name not in _HOME:
         raise AttributeError(f"module 'herglotz' has no attribute {name!r}")
     return getattr(import_module(f"herglotz.{_HOME[name]}"), name)

@@ -17,8 +17,10 @@ from herglotz.export.exported import ExportedStepper
 from herglotz.export.load import load_c
 from herglotz.export.metadata import describe
 from herglotz.export.parameters import Chosen, described_parameters
-from herglotz.models import ContactLagrangian
+from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.stepping import Stepper
+
+MODELS = (ContactLagrangian, OwnLagrangian)  # what can be traced
 
 
 def compile(
@@ -53,12 +55,12 @@ def compile(
     model: Any = source
     if eager is not None:
         model = eager.L_d
-    elif not isinstance(source, ContactLagrangian):
+    elif not isinstance(source, MODELS):
         run: Any = source
         model = getattr(run, "model", None)
-        if isinstance(model, ContactLagrangian):
+        if isinstance(model, MODELS):
             described = {"h": run.h, "box": run.box, "units": run.data.units}
-    if not isinstance(model, ContactLagrangian):
+    if not isinstance(model, MODELS):
         if eager is None:
             given = type(source).__name__
             raise InputError(f"compile needs a model, a Stepper, a run or the path of a C header, got {given}")
@@ -79,7 +81,7 @@ def _fall_back(eager: Stepper, reason: str) -> Stepper:
 
 
 def compile_c(
-    model: ContactLagrangian,
+    model: Any,  # ContactLagrangian or OwnLagrangian
     *,
     h: float = 1.0,
     box: Mapping[str, Sequence[float]] | None = None,
@@ -110,7 +112,7 @@ def compile_c(
     InputError
         If there is no compiler, or an argument is not usable.
     """
-    if not isinstance(model, ContactLagrangian):
+    if not isinstance(model, MODELS):
         raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     extra = {"parameters": described_parameters(model, parameters)} if parameters else {}

@@ -13,7 +13,7 @@ import herglotz
 from herglotz.data.files import PathLike
 from herglotz.data.holds import Arrival, check_arrival
 from herglotz.errors import InputError, refuse
-from herglotz.models import ContactLagrangian
+from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.schema import check_entries
 
 FORMAT = 3  # 1 held a single step; 2 added rollouts and starts from positions, 3 the Jacobian of a step
@@ -101,6 +101,9 @@ def describe(
 
     Raise InputError if h, box, units or further entries are not usable.
     """
+    if not isinstance(model, ContactLagrangian | OwnLagrangian):
+        name = type(model).__name__
+        raise InputError(f"export takes a model, got a {name}; of an L_d of your own, OwnLagrangian(L_d, dof=n)")
     dtype, n = next(model.parameters()).dtype, model.config.dof
     wrong_dtype = dtype not in (torch.float32, torch.float64)
     refuse({

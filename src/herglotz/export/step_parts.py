@@ -14,7 +14,7 @@ from herglotz.codegen.trace import Graph
 from herglotz.export.equation import Equations, example, field_like
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import Point
-from herglotz.models import ContactLagrangian
+from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.jet import Jet
 from herglotz.models.mass import PositionKinetic
@@ -147,6 +147,9 @@ class StepParts:
     def _given(self, ends: Ends) -> Iterator[None]:
         """The model with its potential known at q0 and q1."""
         potential = self.model.potential
+        if isinstance(self.model, OwnLagrangian):  # it has none
+            yield
+            return
         self.model.potential = GivenPotential(potential, ends)  # pyright: ignore[reportAttributeAccessIssue]
         try:
             yield

@@ -33,7 +33,7 @@ from herglotz.training.verdict import judged
 GONE = 1e3  # times the spread: a free run so far away has left the world, however little its start is known
 
 
-def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig) -> Run:
+def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: FitConfig) -> Run:
     """Return the finished run: its states, its free run beyond the training part, and the errors of both.
 
     `told` are the settings of the fit before anything was decided.
@@ -59,7 +59,7 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig
         "outlier_samples": leading_rows(data.lengths, train.lengths)[dropped.cpu()].tolist(),
         "seed": config.seed,
         "level": config.level,
-        "plan": plan.to_dict(),
+        "plan": None if plan is None else plan.to_dict(),
         "data": {"source": data.source, "sha256": data.digest(), "trajectories": len(data), "samples": data.samples},
         "versions": {
             "herglotz": herglotz.__version__,

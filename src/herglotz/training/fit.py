@@ -18,7 +18,7 @@ from herglotz.data.holds import Arrival
 from herglotz.data.input_terms import with_input_terms
 from herglotz.data.lock import locked
 from herglotz.data.waves import with_waves
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
@@ -30,6 +30,7 @@ from herglotz.training.evaluate import evaluate
 from herglotz.training.identifiability import joint_of
 from herglotz.training.look import look, on_a_line
 from herglotz.training.objectives import OBJECTIVES
+from herglotz.training.own_fit import fit_own
 from herglotz.training.plan import Plan
 from herglotz.training.push import pushes
 from herglotz.training.run import Run
@@ -46,6 +47,7 @@ def fit(
     data: Any,
     config: FitConfig | None = None,
     *,
+    model: Any = None,
     plan: Plan | None = None,
     out: str | Path | None = None,
     progress: Progress = None,
@@ -65,6 +67,10 @@ def fit(
         `herglotz.data.as_trajectories` reads: a path, a DataFrame, arrays.
     config
         Settings; default `FitConfig()`.
+    model
+        An L_d of your own to train in place of the package's model: a `torch.nn.Module` L_d(q0, q1, s0, h), with
+        `at(u)` where there are inputs, its derivatives by `partials` or by autograd. Its parameters are trained in
+        place. Of the settings those that say how to fit apply (`herglotz.training.own_fit.TAKEN`).
     plan
         Follow this plan instead of choosing one: `Plan.from_dict(run.metrics["plan"])` repeats a fit's decisions.
     out
@@ -104,6 +110,8 @@ def fit(
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
     read = data
+    if model is not None:
+        return _fit_own(data, model, config, progress, reading, plan or out or resume or tensorboard)
     data = data if plan is None or plan.turning else on_a_line(data)
     data = data if plan is None else with_input_terms(data, plan.input_terms)
     data = told_arrival(data, config, None if plan is None else Arrival(plan.hold, plan.delay, plan.lag))
@@ -119,6 +127,17 @@ def fit(
         if log is not None:
             log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run
+
+
+def _fit_own(
+    data: Trajectories, model: Any, config: FitConfig, progress: Progress, reading: dict[str, Any], other: Any
+) -> Run:
+    """A fit of an L_d of one's own."""
+    refuse({"model= is fitted without plan, out, resume and tensorboard; leave them out": other})
+    started = time.perf_counter()
+    run = fit_own(data, model, config, Stages(progress))
+    run.metrics["seconds"] = round(time.perf_counter() - started, 3)
+    return replace(run, reading=reading_told(reading, data.names))
 
 
 def told_arrival(data: Trajectories, config: FitConfig, planned: Arrival | None) -> Trajectories:

@@ -63,6 +63,8 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
 
     `parameters` are those that a fit moves, by default all; the others are what they are in the model.
     """
+    if not isinstance(model, ContactLagrangian):
+        return None
     c, config = model.capabilities, model.config
     networks = config.potential_width or config.correction_width or config.mass_width or not config.baseline
     plain = not networks and c.constant_c and not config.terms and (c.order == 2 or model.dof == 1)

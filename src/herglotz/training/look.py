@@ -135,7 +135,7 @@ def _seen(
     settings = user_settings.resolved(data)
     zeros = zeros if plan is None else plan.zeros
     said, (data, arrival, why_arrival) = data, _read(measured(data, zeros), settings)
-    train, unseen = _split(data, settings)
+    train, unseen = split(data, settings)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
     kept, drag = train.keep(~dropped), drag_starts_the_fit(settings)
@@ -171,10 +171,11 @@ def _read(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Arriva
     """The data as a fit takes them, how their recorded inputs arrive, and why."""
     data = data if settings.use_inputs else replace(data, u=None)
     data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
-    return with_arrival(data, _split(data, settings)[0])
+    return with_arrival(data, split(data, settings)[0])
 
 
-def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Trajectories | None]:
+def split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Trajectories | None]:
+    """The first part of every trajectory, which is fitted, and the rest; None where nothing is held out."""
     return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
 
 

@@ -47,7 +47,7 @@ def one_step_problem(
     if config.supervision != "q":
         return SupervisedProblem(model, task.data, momenta=config.supervision == "qps", **shared)
     rows = SHORT_ROWS if short else ROWS if config.coupled and base.start else None
-    most = None if rows is None else rows * prior.start.numel()
+    most = None if rows is None or prior is None else rows * prior.start.numel()
     return ResidualProblem(model, task.data, metric=metric, expected=expected, most=most, **shared)
 
 

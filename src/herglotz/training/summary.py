@@ -18,10 +18,11 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
     """Names and values of what was reached, those that the run has."""
     m, data = run.metrics, run.data
     unit, degrees = common_unit(data.units), bool(data.degrees)  # as the file had them
+    level = f"own L_d {m['own']}" if "own" in m else f"{run.decided.level} level"
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", as_recorded(data)[0].summary()),
-        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
+        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {level}"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
         ("extrapolation RMS", _told(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),

@@ -289,3 +289,17 @@ def write_diagonal_of(w: Writer, node: Any) -> str:
     require(order_of(described(x).shape) == [1, 2, 0] and node.args[1:] in ((0, -2, -1), (0, 1, 2)), node)
     rows = w.emit("Reshape", w.name(x), w.integers(n * n, -1))
     return w.emit("Gather", rows, w.integers(*range(0, n * n, n + 1)), axis=0)
+
+
+def write_padded(w: Writer, node: Any) -> str:
+    """Zeros with the first argument as one entry of an axis, or as a run of them: the derivative of taking these."""
+    g, shape, axis, start, *end = node.args
+    size, place, name = shape[axis], axis_of(axis, node), w.name(g)
+    require(isinstance(size, int) and end[1:] in ([], [1]), node)
+    first = start % size if start < 0 else start
+    if end:
+        last = min(end[0], size) if end[0] >= 0 else size + end[0]
+    else:
+        name, last = w.emit("Unsqueeze", name, w.integers(place)), first + 1
+    zero = w.name(0.0, described(node).dtype)
+    return w.emit("Pad", name, w.integers(first, size - last), zero, w.integers(place))

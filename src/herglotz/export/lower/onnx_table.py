@@ -170,6 +170,8 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.log_sigmoid_backward.default: functions.write_log_sigmoid_backward,
     aten.sigmoid_backward.default: functions.write_sigmoid_backward,
     aten.threshold_backward.default: functions.write_threshold_backward,
+    aten.select_backward.default: ops.write_padded,
+    aten.slice_backward.default: ops.write_padded,
     aten.diag_embed.default: ops.write_diagonal,
     aten.diagonal.default: ops.write_diagonal_of,
 }

@@ -18,7 +18,7 @@ from torch.func import jacrev, vmap
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.windows import Triples, join
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
-from herglotz.models import ContactLagrangian
+from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.stepping import solve
 from herglotz.training.distributed import LaneSums, add_over_processes, own_parts, world
 from herglotz.training.problems.least_squares import LeastSquares
@@ -162,7 +162,8 @@ class ResidualProblem(OneStep):
         if expected is not None:
             self.deviation[self.recorded :] = expected[1]
         self.latents = len(data) if self.carries_s else 0
-        self.many = data.dof >= MANY and not self.carries_s and metric == "position"
+        costly = data.dof >= MANY or isinstance(model, OwnLagrangian)  # whose second derivatives are autograd's
+        self.many = costly and not self.carries_s and metric == "position"
 
     def start(self) -> Tensor:
         """Parameters, then the latents (zero)."""

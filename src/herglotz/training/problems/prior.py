@@ -157,8 +157,13 @@ class Prior:
         return parts if rate is None else [*parts, rate[None] / self.typical_rate]
 
 
-def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Prior:
-    """The prior of every objective, sized by the data: rates are known to 0.3 of the slowest coordinate's own rate."""
+def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Prior | None:
+    """The prior of every objective, sized by the data: rates are known to 0.3 of the slowest coordinate's own rate.
+
+    None of an L_d of one's own, whose parameters mean nothing that is known.
+    """
+    if not isinstance(model, ContactLagrangian):
+        return None
     typical = min(v / s for v, s in zip(base.speed, base.scale, strict=True))
     return Prior(
         model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical, spreads=base.spreads

@@ -1,0 +1,74 @@
+"""The derivatives of `herglotz.mechanics.partials` by `torch.func`: for `vmap`, Jacobians by parameters, and traces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+from torch.func import vjp
+
+from herglotz.mechanics.partials import DiscreteLagrangian, Forced, Forces, Partials, checked
+
+
+def functional_partials(
+    L_d: DiscreteLagrangian,
+    q0: Tensor,  # (..., n)
+    q1: Tensor,  # (..., n)
+    s0: Tensor,  # (...)
+    h: Tensor,  # () or (...)
+    order: int = 1,
+) -> Partials:
+    """Return what `autograd_partials` does, by function transforms, which nest: (...) may be a sample inside `vmap`.
+
+    Samples do not interact, so that one product with the Jacobian of the batch is the batch of gradients; second
+    derivatives are 2n + 1 products with the Jacobian of these. L_d must be a pure function of tensors.
+    """
+    q0, q1, s0, _ = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
+    xs = (q0, q1, s0[..., 0])
+
+    def first(*x: Tensor) -> tuple[Tensor, Tensor]:
+        L, pull = cast(Any, vjp(lambda *x: checked(L_d, cast(Any, L_d)(*x, h), x[2]), *x))
+        D1, D2, D3 = pull(torch.ones_like(L))
+        return torch.cat([D1, D2, D3[..., None]], -1), L
+
+    force = _forces(L_d, xs, h, order) if isinstance(L_d, Forced) else None
+    n = q0.shape[-1]
+    if order == 1:
+        D, L = first(*xs)
+        return Partials(L, *_split(D, n), force=force)
+    D, by, L = _rows(first, xs)
+    return Partials(
+        L, *_split(D, n), by[0][..., :n, :], by[1][..., :n, :], by[1][..., n : 2 * n, :], by[2][..., :n],
+        by[2][..., n : 2 * n], by[2][..., 2 * n], force,
+    )  # fmt: skip
+
+
+def _split(D: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    return D[..., :n], D[..., n : 2 * n], D[..., 2 * n]
+
+
+def _rows(function: Callable[..., tuple[Tensor, Any]], xs: tuple[Tensor, ...]) -> tuple[Tensor, list[Tensor], Any]:
+    """The value y (..., m), ∂y/∂x of every x (..., m, *), and what else the function gives."""
+    y, pull, rest = cast(Any, vjp(function, *xs, has_aux=True))
+    units = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
+    rows = [pull(unit.expand(y.shape)) for unit in units.unbind()]
+    return y, [torch.stack(x, y.ndim - 1) for x in zip(*rows, strict=True)], rest
+
+
+def _forces(L_d: Forced, xs: tuple[Tensor, Tensor, Tensor], h: Tensor, order: int) -> Forces | None:
+    """F⁻ and F⁺, with their derivatives at order 2."""
+    found = L_d.forces(*xs, h)
+    if found is None or order == 1:
+        return None if found is None else Forces(*found)
+
+    def both(*x: Tensor) -> tuple[Tensor, None]:
+        forces = cast(Any, L_d).forces(*x, h)
+        return torch.cat(forces, -1), None
+
+    n = xs[0].shape[-1]
+    F, by, _ = _rows(both, xs)
+    minus = F[..., :n], *(x.narrow(F.ndim - 1, 0, n) for x in by)
+    plus = F[..., n:], *(x.narrow(F.ndim - 1, n, n) for x in by)
+    return Forces(minus[0], plus[0], *minus[1:], *plus[1:])

@@ -1,0 +1,179 @@
+"""An L_d of one's own in the place of a model: what fits, exports and files ask of one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from types import SimpleNamespace
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.errors import InputError
+from herglotz.mechanics import ClosedForm, DiscreteLagrangian, Driven, Forced, Partials
+from herglotz.mechanics.functional import functional_partials
+from herglotz.models.capabilities import Capabilities
+
+# Nothing is known of its terms: every step iterates, and s may enter the motion.
+UNKNOWN = Capabilities(
+    order=2, baseline=False, constant_mass=False, constant_c=False, known_damping=False, correction=True,
+    action_flow=True, nonlinear_force=False, sticking=False, coupling=False,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class OwnConfig:
+    """What is known of an L_d of one's own; the names are those of `ModelConfig`."""
+
+    name: str  # of its class or function
+    angles: tuple[bool, ...]
+    scale: tuple[float, ...]  # (n,) typical sizes of q
+    speed: tuple[float, ...]  # (n,) and of its rate
+    inputs: int = 0
+    level: str = "full"  # "forced" where it comes with forces: its map is no contact map
+    baseline: bool = False
+    absent: tuple[str, ...] = ()
+    order: int = 2
+
+    @property
+    def dof(self) -> int:
+        """Number of coordinates n."""
+        return len(self.angles)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return asdict(self)
+
+
+class OwnLagrangian(nn.Module):
+    """L_d(q0, q1, s0, h) of a module or function, with what steppers, fits and exports ask of `ContactLagrangian`.
+
+    Derivatives are the module's own `partials`, or those of `functional_partials`. A module with `at(u)` takes inputs,
+    one with `forces` has forces F⁻ and F⁺ (Lagrange–d'Alembert–Herglotz).
+
+    Parameters
+    ----------
+    L_d
+        A module whose parameters are all float32 or all float64, or a function of tensors.
+    dof
+        Number n of coordinates.
+    inputs
+        Number m of inputs; L_d then has `at(u)`.
+    angles, scale, speed
+        (n,) which coordinates are angles in rad, and typical sizes of q and of its rate, in the data's units.
+
+    Raises
+    ------
+    InputError
+        If L_d is no function, or lacks `at(u)`.
+    """
+
+    friction = damping = kinetic = correction = None
+    potential = SimpleNamespace(network=None, features=None)  # none
+    named_terms = ()
+    capabilities = UNKNOWN
+    s_enters_motion = True  # unless a fit has looked (`herglotz.training.own_fit`)
+    linear_in_q1 = False
+
+    def __init__(
+        self,
+        L_d: DiscreteLagrangian,
+        dof: int,
+        *,
+        inputs: int = 0,
+        angles: tuple[bool, ...] = (),
+        scale: tuple[float, ...] = (),
+        speed: tuple[float, ...] = (),
+    ):
+        super().__init__()
+        check_own(L_d, inputs)
+        self.L_d = L_d
+        name = getattr(L_d, "__name__", type(L_d).__name__)
+        level = "forced" if isinstance(L_d, Forced) else "full"
+        one, none = (1.0,) * dof, (False,) * dof
+        self.config = OwnConfig(name, angles or none, scale or one, speed or one, inputs, level)
+        if next(self.parameters(), None) is None:  # a function has a dtype, too
+            self.register_parameter("nothing", nn.Parameter(torch.empty(0, dtype=torch.float64), requires_grad=False))
+
+    @property
+    def dof(self) -> int:
+        """Number of coordinates n."""
+        return self.config.dof
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs m."""
+        return self.config.inputs
+
+    def at(self, u: Tensor) -> DrivenOwn:
+        """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
+        check_own(self.L_d, 1)
+        return DrivenOwn(self, u)
+
+    def forward(
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0, u: Tensor | None = None
+    ) -> Tensor | Partials:
+        """L_d, shape (...); with `order` 1 or 2 its `Partials` (so that functional_call reaches both)."""
+        if order:
+            return self.partials(q0, q1, s0, h, order, u)
+        return self._driven(u)(q0, q1, s0, h)
+
+    def partials(
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1, u: Tensor | None = None
+    ) -> Partials:
+        """See `herglotz.mechanics.partials`."""
+        L_d, h = self._driven(u), torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
+        if isinstance(L_d, ClosedForm):
+            return L_d.partials(q0, q1, s0, h, order)
+        return functional_partials(L_d, q0, q1, s0, h.expand(torch.broadcast_shapes(h.shape, s0.shape)), order)
+
+    def partials_increment(
+        self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1, u: Tensor | None = None
+    ) -> Partials:
+        """`partials` at (q0, q0 + Δ, s0); L_d subtracts what is added here, and a short step in float32 rounds."""
+        return self.partials(q0, q0 + delta, s0, h, order, u)
+
+    def typical_increment(self, h: Tensor) -> Tensor:
+        """The size of q1 − q0 at the typical speed, shaped like h."""
+        return h * max(self.config.speed)
+
+    def _driven(self, u: Tensor | None) -> DiscreteLagrangian:
+        return self.L_d if u is None else cast(Driven, self.L_d).at(u)
+
+
+@dataclass(frozen=True)
+class DrivenOwn:
+    """An L_d of one's own with its inputs at one step's value."""
+
+    model: OwnLagrangian
+    u: Tensor  # (..., m)
+    capabilities = UNKNOWN
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """L_d, shape (...)."""
+        return cast(Tensor, self.model(q0, q1, s0, h, 0, self.u))
+
+    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """See `herglotz.mechanics.partials`."""
+        return self.model.partials(q0, q1, s0, h, order, self.u)
+
+    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """See `OwnLagrangian.partials_increment`."""
+        return self.model.partials_increment(q0, delta, s0, h, order, self.u)
+
+    def typical_increment(self, h: Tensor) -> Tensor:
+        """See `OwnLagrangian.typical_increment`."""
+        return self.model.typical_increment(h)
+
+
+def check_own(L_d: Any, inputs: int) -> None:
+    """Refuse what is no discrete Lagrangian, or takes no inputs where there are some."""
+    if not isinstance(L_d, Callable):
+        raise InputError(f"model must be a module or function L_d(q0, q1, s0, h), got a {type(L_d).__name__}")
+    if inputs and not isinstance(L_d, Driven):
+        name = getattr(L_d, "__name__", type(L_d).__name__)
+        raise InputError(
+            f"{name} takes no inputs, and the data have some: give it a method `at(u)` that returns the L_d of a step "
+            "with input u (..., m), or leave the inputs out (inputs=())"
+        )

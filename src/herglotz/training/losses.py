@@ -1,0 +1,264 @@
+"""Losses for a training loop of one's own: functions of tensors, differentiable in all that L_d is made of.
+
+`herglotz_residual` compares three neighbouring positions at a time and needs no state; `shooting` compares whole
+trajectories, whose starts are unknowns beside the parameters, as noise of q asks for: a residual of noisy positions
+is least for another model than that of the motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError, refuse
+from herglotz.mechanics import (
+    DiscreteLagrangian,
+    momentum_jacobian,
+    momentum_plus,
+    momentum_residual,
+    partials,
+)
+from herglotz.mechanics.partials import value
+from herglotz.stepping import Rollout, State, Stepper, solve
+from herglotz.stepping.single_step import driven_by
+from herglotz.stepping.state import check_h
+
+
+def herglotz_residual(
+    L_d: DiscreteLagrangian,
+    q: Tensor,  # (..., K+1, n)
+    h: Tensor | float,  # () or (..., K)
+    *,
+    s0: Tensor | None = None,  # (...)
+    u: Tensor | None = None,  # (..., K, m)
+    preconditioned: bool = True,
+) -> Tensor:
+    """Return J⁻¹R at every inner sample of recorded motions: the error of each next position, to first order.
+
+    R_k = D1 L_d(q_k, q_{k+1}, s_k) + c_k D2 L_d(q_{k−1}, q_k, s_{k−1}), J = ∂R_k/∂q_{k+1}, which is the mixed Hessian M
+    where R = 0, and s_{k+1} = s_k + L_d(q_k, q_{k+1}, s_k). Train on the mean of its square. R alone is no loss: an L_d
+    times 0.1 has a tenth of it and the same motion, so that an optimiser shrinks L_d and learns nothing; J⁻¹R does not
+    change. Minibatches are windows of at least three samples, stacked along the first axis.
+
+    Parameters
+    ----------
+    L_d
+        A module or function L_d(q0, q1, s0, h) → (...); with inputs one that has `at(u)`.
+    q
+        (..., K+1, n) positions, K ≥ 2, of any float dtype and device.
+    h
+        () or (..., K) time steps between them: `t.diff(dim=-1)`.
+    s0
+        (...) action at the first sample, in the unit of L_d; left out: 0. Where L_d depends on s by more than −γs, make
+        it a parameter that is trained, too.
+    u
+        (..., K, m) input of each step.
+    preconditioned
+        False gives R, in units of momentum, to look at.
+
+    Returns
+    -------
+    Tensor
+        (..., K−1, n), in units of q.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, a number is not finite, h is not positive, or J is singular: L_d does not join q0 to q1.
+
+    Source: discrete Herglotz equations; erratum E4 of `docs/mathematics.md`.
+    """
+    h, s0, u = _checked(q, h, s0, u, 2)
+    q0, q1 = q[..., :-1, :], q[..., 1:, :]
+    s, axis = _action(L_d, q, h, s0, u), q.ndim - 2
+    P = partials(driven_by(L_d, u), q0, q1, s, h, 2)
+    p = momentum_plus(P).narrow(axis, 0, h.shape[-1] - 1)
+    after = P.map(lambda x: x.narrow(axis, 1, h.shape[-1] - 1))
+    R = momentum_residual(after, p)
+    r = solve(momentum_jacobian(after, p), R) if preconditioned else R
+    _refuse_infinite(r)
+    return r
+
+
+def _action(L_d: DiscreteLagrangian, q: Tensor, h: Tensor, s0: Tensor, u: Tensor | None) -> Tensor:
+    """The action at the start of every step, (..., K): step after step, unless no derivative of L_d depends on it."""
+    q0, q1, L = q[..., :-1, :], q[..., 1:, :], driven_by(L_d, u)
+    with torch.no_grad():
+        first = s0[..., None].expand(h.shape).contiguous()
+        P = partials(L, q0, q1, first, h)
+        near = first + torch.nn.functional.pad(P.L.cumsum(-1)[..., :-1], (1, 0))
+        other = partials(L, q0, q1, near, h)
+        same = all(torch.equal(getattr(P, name), getattr(other, name)) for name in ("D1", "D2", "D3"))
+    if same and not s0.requires_grad:
+        return first
+    found = [s0]
+    for k in range(h.shape[-1] - 1):
+        L = driven_by(L_d, None if u is None else u[..., k, :])
+        found.append(found[-1] + value(L, q[..., k, :], q[..., k + 1, :], found[-1], h[..., k]))
+    return torch.stack(found, -1)
+
+
+class Starts(NamedTuple):
+    """The first two positions of each of S segments and the action at the first, to be trained beside L_d."""
+
+    q0: Tensor  # (..., S, n) at the samples 0, length, 2 length, …
+    q1: Tensor  # (..., S, n) one sample later
+    s: Tensor  # (..., S)
+
+
+class Shooting(NamedTuple):
+    """What segments of motion miss, in units of q."""
+
+    misfit: Tensor  # (..., K+1, n) model less recording, at every sample
+    joints: Tensor  # (..., S−1, 2n+1) end of a segment less the start of the next: two positions, and s (rescaled)
+
+    @property
+    def loss(self) -> Tensor:
+        """(Σ misfit² + Σ joints²) over the number of recorded numbers, ()."""
+        return (self.misfit.square().sum() + self.joints.square().sum()) / self.misfit.numel()
+
+
+def starts(
+    q: Tensor,  # (..., K+1, n)
+    length: int,  # steps of a segment
+) -> Starts:
+    """Return the starts of segments from the recorded positions, s = 0, as leaves that want gradients.
+
+    Parameters
+    ----------
+    q
+        (..., K+1, n) positions, in their own units, K ≥ 2.
+    length
+        Steps of a segment; more than K − 1: one segment, the whole recording. The last one takes what is left.
+
+    Returns
+    -------
+    Starts
+        For `shooting`, and `[*model.parameters(), *starts]` for an optimiser.
+
+    Raises
+    ------
+    InputError
+        If q has fewer than three samples, or length is not positive.
+    """
+    _checked(q, 1.0, None, None, 2)
+    refuse({f"length must be a whole number >= 1, got {length}": length < 1})
+    at = torch.arange(max((q.shape[-2] - 2) // length, 1), device=q.device) * length
+    found = Starts(q[..., at, :], q[..., at + 1, :], q.new_zeros((*q.shape[:-2], len(at))))
+    return Starts(*(x.detach().clone().requires_grad_() for x in found))
+
+
+def shooting(
+    L_d: DiscreteLagrangian,
+    q: Tensor,  # (..., K+1, n)
+    h: Tensor | float,  # () or (..., K)
+    starts: Starts,  # S segments, of `starts`
+    *,
+    u: Tensor | None = None,  # (..., K, m)
+    length: int | None = None,  # that of `starts`
+) -> Shooting:
+    """Return what motions of L_d over segments miss of a recording, and of the start of the next (multiple shooting).
+
+    Each segment starts from two positions and an action of its own, (q1, p1, s1) = FL⁺(q0, q1, s), and steps by
+    D1 L_d + c p = 0. Train L_d and the starts together on `.loss`, segments short at first; one segment is the whole
+    trajectory, without joints. Gradients come by the implicit-function theorem.
+
+    Parameters
+    ----------
+    L_d, q, h, u
+        As in `herglotz_residual`.
+    starts
+        Of `starts(q, length)`.
+    length
+        Steps of a segment, as there; left out: one segment.
+
+    Returns
+    -------
+    Shooting
+        `misfit` (..., K+1, n) and `joints` (..., S−1, 2n+1), in units of q.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, or as `herglotz_residual`.
+    StepError
+        If a step has no solution: shorter segments, or a fit of `herglotz_residual` first, lead there.
+
+    Source: multiple shooting (Bock 1984) on Φ̃ of section 1 of `docs/mathematics.md`.
+    """
+    h, _, u = _checked(q, h, None, u, 2)
+    K, (*batch, S, n) = h.shape[-1], starts.q0.shape
+    length = min(K - 1 if length is None else length, K - 1)
+    fitting = max((K - 1) // length, 1) == S and tuple(batch) == tuple(q.shape[:-2]) and n == q.shape[-1]
+    refuse({f"starts of shape {tuple(starts.q0.shape)} are no segments of {length} steps of q {tuple(q.shape)}; "
+            "make them by starts(q, length), with the same length": not fitting})  # fmt: skip
+    stepper = Stepper(L_d, throw=True)
+    in_first = slice(0, (S - 1) * length + 1, length)
+    start = stepper.init(*starts, h=h[..., in_first], u=None if u is None else u[..., in_first, :])
+    rows = h[..., 1 : S * length + 1].unflatten(-1, (S, length))
+    given = None if u is None else u[..., 1 : S * length + 1, :].unflatten(-2, (S, length))
+    run = stepper.rollout(*start, h=rows, inputs=given)
+    tail = K - 1 - S * length
+    parts = [
+        torch.cat([starts.q0[..., None, :], run.q[..., : length - 1, :]], -2).flatten(-3, -2),
+        run.q[..., -1, -2:, :],
+    ]
+    if tail:
+        last = State(run.q[..., -1, -1, :], run.p[..., -1, -1, :], run.s[..., -1, -1])
+        rest = None if u is None else u[..., -tail:, :]
+        parts.append(stepper.rollout(*last, h=h[..., -tail:], inputs=rest).q[..., 1:, :])
+    return Shooting(torch.cat(parts, -2) - q, _joints(run, starts))
+
+
+def _joints(run: Rollout, starts: Starts) -> Tensor:
+    """End of each segment less the start of the next; s by the spread of q over its own change along segments."""
+    q = run.q[..., :-1, :, :]
+    positions = [q[..., -2, :] - starts.q0[..., 1:, :], q[..., -1, :] - starts.q1[..., 1:, :]]
+    s = run.s[..., :-1, -2] - starts.s[..., 1:]
+    with torch.no_grad():
+        spread, change = (x.square().mean().sqrt() for x in (run.q - run.q.mean(-2, True), run.s - run.s[..., :1]))
+        by = torch.where(change > 0, spread / change, 0.0)
+    return torch.cat([*positions, (s * by)[..., None]], -1)
+
+
+def _checked(
+    q: Tensor, h: Tensor | float, s0: Tensor | None, u: Tensor | None, least: int
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """H (..., K), s0 (...) and u, as the losses take them."""
+    refuse({f"q must be a tensor (..., K+1, n), got a {type(q).__name__}; torch.as_tensor makes one":
+            not isinstance(q, Tensor)})  # fmt: skip
+    refuse({
+        f"q needs shape (..., K+1, n) with at least {least + 1} samples, got {tuple(q.shape)}; "
+        "one coordinate is q[:, None]": q.ndim < 2 or q.shape[-2] <= least,
+        f"q must hold float numbers, got {q.dtype}; convert it with .double()": not q.is_floating_point(),
+    })  # fmt: skip
+    if len(bad := (~torch.isfinite(q)).nonzero()):
+        raise InputError(f"q is not finite at {tuple(bad[0].tolist())}; leave that window out")
+    batch, K = q.shape[:-2], q.shape[-2] - 1
+    h = check_h(h, q)
+    for name, x, shape in (("h", h, (*batch, K)), ("s0", s0, batch)):
+        if x is not None and not _fits(x.shape, shape):
+            raise InputError(f"{name} needs shape {shape} or one that spreads to it, got {tuple(x.shape)}")
+    s0 = q.new_zeros(batch) if s0 is None else s0.expand(batch)
+    if u is not None:
+        wrong = not isinstance(u, Tensor) or u.ndim < 2 or not _fits(u.shape[:-1], (*batch, K))
+        refuse({f"u needs shape {(*batch, K)} and its numbers last, got {tuple(getattr(u, 'shape', ()))}": wrong})
+        u = u.expand(*batch, K, u.shape[-1])
+    return h.expand(*batch, K), s0, u
+
+
+def _fits(shape: torch.Size | tuple[int, ...], whole: tuple[int, ...]) -> bool:
+    """Whether a shape spreads to the whole one."""
+    short = len(shape) <= len(whole)
+    return short and all(a in (1, b) for a, b in zip(reversed(shape), reversed(whole), strict=False))
+
+
+def _refuse_infinite(r: Tensor) -> None:
+    if len(bad := (~torch.isfinite(r)).nonzero()):
+        *sample, k, _ = bad[0].tolist()
+        raise InputError(
+            f"J = ∂R/∂q1 is singular, or L_d not finite, at step {k + 1} of window {tuple(sample)}: a discrete "
+            "Lagrangian must join q0 to q1, as m |q1 - q0|² / 2h does; add such a term, or start from smaller weights"
+        )

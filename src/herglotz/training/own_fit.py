@@ -1,0 +1,156 @@
+"""Fitting an L_d of one's own: one-step errors, then whole trajectories where the data are noisy."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import functional_call
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import roughness
+from herglotz.data.spikes import spikes
+from herglotz.errors import InputError, refuse
+from herglotz.mechanics import DiscreteLagrangian, Partials
+from herglotz.models import OwnLagrangian
+from herglotz.training.baseline import Baseline, estimate_baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.evaluate import evaluate
+from herglotz.training.first_states import states_of_pairs
+from herglotz.training.look import Look, split
+from herglotz.training.objectives import Fitted
+from herglotz.training.one_step_fit import NOISE_OF_R, fit_one_step
+from herglotz.training.problems.grid import step_inputs
+from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.run import Run
+from herglotz.training.stages import Stages
+from herglotz.training.task import NOISY
+from herglotz.training.trajectory_fit import fit_states, fit_trajectories
+
+# Settings that say how to fit; all others say what the model is made of, or look for terms.
+TAKEN = ("objective", "optimiser", "train_fraction", "seed", "dtype", "device", "iterations", "learning_rate", "batch",
+         "robust", "use_inputs", "substeps")  # fmt: skip
+OBJECTIVES = ("auto", "residual", "trajectory")
+
+
+def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> Run:
+    """Train the parameters of L_d, in place, and return the run; see `fit`.
+
+    One-step errors J⁻¹R come first. They are the whole fit where they are no larger than those of exact data
+    (`NOISY`), or `config.objective` says so; else multiple shooting goes on from there.
+    """
+    own, seen = _prepared(data, L_d, config)
+    model: Any = own  # it stands in for a `ContactLagrangian`
+    task = seen.task(stages)
+    with stages.bar:
+        _try_derivatives(model, task.data)
+        problem = ResidualProblem(model, task.data, max_step=task.base.max_step, sigma=task.exact)
+        refuse({
+            "batch: the motion of this L_d depends on s, which is carried along whole trajectories; leave batch out, "
+            "or train in a loop of your own (herglotz.losses)": config.batch and problem.carries_s,
+        })  # fmt: skip
+        # A rule of its own leaves errors far above rounding, whose last digits would take hundreds of iterations.
+        result, rms = fit_one_step(replace(task, hurried=True), problem, "one-step error", config.iterations)
+        notes = {"iterations": result.iterations, "reason": result.reason}
+        sigma = max(rms / NOISE_OF_R, task.exact)
+        one_step = config.objective == "residual" or (config.objective == "auto" and sigma <= NOISY * task.size)
+        chosen = None if one_step else fit_trajectories(task, model, sigma)
+        found: Any = fit_states(task, model, sigma) if chosen is None else chosen.fit
+        notes["follows_data"] = found is not None and (one_step or chosen is not None)
+        if chosen is not None:
+            chosen.fit.problem.parameters.set(chosen.fit.theta)
+            notes |= {"robust": found.problem.freedom is not None, "segment_steps": found.problem.grid.longest}
+        states = states_of_pairs(model, task.data) if found is None else found.states()
+        used = None if chosen is None else found.problem.used
+        objective = "residual" if one_step else "trajectory"
+        fitted = Fitted(model, states, objective, sigma, notes, used)
+        run = evaluate(task, seen, None, fitted, replace(config, objective=objective))
+    run.metrics.update(level=model.config.level, own=model.config.name)
+    return run
+
+
+def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagrangian, Look]:
+    """The module as a model on the fit's device, and what is known of the data."""
+    default = FitConfig()
+    other = [f.name for f in fields(config) if getattr(config, f.name) != getattr(default, f.name)]
+    wrong = ", ".join(name for name in other if name not in TAKEN)
+    refuse({
+        f"{wrong}: model= says what the model is made of; leave it out": wrong,
+        f"an L_d of your own is fitted to the objectives {', '.join(OBJECTIVES)}, not {config.objective}":
+            config.objective not in OBJECTIVES,
+    })  # fmt: skip
+    data = data if config.use_inputs else replace(data, u=None)
+    data = data.unwrapped().to(dtype=config.torch_dtype, device=config.device)
+    train, unseen = split(data, config)
+    dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
+    kept = train.keep(~dropped)
+    base = estimate_baseline(kept, substeps=config.substeps)
+    model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device=config.device)
+    model.s_enters_motion = s_enters_motion(model, kept)
+    seen = Look(
+        data, train, unseen, kept, dropped, False, data.arrival, {}, (), why_zeros="", friction="",
+        noise=roughness(kept), settings=config, base=base,
+    )  # fmt: skip
+    return model, seen
+
+
+def own_model(L_d: DiscreteLagrangian, data: Trajectories, base: Baseline) -> OwnLagrangian:
+    """L_d as a model of these data; refused if it has nothing to train, or parameters that stay as they are."""
+    inputs = 0 if data.u is None else data.u.shape[1]
+    model = OwnLagrangian(L_d, data.dof, inputs=inputs, angles=data.angles, scale=base.scale, speed=base.speed)
+    frozen = [name for name, x in model.named_parameters() if x.numel() and not x.requires_grad]
+    name = model.config.name
+    refuse({
+        f"{name} has no parameters to train; make it a torch.nn.Module with some, or step it as it is: hz.Stepper(L_d)":
+            not sum(x.numel() for x in model.parameters()),
+        f"{name}: {', '.join(frozen)} do not require gradients; make them buffers (register_buffer)": frozen,
+    })  # fmt: skip
+    return model
+
+
+def s_enters_motion(model: Any, data: Trajectories) -> bool:
+    """Whether a derivative of L_d depends on s, at drawn parameters: those at the start of a fit may hide it by a 0."""
+    make = torch.Generator().manual_seed(0)
+    drawn = {
+        name: torch.randn(x.shape, generator=make, dtype=torch.float64).to(x) for name, x in model.named_parameters()
+    }
+    steps, u = data.steps(), step_inputs(model, data)
+    i = steps.index
+    s = torch.randn(len(i), generator=make, dtype=torch.float64).to(data.q)
+    at = lambda s: functional_call(  # noqa: E731
+        model, drawn, (data.q[i], data.q[i + 1], s, steps.h, 1, None if u is None else u[i])
+    )
+    with torch.no_grad():
+        first, second = at(s), at(-2 * s + 1)
+    return not all(torch.equal(x, y) for x, y in ((getattr(first, k), getattr(second, k)) for k in ("D1", "D2", "D3")))
+
+
+def _try_derivatives(model: Any, data: Trajectories) -> None:
+    """Refuse an L_d whose derivatives by parameters cannot be had sample by sample, or that joins no positions."""
+    t = data.triples()
+    rows: list[Tensor] = [x[:2] for x in (t.q0, t.q1, t.h0)]
+    theta: dict[str, Tensor] = dict(model.named_parameters())
+    u = step_inputs(model, data)
+
+    def one(theta: dict[str, Tensor], q0: Tensor, q1: Tensor, h: Tensor, *u: Tensor) -> Tensor:
+        P: Partials = functional_call(model, theta, (q0, q1, torch.zeros_like(h), h, 2, *u))
+        return P.D12
+
+    inputs = () if u is None else (u[t.index[:2]],)
+    try:
+        D12 = torch.func.vmap(one, (None, *(0,) * (3 + len(inputs))))(theta, *rows, *inputs)
+        torch.func.vmap(torch.func.jacrev(one), (None, *(0,) * (3 + len(inputs))))(theta, *rows, *inputs)
+    except (RuntimeError, NotImplementedError) as error:
+        first = str(error).strip().splitlines()[0]
+        raise InputError(
+            f"{model.config.name}: torch.func cannot differentiate it sample by sample ({first}); write it as a pure "
+            "function of tensors, without .item(), numpy, `if` on values or writing in place, or train it in a loop of "
+            "your own (herglotz.losses)"
+        ) from None
+    if not bool((torch.linalg.det(D12) != 0).all()):
+        raise InputError(
+            f"{model.config.name}: ∂²L_d/∂q0∂q1 is singular at the start of the fit, so that no step follows from it; "
+            "a discrete Lagrangian must join q0 to q1, as m |q1 - q0|² / 2h does"
+        )

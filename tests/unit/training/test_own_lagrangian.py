@@ -1,0 +1,241 @@
+"""An L_d of one's own: its losses, its fit, and the files that it is written to."""
+
+import math
+import shutil
+
+import pytest
+import torch
+from torch import nn
+
+import herglotz as hz
+from herglotz.export import compare, compile_c, export_pt2
+from herglotz.mechanics import autograd_partials
+from herglotz.models import OwnLagrangian
+from herglotz.stepping import Stepper
+
+H = 0.1
+
+
+class Spring(nn.Module):
+    """|v|²/2 − k |q|²/2 − γs, with a term in s² that makes s enter the motion."""
+
+    def __init__(self, k=1.0, gamma=0.2, bend=0.0, dtype=torch.float64):
+        super().__init__()
+        self.k, self.gamma = (nn.Parameter(torch.tensor(x, dtype=dtype)) for x in (k, gamma))
+        self.bend = bend
+
+    def forward(self, q0, q1, s0, h):
+        v = (q1 - q0) / h[..., None]
+        V = self.k * ((q0 * q0).sum(-1) + (q1 * q1).sum(-1)) / 4
+        return h * ((v * v).sum(-1) / 2 - V - self.gamma * s0 - self.bend * s0 * s0)
+
+
+class Pushed(Spring):
+    """The same with an input."""
+
+    def at(self, u):
+        return lambda q0, q1, s0, h: self(q0, q1, s0, h) + h * (u * q0).sum(-1)
+
+
+def motion(L_d, steps=40, n=1, inputs=None):
+    q = torch.linspace(0.3, 1.0, 3 * n, dtype=torch.float64).reshape(3, n)
+    with torch.no_grad():
+        return Stepper(L_d).rollout(q, 0.3 * q, h=H, steps=steps, inputs=inputs)
+
+
+def least(loss, parameter):
+    """The derivative of a loss by one number, by differences."""
+    ends = []
+    for change in (1e-5, -1e-5):
+        with torch.no_grad():
+            parameter += change
+        ends.append(float(loss().detach()))
+        with torch.no_grad():
+            parameter -= change
+    return (ends[0] - ends[1]) / 2e-5
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.3])
+def test_the_residual_of_a_motion_is_zero_and_of_another_model_is_not(bend):
+    # fails if s is not carried along, or R_k is taken with the momentum of another step
+    L_d = Spring(bend=bend)
+    out = motion(L_d)
+    assert hz.losses.herglotz_residual(L_d, out.q, H, s0=out.s[..., 0]).abs().max() < 1e-13
+    assert hz.losses.herglotz_residual(Spring(k=1.1, bend=bend), out.q, H).abs().max() > 1e-4
+
+
+def test_the_residual_is_the_error_of_the_next_position():  # fails if J is not ∂R/∂q1, or has the other sign
+    L_d, q = Spring(), motion(Spring()).q.clone()
+    q[:, -1] += 1e-3
+    assert torch.allclose(hz.losses.herglotz_residual(L_d, q, H)[:, -1], torch.full((3, 1), 1e-3).double(), atol=1e-12)
+
+
+def test_a_smaller_L_d_has_a_smaller_raw_residual_alone():  # fails if the preconditioner is left out: it collapses
+    L_d, q = Spring(k=1.3), motion(Spring()).q
+    small = lambda *x: 0.01 * L_d(*x)  # noqa: E731
+    small_s = lambda q0, q1, s0, h: small(q0, q1, 100 * s0, h)  # noqa: E731  the same motion: s in another unit
+    (r, R), (r_small, R_small) = (
+        [hz.losses.herglotz_residual(x, q, H, preconditioned=on) for on in (True, False)] for x in (L_d, small_s)
+    )
+    assert torch.allclose(r_small, r, rtol=1e-9, atol=0.0)
+    assert torch.allclose(R_small, 0.01 * R, rtol=1e-9, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    "null",
+    [
+        lambda q0, q1, s0, h: 0 * h * (q0 * q1).sum(-1) * s0,  # constant
+        lambda q0, q1, s0, h: h * (q0 * q0).sum(-1) - 0.1 * h * s0 + 0 * q1.sum(-1),  # blind to q1
+    ],
+)
+def test_null_models_are_refused(null):  # fails if an L_d that steps nowhere has a small loss, or NaN
+    with pytest.raises(hz.InputError, match="must join q0 to q1"):
+        hz.losses.herglotz_residual(null, motion(Spring()).q, H)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.3])
+def test_gradients_of_the_losses_are_those_of_differences(bend):  # fails if J, s or an implicit step is held constant
+    L_d, out = Spring(k=1.2, bend=bend), motion(Spring(bend=bend))
+    noisy = out.q + 0.01 * torch.randn(out.q.shape, generator=torch.Generator().manual_seed(0)).double()
+    starts = hz.losses.starts(noisy, 11)
+    losses = [
+        lambda: hz.losses.herglotz_residual(L_d, noisy, H).square().mean(),
+        lambda: hz.losses.shooting(L_d, noisy, H, starts, length=11).misfit.square().sum(),
+    ]
+    for loss in losses:
+        L_d.zero_grad()
+        loss().backward()
+        for parameter in L_d.parameters():
+            assert float(parameter.grad) == pytest.approx(least(loss, parameter), rel=1e-5)
+
+
+@pytest.mark.parametrize("length", [1, 7, 13, 100])
+def test_shooting_misses_nothing_of_a_motion(length):  # fails if segments are laid beside their samples
+    L_d, out = Spring(), motion(Spring())
+    starts = hz.losses.starts(out.q, length)
+    at = torch.arange(starts.s.shape[-1]) * min(length, 39)
+    found = hz.losses.shooting(L_d, out.q, H, starts._replace(s=out.s[:, at]), length=length)
+    assert found.misfit.shape == out.q.shape
+    assert max(float(x.detach().abs().max()) for x in found if x.numel()) < 1e-12
+    assert hz.losses.shooting(Spring(k=1.1), out.q, H, starts, length=length).loss > 1e-9
+
+
+def test_joints_are_the_gaps_between_segments():  # fails if a segment may start anywhere
+    L_d, out = Spring(), motion(Spring())
+    starts = hz.losses.starts(out.q, 10)
+    at = torch.arange(3) * 10
+    moved = starts._replace(q0=starts.q0.detach().clone(), s=out.s[:, at])
+    moved.q0[:, 1] += 0.01
+    joints = hz.losses.shooting(L_d, out.q, H, moved, length=10).joints
+    assert torch.allclose(joints[:, 0, 0], torch.full((3,), -0.01).double(), atol=1e-12)
+
+
+def test_inputs_and_single_precision_and_unequal_steps():  # fails if u or h of another step is taken, or a dtype made
+    u = torch.linspace(-1, 1, 40).double()[:, None]
+    out = motion(Pushed(), inputs=u)
+    assert hz.losses.herglotz_residual(Pushed(), out.q, H, u=u).abs().max() < 1e-13
+    assert hz.losses.herglotz_residual(Pushed(), out.q, H, u=u.roll(1, 0)).abs().max() > 1e-5
+    h = torch.linspace(0.05, 0.15, 40).double()
+    uneven = Stepper(Spring()).rollout(out.q[:, 0], out.p[:, 0], h=h)
+    assert hz.losses.herglotz_residual(Spring(), uneven.q, h).abs().max() < 1e-13
+    single = hz.losses.herglotz_residual(Spring(dtype=torch.float32), uneven.q.float(), h.float())
+    assert single.dtype == torch.float32
+    assert single.abs().max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"q": torch.zeros(5).double()}, r"q needs shape"),
+        ({"q": torch.zeros(2, 1).double()}, r"at least 3 samples"),
+        ({"q": torch.tensor([[0.0], [math.nan], [1.0]])}, r"not finite at \(1, 0\)"),
+        ({"h": -0.1}, "h must be"),
+        ({"h": torch.ones(7).double()}, r"h needs shape \(3, 40\)"),
+        ({"u": torch.ones(3, 7, 1).double()}, "u needs shape"),
+        ({"u": torch.ones(40, 1).double()}, "takes no inputs"),
+    ],
+)
+def test_wrong_arguments_are_named(change, words):  # fails if a wrong shape spreads in silence
+    given = {"q": motion(Spring()).q, "h": H, "u": None} | change
+    with pytest.raises(hz.InputError, match=words):
+        hz.losses.herglotz_residual(Spring(), given["q"], given["h"], u=given["u"])
+
+
+def test_starts_of_another_length_are_refused():  # fails if segments are cut elsewhere than they start
+    q = motion(Spring()).q
+    with pytest.raises(hz.InputError, match="make them by starts"):
+        hz.losses.shooting(Spring(), q, H, hz.losses.starts(q, 10), length=5)
+
+
+def test_gradients_go_through_a_rollout_to_parameters_and_start():  # fails if the solve is cut off from the graph
+    L_d = Spring(bend=0.3)
+    q = torch.tensor([0.7], dtype=torch.float64, requires_grad=True)
+    end = lambda: Stepper(L_d).rollout(q, 0 * q.detach(), h=H, steps=20).q[-1, 0]  # noqa: E731
+    end().backward()
+    for x in (q, *L_d.parameters()):
+        assert float(x.grad) == pytest.approx(least(end, x), rel=1e-6)
+
+
+def test_functional_derivatives_are_those_of_autograd():  # fails if a block is transposed or takes another row
+    L_d, make = Spring(bend=0.3), torch.Generator().manual_seed(0)
+    mixed = lambda q0, q1, s0, h: L_d(q0, q1, s0, h) + (q0[..., 0] * q1[..., 1] ** 2) * s0  # noqa: E731
+    q0, q1 = torch.randn(2, 5, 2, generator=make).double()
+    s, h = torch.rand(2, 5, generator=make).double()
+    slow, fast = autograd_partials(mixed, q0, q1, s, h, 2), OwnLagrangian(mixed, 2).partials(q0, q1, s, h, 2)
+    for name in ("L", "D1", "D2", "D3", "D11", "D12", "D22", "D13", "D23", "D33"):
+        assert torch.allclose(getattr(fast, name), getattr(slow, name), rtol=1e-12, atol=1e-14), name
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    net = Spring(k=0.5, gamma=0.0)
+    data = hz.simulate(hz.scene("damped_oscillator"), trajectories=2, steps=40, h=H, seed=0)
+    return net, hz.fit(data, model=net)
+
+
+def test_a_module_is_fitted_in_place(fitted):  # fails if a copy is trained, or the parameters are not found
+    net, run = fitted
+    scene = hz.scene("damped_oscillator")
+    rule = hz.Stepper(net)
+    assert run.model.L_d is net
+    assert float(net.gamma.detach()) == pytest.approx(scene.parameters["gamma"], rel=1e-2)
+    assert run.metrics["verdict"].startswith("fits")
+    assert run.rollout(10).ok
+    assert rule.step(run.states_at_end(), H).state.finite.all()
+    assert "own L_d" in run.summary()
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+def test_a_module_is_written_as_c(fitted):  # fails if C has another potential, or rounds its derivative
+    net, run = fitted
+    found = compare(compile_c(OwnLagrangian(net, 1), h=H), run.stepper, batches=(1, 7), steps=100, h=H)
+    assert found["failed"] == found["status"] == 0
+    assert max(found[x] for x in "qpsc") < 1e-12
+
+
+def test_what_cannot_be_fitted_says_so():  # fails if the message names a setting that the user did not give
+    data = hz.simulate(hz.scene("damped_oscillator"), trajectories=1, steps=20, h=H, seed=0)
+
+    class Branching(Spring):
+        def forward(self, q0, q1, s0, h):
+            L = super().forward(q0, q1, s0, h)
+            return L if bool((L > 0).all()) else 2 * L
+
+    frozen = Spring()
+    frozen.k.requires_grad_(False)
+    for model, settings, words in (
+        (3, {}, "must be a module or function"),
+        (lambda *x: x[0].sum(-1), {}, "no parameters to train"),
+        (frozen, {}, r"L_d.k do not require gradients"),
+        (Branching(), {}, "cannot differentiate it sample by sample"),
+        (Spring(), {"level": "affine"}, "level: model= says"),
+        (Spring(), {"objective": "raw"}, "not raw"),
+        (Spring(), {"out": "run"}, "without plan, out"),
+    ):
+        with pytest.raises(hz.InputError, match=words):
+            hz.fit(data, model=model, **settings)
+
+
+def test_a_module_without_a_model_around_it_is_refused(tmp_path):  # fails if export breaks in an attribute
+    with pytest.raises(hz.InputError, match="OwnLagrangian"):
+        export_pt2(Spring(), tmp_path / "x.pt2", h=H)
