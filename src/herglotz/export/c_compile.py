@@ -6,7 +6,7 @@ import copy
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 from herglotz.codegen.c_compiler import compiler
 from herglotz.data.files import PathLike
@@ -114,10 +114,11 @@ def compile_c(
     """
     if not isinstance(model, MODELS):
         raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
+    model = cast("Any", model)
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     extra = {"parameters": described_parameters(model, parameters)} if parameters else {}
     entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None, **extra})
     entries = described(model, entries, "model", dtype, tolerance)
-    kept = copy.deepcopy(model)  # the model may be trained on
+    kept: Any = copy.deepcopy(model)  # the model may be trained on
     header = c_source(kept, entries, "stepper.h", derivatives=False)
     return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

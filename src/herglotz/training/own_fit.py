@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -56,8 +56,8 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
         notes = {"iterations": result.iterations, "reason": result.reason}
         sigma = max(rms / NOISE_OF_R, task.exact)
         one_step = config.objective == "residual" or (config.objective == "auto" and sigma <= NOISY * task.size)
-        chosen = None if one_step else fit_trajectories(task, model, sigma)
-        found: Any = fit_states(task, model, sigma) if chosen is None else chosen.fit
+        chosen = cast("Any", None if one_step else fit_trajectories(task, model, sigma))
+        found = cast("Any", fit_states(task, model, sigma) if chosen is None else chosen.fit)
         notes["follows_data"] = found is not None and (one_step or chosen is not None)
         if chosen is not None:
             chosen.fit.problem.parameters.set(chosen.fit.theta)

@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from typing import Any, cast
 
 import pytest
 import torch
@@ -106,6 +107,7 @@ def test_gradients_of_the_losses_are_those_of_differences(bend):  # fails if J, 
         L_d.zero_grad()
         loss().backward()
         for parameter in L_d.parameters():
+            assert parameter.grad is not None
             assert float(parameter.grad) == pytest.approx(least(loss, parameter), rel=1e-5)
 
 
@@ -173,6 +175,7 @@ def test_gradients_go_through_a_rollout_to_parameters_and_start():  # fails if t
     end = lambda: Stepper(L_d).rollout(q, 0 * q.detach(), h=H, steps=20).q[-1, 0]  # noqa: E731
     end().backward()
     for x in (q, *L_d.parameters()):
+        assert x.grad is not None
         assert float(x.grad) == pytest.approx(least(end, x), rel=1e-6)
 
 
@@ -223,7 +226,7 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
 
     frozen = Spring()
     frozen.k.requires_grad_(False)
-    for model, settings, words in (
+    cases: Any = (
         (3, {}, "must be a module or function"),
         (lambda *x: x[0].sum(-1), {}, "no parameters to train"),
         (frozen, {}, r"L_d.k do not require gradients"),
@@ -231,11 +234,12 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
         (Spring(), {"level": "affine"}, "level: model= says"),
         (Spring(), {"objective": "raw"}, "not raw"),
         (Spring(), {"out": "run"}, "without plan, out"),
-    ):
+    )
+    for model, settings, words in cases:
         with pytest.raises(hz.InputError, match=words):
             hz.fit(data, model=model, **settings)
 
 
 def test_a_module_without_a_model_around_it_is_refused(tmp_path):  # fails if export breaks in an attribute
     with pytest.raises(hz.InputError, match="OwnLagrangian"):
-        export_pt2(Spring(), tmp_path / "x.pt2", h=H)
+        export_pt2(cast("Any", Spring()), tmp_path / "x.pt2", h=H)
