@@ -61,9 +61,12 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
         notes["follows_data"] = found is not None and (one_step or chosen is not None)
         if chosen is not None:
             chosen.fit.problem.parameters.set(chosen.fit.theta)
-            notes |= {"robust": found.problem.freedom is not None, "segment_steps": found.problem.grid.longest}
+            notes |= {
+                "robust": chosen.fit.problem.freedom is not None,
+                "segment_steps": chosen.fit.problem.grid.longest,
+            }
         states = states_of_pairs(model, task.data) if found is None else found.states()
-        used = None if chosen is None else found.problem.used
+        used = None if chosen is None else chosen.fit.problem.used
         objective = "residual" if one_step else "trajectory"
         fitted = Fitted(model, states, objective, sigma, notes, used)
         run = evaluate(task, seen, None, fitted, replace(config, objective=objective))
