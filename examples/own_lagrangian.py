@@ -32,8 +32,8 @@ run = hz.fit(data, model=net, robust="off", iterations=40)
 print(f"gamma = {net.gamma.item():.3f} (0.2 is true)\n{run.summary()}")
 
 # %% [markdown]
-# `fit` has trained `net` in place: one-step errors J⁻¹R by Levenberg–Marquardt, then whole trajectories, as the data are
-# noisy. What comes back is a `Run` that steps, predicts, draws, verifies and exports.
+# `fit` has trained `net` in place: one-step errors J⁻¹R by Levenberg–Marquardt, then whole trajectories, as the data
+# are noisy. What comes back is a `Run` that steps, predicts, draws, verifies and exports.
 
 # %%
 run.plot("trajectory")
@@ -57,8 +57,8 @@ print(f"C and PyTorch differ by {(ours.q - eager.q).abs().max():.1e} after 200 s
 # ## A loop of your own
 #
 # `hz.losses.herglotz_residual` gives J⁻¹R, in units of q, for any optimiser, dtype and device: the error of each next
-# position, to first order. Minibatches are windows of three samples and more, stacked. The raw residual R is no loss: it
-# is a tenth for a tenth of L_d, which has the same motion.
+# position, to first order. Minibatches are windows of three samples and more, stacked. The raw residual R is no loss:
+# it is a tenth for a tenth of L_d, which has the same motion.
 
 # %%
 q = data.q.reshape(4, -1, 1).float()

@@ -112,7 +112,8 @@ def compile_c(
     InputError
         If there is no compiler, or an argument is not usable.
     """
-    if not isinstance(model, MODELS):
+    given: object = model
+    if not isinstance(given, MODELS):
         raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     extra = {"parameters": described_parameters(model, parameters)} if parameters else {}

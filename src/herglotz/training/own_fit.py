@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -56,14 +56,17 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
         notes = {"iterations": result.iterations, "reason": result.reason}
         sigma = max(rms / NOISE_OF_R, task.exact)
         one_step = config.objective == "residual" or (config.objective == "auto" and sigma <= NOISY * task.size)
-        chosen = None if one_step else fit_trajectories(task, model, sigma)
-        found: Any = fit_states(task, model, sigma) if chosen is None else chosen.fit
+        chosen: Any = None if one_step else fit_trajectories(task, model, sigma)
+        found = cast(Any, chosen.fit if chosen is not None else fit_states(task, model, sigma))
         notes["follows_data"] = found is not None and (one_step or chosen is not None)
         if chosen is not None:
             chosen.fit.problem.parameters.set(chosen.fit.theta)
-            notes |= {"robust": found.problem.freedom is not None, "segment_steps": found.problem.grid.longest}
+            notes |= {
+                "robust": chosen.fit.problem.freedom is not None,
+                "segment_steps": chosen.fit.problem.grid.longest,
+            }
         states = states_of_pairs(model, task.data) if found is None else found.states()
-        used = None if chosen is None else found.problem.used
+        used = None if chosen is None else chosen.fit.problem.used
         objective = "residual" if one_step else "trajectory"
         fitted = Fitted(model, states, objective, sigma, notes, used)
         run = evaluate(task, seen, None, fitted, replace(config, objective=objective))

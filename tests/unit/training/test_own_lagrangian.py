@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from herglotz.export import compare, compile_c, export_pt2
 from herglotz.mechanics import autograd_partials
 from herglotz.models import OwnLagrangian
 from herglotz.stepping import Stepper
+from herglotz.training import laplace
 
 H = 0.1
 
@@ -106,6 +108,7 @@ def test_gradients_of_the_losses_are_those_of_differences(bend):  # fails if J, 
         L_d.zero_grad()
         loss().backward()
         for parameter in L_d.parameters():
+            assert parameter.grad is not None
             assert float(parameter.grad) == pytest.approx(least(loss, parameter), rel=1e-5)
 
 
@@ -173,6 +176,7 @@ def test_gradients_go_through_a_rollout_to_parameters_and_start():  # fails if t
     end = lambda: Stepper(L_d).rollout(q, 0 * q.detach(), h=H, steps=20).q[-1, 0]  # noqa: E731
     end().backward()
     for x in (q, *L_d.parameters()):
+        assert x.grad is not None
         assert float(x.grad) == pytest.approx(least(end, x), rel=1e-6)
 
 
@@ -205,6 +209,18 @@ def test_a_module_is_fitted_in_place(fitted):  # fails if a copy is trained, or 
     assert "own L_d" in run.summary()
 
 
+def test_a_run_says_what_it_cannot_do_with_a_module(fitted, tmp_path):  # fails if an attribute is missing inside
+    _, run = fitted
+    for ask in (run.equation, lambda: laplace(run), lambda: run.plot("learned"), lambda: run.report(tmp_path / "r")):
+        with pytest.raises(hz.InputError, match="not an L_d of your own"):
+            ask()
+    with pytest.raises(hz.InputError, match=r"torch\.save"):
+        run.save(tmp_path / "run")
+    with pytest.raises(hz.InputError, match="no plan"):
+        run.plot("plan")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
 def test_a_module_is_written_as_c(fitted):  # fails if C has another potential, or rounds its derivative
     net, run = fitted
@@ -223,7 +239,7 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
 
     frozen = Spring()
     frozen.k.requires_grad_(False)
-    for model, settings, words in (
+    wrong: tuple[tuple[Any, dict[str, Any], str], ...] = (
         (3, {}, "must be a module or function"),
         (lambda *x: x[0].sum(-1), {}, "no parameters to train"),
         (frozen, {}, r"L_d.k do not require gradients"),
@@ -231,11 +247,13 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
         (Spring(), {"level": "affine"}, "level: model= says"),
         (Spring(), {"objective": "raw"}, "not raw"),
         (Spring(), {"out": "run"}, "without plan, out"),
-    ):
+    )
+    for model, settings, words in wrong:
         with pytest.raises(hz.InputError, match=words):
             hz.fit(data, model=model, **settings)
 
 
 def test_a_module_without_a_model_around_it_is_refused(tmp_path):  # fails if export breaks in an attribute
+    bare: Any = Spring()
     with pytest.raises(hz.InputError, match="OwnLagrangian"):
-        export_pt2(Spring(), tmp_path / "x.pt2", h=H)
+        export_pt2(bare, tmp_path / "x.pt2", h=H)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -157,10 +158,10 @@ class Prior:
         return parts if rate is None else [*parts, rate[None] / self.typical_rate]
 
 
-def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Prior | None:
+def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Any:
     """The prior of every objective, sized by the data: rates are known to 0.3 of the slowest coordinate's own rate.
 
-    None of an L_d of one's own, whose parameters mean nothing that is known.
+    A `Prior`, or None of an L_d of one's own, whose parameters mean nothing that is known.
     """
     if not isinstance(model, ContactLagrangian):
         return None
