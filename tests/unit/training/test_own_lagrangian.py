@@ -141,6 +141,10 @@ def test_inputs_and_single_precision_and_unequal_steps():  # fails if u or h of 
     h = torch.linspace(0.05, 0.15, 40).double()
     uneven = Stepper(Spring()).rollout(out.q[:, 0], out.p[:, 0], h=h)
     assert hz.losses.herglotz_residual(Spring(), uneven.q, h).abs().max() < 1e-13
+    found = hz.losses.shooting(Spring(), uneven.q, h, hz.losses.starts(uneven.q, 11), length=11)
+    assert found.misfit.detach().abs().max() < 1e-12
+    found = hz.losses.shooting(Pushed(), out.q, H, hz.losses.starts(out.q, 11), u=u, length=11)
+    assert found.misfit.detach().abs().max() < 1e-12
     single = hz.losses.herglotz_residual(Spring(dtype=torch.float32), uneven.q.float(), h.float())
     assert single.dtype == torch.float32
     assert single.abs().max() < 1e-5
