@@ -112,7 +112,8 @@ def compile_c(
     InputError
         If there is no compiler, or an argument is not usable.
     """
-    if not isinstance(model, MODELS):
+    given: object = model
+    if not isinstance(given, MODELS):
         raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
     model = cast("Any", model)
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")

@@ -177,3 +177,9 @@ def check_own(L_d: Any, inputs: int) -> None:
             f"{name} takes no inputs, and the data have some: give it a method `at(u)` that returns the L_d of a step "
             "with input u (..., m), or leave the inputs out (inputs=())"
         )
+
+
+def refuse_own(model: Any, what: str, instead: str) -> None:
+    """Refuse what reads the package's own terms of a model that is an L_d of one's own."""
+    if isinstance(model, OwnLagrangian):
+        raise InputError(f"{what} reads the terms of the package's models, not an L_d of your own; {instead}")

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from herglotz.models import refuse_own
 from herglotz.models.phase import Phase
 from herglotz.models.terms import LinearDamping
 from herglotz.plots.fan import momentum_unit
@@ -42,6 +43,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     posterior
         Adds bands of two standard deviations.
     """
+    refuse_own(run.model, "the figure", "plot what the module has learned from the module")
     columns = min(run.data.dof, MOST_COLUMNS)
     rubs = run.model.friction is not None or isinstance(run.model.damping, LinearDamping)
     entries = _moving_masses(run)

@@ -14,6 +14,7 @@ from herglotz.data.column_table import column_rows
 from herglotz.data.files import folder_at, write_atomically
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.errors import InputError
+from herglotz.models import refuse_own
 from herglotz.plots import plot_bands, plot_learned, plot_sizes, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
 from herglotz.progress import ProgressBar
@@ -77,6 +78,7 @@ def write_report(run: Run, folder: str | Path, against: Trajectories | None = No
     InputError
         If the folder or a file cannot be written, or `against` has other columns than the run.
     """
+    refuse_own(run.model, "the report", "run.verify(), run.summary() and run.plot() show what was reached")
     document = describe(run, against, name)
     folder = folder_at(folder)
     written = {folder / "report.html": as_html(document), folder / "report.md": as_markdown(document)}

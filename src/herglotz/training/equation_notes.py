@@ -10,6 +10,7 @@ from torch import Tensor
 from herglotz.data.trajectories import GAP
 from herglotz.data.units import common_unit, size
 from herglotz.errors import InputError
+from herglotz.models import refuse_own
 from herglotz.training.baseline import JITTER
 from herglotz.training.equation_terms import is_formula, newtonian
 from herglotz.training.equation_words import plain
@@ -40,6 +41,7 @@ DRY = ", but dry friction, of q and v, acts by h in place of h/2 in the first of
 
 def notes_of(run: FittedRun) -> tuple[str, ...]:
     """The notes of a run, those that it has something for."""
+    refuse_own(run.model, "the equation", "herglotz.theory.ContinuousEquation evaluates that of any L_d")
     return tuple(filter(None, (_inputs(run), _sensors(run), _steps(run))))
 
 

@@ -59,7 +59,7 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
         "outlier_samples": leading_rows(data.lengths, train.lengths)[dropped.cpu()].tolist(),
         "seed": config.seed,
         "level": config.level,
-        "plan": None if plan is None else plan.to_dict(),
+        **({} if plan is None else {"plan": plan.to_dict()}),
         "data": {"source": data.source, "sha256": data.digest(), "trajectories": len(data), "samples": data.samples},
         "versions": {
             "herglotz": herglotz.__version__,

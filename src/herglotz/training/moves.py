@@ -52,7 +52,7 @@ class Moves:
         sets = list(sets)
         new = [own for own in dict.fromkeys(sets) if own not in self.known]
         curvatures = BLOCKS * (1 + max(map(len, new), default=0)) ** 2
-        many = max(1, MEMORY // max(curvatures, self.trial.problem.data.q.numel()))
+        many = max(1, MEMORY // max(curvatures, self.fitter.data.q.numel()))
         for k in range(0, len(new), many):
             part = new[k : k + many]
             self.known.update(zip(part, self.foretold(part), strict=True))

@@ -18,7 +18,7 @@ import herglotz
 from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.npz_format import npz_bytes, trajectories_of
 from herglotz.errors import InputError, refuse
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ContactLagrangian, ModelConfig, refuse_own
 from herglotz.schema import check_entries, matches
 from herglotz.stepping import State
 from herglotz.training.config import FitConfig
@@ -94,6 +94,11 @@ def save_run(run: Run, folder: str | Path) -> None:
     OSError
         If the folder cannot be written.
     """
+    refuse_own(
+        run.model,
+        "a run's folder",
+        "keep the module: torch.save(module.state_dict(), path), and export files of the run",
+    )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = {

@@ -19,6 +19,7 @@ from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes
 from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
+from herglotz.models import refuse_own
 from herglotz.threads import one_thread
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import estimate_baseline
@@ -200,6 +201,7 @@ def laplace(run: Run) -> Laplace:
     InputError
         If the trajectories cannot be solved from the run's states.
     """
+    refuse_own(run.model, "the posterior", "fit several seeds for a spread")
     return Laplace(run)
 
 

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
@@ -13,6 +13,7 @@ from herglotz.export import compare, compile_c, export_pt2
 from herglotz.mechanics import autograd_partials
 from herglotz.models import OwnLagrangian
 from herglotz.stepping import Stepper
+from herglotz.training import laplace
 
 H = 0.1
 
@@ -140,6 +141,10 @@ def test_inputs_and_single_precision_and_unequal_steps():  # fails if u or h of 
     h = torch.linspace(0.05, 0.15, 40).double()
     uneven = Stepper(Spring()).rollout(out.q[:, 0], out.p[:, 0], h=h)
     assert hz.losses.herglotz_residual(Spring(), uneven.q, h).abs().max() < 1e-13
+    found = hz.losses.shooting(Spring(), uneven.q, h, hz.losses.starts(uneven.q, 11), length=11)
+    assert found.misfit.detach().abs().max() < 1e-12
+    found = hz.losses.shooting(Pushed(), out.q, H, hz.losses.starts(out.q, 11), u=u, length=11)
+    assert found.misfit.detach().abs().max() < 1e-12
     single = hz.losses.herglotz_residual(Spring(dtype=torch.float32), uneven.q.float(), h.float())
     assert single.dtype == torch.float32
     assert single.abs().max() < 1e-5
@@ -208,6 +213,18 @@ def test_a_module_is_fitted_in_place(fitted):  # fails if a copy is trained, or 
     assert "own L_d" in run.summary()
 
 
+def test_a_run_says_what_it_cannot_do_with_a_module(fitted, tmp_path):  # fails if an attribute is missing inside
+    _, run = fitted
+    for ask in (run.equation, lambda: laplace(run), lambda: run.plot("learned"), lambda: run.report(tmp_path / "r")):
+        with pytest.raises(hz.InputError, match="not an L_d of your own"):
+            ask()
+    with pytest.raises(hz.InputError, match=r"torch\.save"):
+        run.save(tmp_path / "run")
+    with pytest.raises(hz.InputError, match="no plan"):
+        run.plot("plan")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
 def test_a_module_is_written_as_c(fitted):  # fails if C has another potential, or rounds its derivative
     net, run = fitted
@@ -226,7 +243,7 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
 
     frozen = Spring()
     frozen.k.requires_grad_(False)
-    cases: Any = (
+    wrong: tuple[tuple[Any, dict[str, Any], str], ...] = (
         (3, {}, "must be a module or function"),
         (lambda *x: x[0].sum(-1), {}, "no parameters to train"),
         (frozen, {}, r"L_d.k do not require gradients"),
@@ -235,11 +252,12 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
         (Spring(), {"objective": "raw"}, "not raw"),
         (Spring(), {"out": "run"}, "without plan, out"),
     )
-    for model, settings, words in cases:
+    for model, settings, words in wrong:
         with pytest.raises(hz.InputError, match=words):
             hz.fit(data, model=model, **settings)
 
 
 def test_a_module_without_a_model_around_it_is_refused(tmp_path):  # fails if export breaks in an attribute
+    bare: Any = Spring()
     with pytest.raises(hz.InputError, match="OwnLagrangian"):
-        export_pt2(cast("Any", Spring()), tmp_path / "x.pt2", h=H)
+        export_pt2(bare, tmp_path / "x.pt2", h=H)

@@ -28,6 +28,8 @@ from herglotz.training.trials import Variant
 NOISE = 0.003
 T = TypeVar("T")
 
+FEW = SimpleNamespace(q=torch.zeros(9, 1))  # data of a search that a test stands in for
+
 
 def there(found: T | None) -> T:
     assert found is not None
@@ -316,7 +318,7 @@ def test_of_many_offers_some_leave_at_once_but_not_those_that_stand_for_one_anot
             every = zip(sets, lost, strict=True)
             return [Score(torch.full((10,), 2.0 * none), 400, len(own), len(own), 1.0) for own, none in every]
 
-    fitter = SimpleNamespace(offered=32, offers=[Offer(name, (name,)) for name in names])
+    fitter = SimpleNamespace(offered=32, offers=[Offer(name, (name,)) for name in names], data=FEW)
     moves = Pairs(cast(Any, SimpleNamespace(fitter=fitter)))
     fewest = moves.leaving(frozenset(names))[0]
     assert len(fewest) == 16
@@ -336,7 +338,7 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
             return [Score(torch.full((10,), none), 400, len(own), len(own), 1.0) for own, none in every]
 
     def moves(*offers):
-        return Friction(cast(Any, SimpleNamespace(fitter=SimpleNamespace(offered=3, offers=offers))))
+        return Friction(cast(Any, SimpleNamespace(fitter=SimpleNamespace(offered=3, offers=offers, data=FEW))))
 
     free = Offer("free", ("free",))
     assert moves(dry, excess, free).joining(frozenset()) == [{"dry", "excess"}]

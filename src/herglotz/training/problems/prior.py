@@ -161,7 +161,7 @@ class Prior:
 def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Any:
     """The `Prior` of every objective, sized by the data: rates are known to 0.3 of the slowest coordinate's own rate.
 
-    None of an L_d of one's own, whose parameters mean nothing that is known.
+    A `Prior`, or None of an L_d of one's own, whose parameters mean nothing that is known.
     """
     if not isinstance(model, ContactLagrangian):
         return None
