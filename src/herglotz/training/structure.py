@@ -149,7 +149,7 @@ def search(
     found = read.with_functions(best)
     if found is not best:  # functions may be what recordings seemed to differ by, and tell a hold that terms did not
         later = read.held(found, [other for other in holds if other != hold])
-        other = wanted.of(replace(data, hold=later)) if later else wanted
+        other = wanted.of(replace(wanted.data, hold=later)) if later else wanted
         if (again := other.part.again(found)) is not None:
             wanted, hold = other, later or hold
             read, found, differ = wanted.part.with_zeros(again)
