@@ -41,6 +41,7 @@ from herglotz.training.sensor_zeros import in_words
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
+from herglotz.training.trials import Trial
 
 MOST = 3  # most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n²
 TRIPLES, ENOUGH = 4000, 5  # most triples in the linear problem, and least number of residuals for each coefficient
@@ -158,19 +159,23 @@ def search(
         read, found, differ = wanted.of_part(found, differ is not None)
     if found is None:
         return Structure(config, base, "no dictionary of terms: what follows a part of the data does not follow all")
-    noise = precision(data)
     settings, found_base = settings_of_trial(found, wanted.config)
     settings = replace(settings, dtype=config.dtype, device=config.device)
     base = replace(found_base, low=base.low, high=base.high)
+    zeros, why, compared = (), "", compared_models(read.fitters.values(), found)
+    if differ is not None:
+        zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
+    return Structure(settings, base, _told(found, data), found.rms, zeros, why, True, compared, more, hold)
+
+
+def _told(found: Trial, data: Trajectories) -> str:
+    """The terms of a model, and by how much they miss the data."""
+    noise = precision(data)
     named = ", ".join(("mass", "damping", *found.names))
     miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, noise))
     least = least if math.isfinite(noise) else "unknown"
     words = f"{named} miss the data by {miss}, whose precision is {least}"
-    words += "" if found.whole else "; whole trajectories are not followed"
-    zeros, why, compared = (), "", compared_models(read.fitters.values(), found)
-    if differ is not None:
-        zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
-    return Structure(settings, base, words, found.rms, zeros, why, True, compared, more, hold)
+    return words if found.whole else f"{words}; whole trajectories are not followed"
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:
