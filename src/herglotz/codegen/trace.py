@@ -131,6 +131,11 @@ class Recorder(TorchDispatchMode):
         axis = next(i for i, x in enumerate(inputs) if x.ndim)
         self.batch, self.axis = len(inputs[axis]), self.places[axis]
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """False: torch would import its compiler, which takes longer than a trace, to be kept out of this one."""
+        return False
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run one operation, and write it down."""
         kwargs = kwargs or {}
@@ -154,13 +159,10 @@ class Recorder(TorchDispatchMode):
 
     def graph_of(self, outputs: Sequence[Tensor]) -> Graph:
         """The graph that ends in these tensors; each is a tensor of its own."""
-        from torch._functorch.compile_utils import fx_graph_cse
-
         left_out = [self.unchanged.get(id(x)) for x in outputs]
         ends = zip(outputs, left_out, strict=True)
         self.graph.output(tuple(self._moved(x) if how is None else self._written(*how) for x, how in ends))
-        graph = fx_graph_cse(self.graph)
-        graph.eliminate_dead_code()
+        graph = without_repetitions(self.graph)
         numbers = {place.name: value for place, value in self.constants.values()}
         places = graph.find_nodes(op="placeholder")
         constants = {x: numbers[x.name] for x in places if x.name in numbers}
@@ -245,6 +247,21 @@ class Recorder(TorchDispatchMode):
     def _is_size(self, x: Any) -> bool:
         """Whether this is a multiple of the example's batch."""
         return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * self.batch and x % self.batch == 0
+
+
+def without_repetitions(graph: fx.Graph) -> fx.Graph:
+    """The graph with every call once, and no call that nothing reads.
+
+    `fx_graph_cse` of torch does the same, and imports torch's compiler, which takes longer than the whole trace.
+    """
+    first: dict[tuple[Any, str, str], fx.Node] = {}
+    for node in graph.nodes:
+        if node.op == "call_function":
+            same = first.setdefault((node.target, repr(node.args), repr(node.kwargs)), node)
+            if same is not node:
+                node.replace_all_uses_with(same)
+    graph.eliminate_dead_code()
+    return graph
 
 
 def _storage(x: Tensor) -> int:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, vjp, vmap
+from torch.func import functional_call, vmap
 
 import herglotz
 from herglotz.codegen.angles import Angles
@@ -194,7 +194,6 @@ class Functions:
 
     def __init__(self, model: ContactLagrangian):
         self.parameters, self.n, self.sticks = ParameterVector(model), model.dof, model.capabilities.sticking
-        self.basis = torch.eye(2 * self.n, dtype=torch.float64).unbind()  # made outside of the trace
 
     def equation(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> PartialsEquation:
         """The step equation in Δ, with second derivatives."""
@@ -220,21 +219,21 @@ class Functions:
         """F, J, (p1, s1 − s0), and of a solved step ∂(q1, p1)/∂(q, p), c, and ∂(F, p1)/∂θ at Δ."""
         n, p0 = self.n, x[:, self.n : 2 * self.n]
 
-        def by_parameters(x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None) -> Tensor:
-            def of_sample(theta: Tensor) -> Tensor:
-                driven = None if u is None else u[None]
-                P = self.equation(x[None], h[None], driven, theta, sharpest)(delta[None], False).rest
-                own = x[None, self.n : 2 * self.n]
-                return torch.cat([momentum_residual(P, own), momentum_plus(P)], -1)[0]
+        def of_sample(theta: Tensor, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None) -> Tensor:
+            driven = None if u is None else u[None]
+            P = self.equation(x[None], h[None], driven, theta, sharpest)(delta[None], False).rest
+            return torch.cat([momentum_residual(P, x[None, n : 2 * n]), momentum_plus(P)], -1)[0]
 
-            back: Any = vjp(of_sample, theta)[1]
-            return torch.stack([back(e)[0] for e in self.basis])
-
+        # Each sample has a θ of its own, whose derivatives autograd gives: `torch.func.vjp` imports torch's compiler,
+        # which takes longer than the trace.
+        with torch.enable_grad():
+            own = theta.expand(len(x), -1).clone().requires_grad_()
+            results = vmap(of_sample, (0, 0, 0, 0, None if u is None else 0))(own, x, delta, h, u).unbind(-1)
+            G = torch.stack([torch.autograd.grad(r.sum(), own, retain_graph=True)[0] for r in results], 1)
         point = self.equation(x, h, u, theta, sharpest)(delta, True)
         P, J = point.rest, point.J
         assert J is not None
         end = torch.cat([momentum_plus(P), P.L[:, None]], -1)
-        G = vmap(by_parameters, (0, 0, 0, None if u is None else 0))(x, delta, h, u)
         A, c = step_derivative(P, p0)[:, : 2 * n, : 2 * n], P.c.expand(len(x))
         return tuple(y.clone() for y in (point.F, J, end, A, c, G))
 
