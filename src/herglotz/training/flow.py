@@ -72,7 +72,7 @@ class CompiledFlow:
         whole = self.placed.rest.index_copy(0, self.placed.chosen, theta)
         ends, r = starts.contiguous().clone(), torch.zeros_like(of.y)
         delta, states = ends.new_zeros(len(ends), self.n), ends.new_zeros(*self.nodes, ends.shape[-1])
-        d = 2 * self.n
+        d = self.kernel.d
         F = 0 if sums is None else len(sums.corner)
         chosen = self.placed.chosen[:F]
 

@@ -2,8 +2,8 @@
 
 The parameters θ are an argument, so that one library serves every fit of this structure and every subset of its terms
 (a term that is absent is a 0). It is kept on disk by what it is made of: the configuration, this package's sources, the
-compiler and the processor. Models without C (networks, s in the equation of motion, order 4 of several coordinates),
-and machines without a compiler, have no kernel: `kernel_of` gives None, and torch evaluates the same functions.
+compiler and the processor. Models without C (large networks, order 4 of several coordinates), and machines without a
+compiler, have no kernel: `kernel_of` gives None, and torch evaluates the same functions.
 """
 
 from __future__ import annotations
@@ -66,8 +66,7 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
     if not isinstance(model, ContactLagrangian):
         return None
     c, config = model.capabilities, model.config
-    networks = config.potential_width or config.correction_width or config.mass_width or not config.baseline
-    plain = not networks and c.constant_c and not config.terms and (c.order == 2 or model.dof == 1)
+    plain = not config.terms and (c.order == 2 or model.dof == 1)
     like = next(model.parameters())
     if not plain or like.device.type != "cpu" or like.dtype != torch.float64:
         return None
@@ -92,13 +91,19 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
 
 
 def structure(config: ModelConfig) -> ModelConfig:
-    """The configuration without what a kernel takes as an argument: starts, sizes, and which numbers are 0."""
+    """The configuration without what a kernel takes as an argument: starts, sizes, and which numbers are 0.
+
+    Networks have the sizes of what they are given as constants.
+    """
+    plain = replace(config, seed=0, absent=())
+    damped = config.level in ("affine", "full")
+    if damped or config.potential_width or config.correction_width or config.mass_width or not config.baseline:
+        return plain if damped else replace(plain, damping_width=0)
     n = len(config.angles)
     ones, zeros = (1.0,) * n, (0.0,) * n
     held = config.alike or config.translations  # the baseline's potential, which is no argument there
     stiffness, tilt = (config.stiffness, config.tilt) if held else (ones, zeros)
-    return replace(config, scale=ones, speed=ones, stiffness=stiffness, tilt=tilt, rate=0.1, seed=0, absent=(),
-                   damping_width=0)  # fmt: skip
+    return replace(plain, scale=ones, speed=ones, stiffness=stiffness, tilt=tilt, rate=0.1, damping_width=0)
 
 
 @cache
@@ -130,6 +135,7 @@ class Kernel:
 
     def __init__(self, model: ContactLagrangian):
         self.n, self.m, self.sticks = model.dof, model.inputs, model.capabilities.sticking
+        self.d = states_of(model)
         self.numbers = ParameterVector(model).numbers  # of θ, in order
         self.place = {key: i for i, key in enumerate(keys_of(self.numbers, model.config))}
         key = _sources() + json.dumps(model.config.to_dict(), sort_keys=True)
@@ -157,6 +163,11 @@ def _passed(x: Tensor | float | int | None) -> Any:
         return ctypes.c_double(x)
     assert x is None or x.is_contiguous()
     return ctypes.c_void_p(None if x is None else x.data_ptr())
+
+
+def states_of(model: ContactLagrangian) -> int:
+    """How many numbers of a state the motion depends on: those of q and p, and s where it enters."""
+    return 2 * model.dof + model.s_enters_motion
 
 
 class _Increments(nn.Module):
@@ -194,6 +205,7 @@ class Functions:
 
     def __init__(self, model: ContactLagrangian):
         self.parameters, self.n, self.sticks = ParameterVector(model), model.dof, model.capabilities.sticking
+        self.d = states_of(model)
 
     def equation(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> PartialsEquation:
         """The step equation in Δ, with second derivatives."""
@@ -216,13 +228,16 @@ class Functions:
     def derive(
         self, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor
     ) -> tuple[Tensor, ...]:
-        """F, J, (p1, s1 − s0), and of a solved step ∂(q1, p1)/∂(q, p), c, and ∂(F, p1)/∂θ at Δ."""
-        n, p0 = self.n, x[:, self.n : 2 * self.n]
+        """F, J, (p1, s1 − s0), and of a solved step ∂(q1, p1)/∂(q, p), c, and ∂(F, p1)/∂θ at Δ.
+
+        Where s enters the motion the derivatives are those of (q1, p1, s1) by (q, p, s), and of (F, p1, s1) by θ.
+        """
+        n, d, p0 = self.n, self.d, x[:, self.n : 2 * self.n]
 
         def of_sample(theta: Tensor, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None) -> Tensor:
             driven = None if u is None else u[None]
             P = self.equation(x[None], h[None], driven, theta, sharpest)(delta[None], False).rest
-            return torch.cat([momentum_residual(P, x[None, n : 2 * n]), momentum_plus(P)], -1)[0]
+            return torch.cat([momentum_residual(P, x[None, n : 2 * n]), momentum_plus(P), P.L[:, None]], -1)[0, :d]
 
         # Each sample has a θ of its own, whose derivatives autograd gives: `torch.func.vjp` imports torch's compiler,
         # which takes longer than the trace.
@@ -234,7 +249,7 @@ class Functions:
         P, J = point.rest, point.J
         assert J is not None
         end = torch.cat([momentum_plus(P), P.L[:, None]], -1)
-        A, c = step_derivative(P, p0)[:, : 2 * n, : 2 * n], P.c.expand(len(x))
+        A, c = step_derivative(P, p0)[:, :d, :d], P.c.expand(len(x))
         return tuple(y.clone() for y in (point.F, J, end, A, c, G))
 
 
@@ -253,7 +268,8 @@ def source_of(model: ContactLagrangian) -> str:
     step = _Traced(functions.derive, state | {"delta": n} | end, m, solved, prepared)
     parts += [] if sticks else [step.function("evaluate", "F", "J")]
     parts += [step.function("finish", "end"), step.function("derive", "end", "A", "*c", "G")]
-    sizes = f"#define hz_N {n}\n#define hz_M {m}\n#define hz_P {P}\n#define hz_STICKS {int(sticks)}\n"
+    values = {"N": n, "M": m, "P": P, "D": functions.d, "STICKS": int(sticks)}
+    sizes = "".join(f"#define hz_{name} {value}\n" for name, value in values.items())
     head, *loops = ((RUNTIME / name).read_text() for name in ("mathematics.h", "sweep.c", "tridiagonal.c"))
     return "\n".join([sizes, head, *parts, prepared.function(), OPTIMISED, *loops])
 

@@ -25,6 +25,7 @@ from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import free_runs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
+from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
 from herglotz.training.sensor_zeros import zeros_of_one
@@ -292,13 +293,14 @@ def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor,
     """States (N, 2n+1), NaN beyond the warm-up of each trajectory, and how badly they suit it."""
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
     sigma, (every, parts) = _sigma(run), _warm_ups(data, warmup)
-    together = _smoothed(run.model, parts, sigma, run.h_range[1])
+    freedom = FREEDOM if run.metrics.get("outliers") else None  # what the fit has met may come again
+    together = _smoothed(run.model, parts, sigma, run.h_range[1], freedom)
     if together is not None:
         states[every.flatten()], cost = together
         return states, cost
     costs = []
     for rows in every:  # one of them at least has no step near it
-        alone = _smoothed(run.model, data.rows(rows, (warmup,)), sigma, run.h_range[1])
+        alone = _smoothed(run.model, data.rows(rows, (warmup,)), sigma, run.h_range[1], freedom)
         if alone is not None:
             states[rows] = alone[0]
             costs.append(alone[1])
@@ -323,13 +325,13 @@ def _own_zeros(run: FittedRun, data: Trajectories, warmup: int) -> tuple[float, 
 
 
 def _smoothed(
-    model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float
+    model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float, freedom: float | None
 ) -> tuple[Tensor, float] | None:
     """States at every sample of warm-ups, (N, 2n+1), the model held, and ½|r|²; None where it has no step near them."""
     turn = max_step * max(v / x for v, x in zip(model.config.speed, model.config.scale, strict=True))
     process = BELIEVED * min(1.0, turn) ** 0.5  # a random force adds as much in many short steps as in a long one
     grid = segment_grid(data, data.samples, max_step)
-    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process)
+    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process, freedom=freedom)
     found = smoothed_states(problem)
     return None if found is None else (problem.states(found[0]), found[1])
 

@@ -235,21 +235,12 @@ class Search:
         return trial
 
     def better_on_a_line(self, trial: Trial | None) -> bool:
-        """Whether angles that are taken for positions on a line, as of a free spring, give a better model.
-
-        Where terms of angles are at the noise, that is the simplest model on a line alone, of fewer numbers.
-        """
-        if not any(self.data.angles) or self.config.translations:
+        """Whether angles that are taken for positions on a line, as of a free spring, give a better model."""
+        if not any(self.data.angles) or self.config.translations or (trial is not None and trial.at_the_noise):
             return False
         data = replace(self.data, angles=(False,) * self.data.dof)
-        on_line = Search(data, estimate_baseline(data, outliers=self.freedom is not None), self.config,
-                         outliers=self.freedom is not None)  # fmt: skip
-        if trial is None or not trial.at_the_noise:
-            other = on_line.run()
-        elif len((plain := on_line.fitter(Variant(on_line.order))).numbers(plain.simple)) < trial.problem.P:
-            other = on_line.grown(plain)
-        else:
-            return False
+        base = estimate_baseline(data, outliers=self.freedom is not None)
+        other = Search(data, base, self.config, outliers=self.freedom is not None).run()
         if other is None or trial is None or not other.replaces(trial):
             return other is not None and trial is None
         ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)

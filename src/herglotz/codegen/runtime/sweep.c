@@ -1,10 +1,10 @@
 /* Free runs over segments of a trajectory with their derivatives: the compiled half of `herglotz.training.kernel`.
 
-   Before this file stand what depends on the model: hz_N coordinates, hz_M inputs, hz_P parameters, and the functions
-   hz_evaluate, hz_finish, hz_derive and, with set-valued dry friction, hz_rest, which leave out what is behind gates that
-   hz_prepare does not open (`codegen/gated.py`). */
+   Before this file stand what depends on the model: hz_N coordinates, hz_M inputs, hz_P parameters, hz_D numbers of a
+   state that the motion depends on (q, p, and s where it enters), and the functions hz_evaluate, hz_finish, hz_derive
+   and, with set-valued dry friction, hz_rest, which leave out what is behind gates that hz_prepare does not open
+   (`codegen/gated.py`). */
 
-#define hz_D (2 * hz_N) /* numbers of a state that the motion depends on: q, p */
 #define hz_X (2 * hz_N + 1)
 enum { hz_MAX_ITERATIONS = 60 };
 /* The last move of Newton's iteration is taken and not looked at again: quadratic convergence makes the next one
@@ -198,7 +198,7 @@ long hz_sweep(long S, const long *begin, const double *h, const double *u, const
           here[i] += own[i];
           here[hz_N + i] = end[i];
         }
-        here[hz_D] += end[hz_N];
+        here[2 * hz_N] += end[hz_N];
         if (!(hz_largest(here) < 1e100)) {
           failed = s;
           break;

@@ -71,7 +71,7 @@ class ShootingProblem(StatesProblem):
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
         self.zeros = data.q.new_zeros(())  # what the sensors read at 0, (N, n), where `WithZeros` fits it
-        placed = kernel_of(model) if self.d == 2 * self.n and s is None and world()[1] == 1 else None
+        placed = kernel_of(model) if s is None and world()[1] == 1 else None
         sharpest = dict(model.named_buffers()).get("friction.sharpest")
         self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, sharpest, self.n)
 
