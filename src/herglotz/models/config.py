@@ -150,11 +150,10 @@ class ModelConfig:
         })  # fmt: skip
 
     def _check_structure(self) -> None:
-        networks = self.potential_width or self.mass_width or self.correction_width or not self.baseline
         refuse({
             f"order must be 2 or 4, got {self.order}": self.order not in (2, 4),
             "order 4 is for features, without networks, at the levels conservative, linear and forced":
-                self.order == 4 and (networks or self.level in ("affine", "full")),
+                self.order == 4 and self.networks,
             "a model without a baseline has no features; leave features, known, alike, diagonal out":
                 not self.baseline and (self.features or self.known or self.alike or self.diagonal),
             "a mass that depends on position is not diagonal; set mass_width=0 or diagonal=False":
@@ -179,6 +178,12 @@ class ModelConfig:
     def dof(self) -> int:
         """Number of coordinates n."""
         return len(self.angles)
+
+    @property
+    def networks(self) -> bool:
+        """Whether any part is a network, whose starting values are drawn."""
+        widths = self.potential_width or self.mass_width or self.correction_width
+        return bool(widths) or not self.baseline or self.level in ("affine", "full")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""

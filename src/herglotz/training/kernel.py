@@ -96,14 +96,14 @@ def structure(config: ModelConfig) -> ModelConfig:
     Networks have the sizes of what they are given as constants.
     """
     plain = replace(config, seed=0, absent=())
-    damped = config.level in ("affine", "full")
-    if damped or config.potential_width or config.correction_width or config.mass_width or not config.baseline:
-        return plain if damped else replace(plain, damping_width=0)
+    plain = plain if config.level in ("affine", "full") else replace(plain, damping_width=0)
+    if config.networks:
+        return plain
     n = len(config.angles)
     ones, zeros = (1.0,) * n, (0.0,) * n
     held = config.alike or config.translations  # the baseline's potential, which is no argument there
     stiffness, tilt = (config.stiffness, config.tilt) if held else (ones, zeros)
-    return replace(plain, scale=ones, speed=ones, stiffness=stiffness, tilt=tilt, rate=0.1, damping_width=0)
+    return replace(plain, scale=ones, speed=ones, stiffness=stiffness, tilt=tilt, rate=0.1)
 
 
 @cache

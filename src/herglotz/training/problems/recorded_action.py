@@ -18,14 +18,18 @@ def action(
     data: Trajectories,
     latent: Tensor,  # (B,) s at the start of every trajectory
 ) -> Tensor:
-    """S at every sample, (N,)."""
+    """S at every sample, (N,); of L_d that is affine in s, L_d = L_d(s = 0) + (c − 1) s, from one evaluation of all."""
     s, h = torch.zeros_like(data.t), data.t.diff()
+    affine = not parameters.model.capabilities.action_flow
+    P = parameters.partials(theta, data.q[:-1], data.q[1:], s[:-1], h, 1) if affine else None
     for k, (now, live) in enumerate(_samples(data)):
         if k == 0:
             s[now] = latent[live]
+        elif P is not None:
+            s[now] = (P.c[now - 1] * s[now - 1] + P.L[now - 1]).detach()
         else:
-            P = parameters.partials(theta, data.q[now - 1], data.q[now], s[now - 1], h[now - 1], 1)
-            s[now] = s[now - 1] + P.L.detach()
+            step = parameters.partials(theta, data.q[now - 1], data.q[now], s[now - 1], h[now - 1], 1)
+            s[now] = s[now - 1] + step.L.detach()
     return s
 
 
