@@ -85,7 +85,8 @@ def save_figure(figure: Figure, path: PathLike) -> None:
 def _image(figure: Figure, form: str) -> bytes:
     buffer = io.BytesIO()
     with styled():
-        figure.savefig(buffer, format=form, dpi=DPI)
+        quick = {"pil_kwargs": {"compress_level": 1}} if form == "png" else {}  # half the time of an image of text
+        figure.savefig(buffer, format=form, dpi=DPI, **quick)
     return buffer.getvalue()
 
 

@@ -69,12 +69,16 @@ class Search:
             self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom, like)
         return self.fitters[variant]
 
+    def first(self) -> Trial | None:
+        """The model that the simplest one grows into."""
+        fitter = self.fitter(Variant(self.order))
+        return self.climbed(fitter, fitter.simple, {})
+
     @inside()
-    def run(self) -> Trial | None:
+    def run(self, first: Trial | None = None) -> Trial | None:
         """The model that held-out time asks for; None where not even the shortest segments can be followed."""
         part(FIRST_TERMS)
-        fitter = self.fitter(Variant(self.order))
-        best = self.climbed(fitter, fitter.simple, {})
+        fitter, best = self.fitter(Variant(self.order)), first or self.first()
         part(MORE_TERMS)
         ends = [best]
         if (start := self.linear_start(fitter)) is not None:
@@ -240,7 +244,11 @@ class Search:
             return False
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        other = Search(data, base, self.config, outliers=self.freedom is not None).run()
+        line = Search(data, base, self.config, outliers=self.freedom is not None)
+        first = line.first()
+        if trial is not None and (first is None or trial.replaces(first)):  # no worse model is worth a search
+            return False
+        other = line.run(first)
         if other is None or trial is None or not other.replaces(trial):
             return other is not None and trial is None
         ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
