@@ -36,6 +36,7 @@ from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.zeros import reference_of
 from herglotz.training.pruning import prune
+from herglotz.training.questions import Questions
 from herglotz.training.search import Search
 from herglotz.training.sensor_zeros import in_words
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
@@ -132,40 +133,25 @@ def search(
     data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
-    read, best, differ = wanted.part.with_zeros(wanted.part.run())
-    if differ is not None:  # terms that made up for zeros may stay where others stand already, and have bent the zeros
-        best = read.run() or best
-        once_more = wanted.part.with_zeros(best and wanted.part.again(best), sure=True)
-        read, best, differ = (read, best, differ) if once_more[1] is None else once_more
-    if read.better_on_a_line(best):  # whose search, with inputs and sizes of its own, finds the terms again
+    asked = Questions(wanted, holds)
+    asked.zeros()
+    if asked.read.better_on_a_line(asked.best):  # whose search, with inputs and sizes of its own, finds the terms again
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
-    if best is None:
+    if asked.best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
-    if hold := read.held(best, holds):
-        wanted, read = (each.of(replace(each.data, hold=hold)) for each in (wanted, read))
-        best = read.run() or best
-    if more := read.input_terms(best):
-        wanted, read = wanted.driven_by(more), read.driven_by(more)
-        best = read.run() or best
-    found = read.with_functions(best)
-    if found is not best:  # functions may be what recordings seemed to differ by, and tell a hold that terms did not
-        later = read.held(found, [other for other in holds if other != hold])
-        other = wanted.of(replace(wanted.data, hold=later)) if later else wanted
-        if (again := other.part.again(found)) is not None:
-            wanted, hold = other, later or hold
-            read, found, differ = wanted.part.with_zeros(again)
-            found = found and read.settled(found, swapped=True)
-    if wanted.part is not wanted:
-        read, found, differ = wanted.of_part(found, differ is not None)
+    for question in (asked.how_inputs_hold, asked.how_inputs_act, asked.functions, asked.all_data):
+        question()
+    found, differ = asked.best, asked.differ
     if found is None:
         return Structure(config, base, "no dictionary of terms: what follows a part of the data does not follow all")
-    settings, found_base = settings_of_trial(found, wanted.config)
+    settings, found_base = settings_of_trial(found, asked.wanted.config)
     settings = replace(settings, dtype=config.dtype, device=config.device)
     base = replace(found_base, low=base.low, high=base.high)
-    zeros, why, compared = (), "", compared_models(read.fitters.values(), found)
+    zeros, why, compared = (), "", compared_models(asked.read.fitters.values(), found)
     if differ is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
-    return Structure(settings, base, _told(found, data), found.rms, zeros, why, True, compared, more, hold)
+    words, terms = _told(found, data), asked.input_terms
+    return Structure(settings, base, words, found.rms, zeros, why, True, compared, terms, asked.hold)
 
 
 def _told(found: Trial, data: Trajectories) -> str:

@@ -1,0 +1,76 @@
+"""What a search asks of data beside their terms: one question after the other, of the model that the last one left.
+
+Zeros of sensors come before everything that may stand for them. How inputs hold, by which terms they act, and whether
+functions say what named terms do not, follows. Of long recordings a part is asked, and all samples at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from torch import Tensor
+
+from herglotz.training.search import Search
+from herglotz.training.trials import Trial
+
+
+class Questions:
+    """The answers so far: the model, and what the data were found to be."""
+
+    def __init__(self, wanted: Search, holds: Sequence[str]):
+        self.wanted, self.holds = wanted, holds  # the search of all data, and the holds of inputs that may be tried
+        self.hold, self.input_terms = "", ()
+        # The search of the part, its sensors' zeros taken off where these differ; the model; the zeros.
+        self.read: Search
+        self.best: Trial | None
+        self.differ: tuple[Tensor, Tensor] | None
+        self.read, self.best, self.differ = wanted.part.with_zeros(wanted.part.run())
+
+    def zeros(self) -> None:
+        """Terms anew where zeros differ, then zeros with these terms.
+
+        Terms that made up for zeros may stay where others stand already, and have bent the zeros.
+        """
+        if self.differ is None:
+            return
+        best, part = self.read.run() or self.best, self.wanted.part
+        once_more = part.with_zeros(best and part.again(best), sure=True)
+        self.read, self.best, self.differ = (self.read, best, self.differ) if once_more[1] is None else once_more
+
+    def how_inputs_hold(self) -> None:
+        """Terms anew with another hold of the inputs, where the model asks for one."""
+        if self.best is not None and (hold := self.read.held(self.best, self.holds)):
+            self.hold = hold
+            self._anew(lambda search: search.of(replace(search.data, hold=hold)))
+
+    def how_inputs_act(self) -> None:
+        """Terms anew with squares, sizes and rates of the inputs, where the model asks for some."""
+        if self.best is not None and (terms := self.read.input_terms(self.best)):
+            self.input_terms = terms
+            self._anew(lambda search: search.driven_by(terms))
+
+    def _anew(self, other: Callable[[Search], Search]) -> None:
+        self.wanted, self.read = other(self.wanted), other(self.read)
+        self.best = self.read.run() or self.best
+
+    def functions(self) -> None:
+        """A model of functions, where it is better; then holds and zeros once more.
+
+        Functions may be what recordings seemed to differ by, and tell a hold that terms did not.
+        """
+        if self.best is None or (found := self.read.with_functions(self.best)) is self.best:
+            return
+        self.best = found
+        later = self.read.held(found, [hold for hold in self.holds if hold != self.hold])
+        wanted = self.wanted.of(replace(self.wanted.data, hold=later)) if later else self.wanted
+        if (again := wanted.part.again(found)) is None:
+            return
+        self.wanted, self.hold = wanted, later or self.hold
+        self.read, best, self.differ = wanted.part.with_zeros(again)
+        self.best = best and self.read.settled(best, swapped=True)
+
+    def all_data(self) -> None:
+        """The model of a part fitted to all data, with what more these ask for."""
+        if self.wanted.part is not self.wanted:
+            self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
