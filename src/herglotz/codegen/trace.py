@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_any
 
 from herglotz.errors import InputError
 
@@ -112,12 +111,13 @@ class Recorder(TorchDispatchMode):
     records the same at four times the cost: it describes every value a second time.
 
     An operation on numbers that no input and no batch size decides is not written down; its result becomes a constant
-    where an operation that is written down reads it. What changes nothing is left out.
+    where an operation that is written down reads it. What changes nothing is left out, and what repeats is one node.
     """
 
     def __init__(self, inputs: Sequence[Tensor]):
         super().__init__()
         self.graph = fx.Graph()
+        self.calls: dict[tuple[Any, str], fx.Node] = {}  # by operation and arguments
         self.nodes: dict[int, fx.Node] = {}  # by the identity of the tensor, which `alive` keeps
         self.alive: list[Any] = []
         self.unchanged: dict[int, tuple[Any, Any, Any]] = {}  # the operations left out, by their result
@@ -131,10 +131,15 @@ class Recorder(TorchDispatchMode):
         axis = next(i for i, x in enumerate(inputs) if x.ndim)
         self.batch, self.axis = len(inputs[axis]), self.places[axis]
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Nothing here is compiled by torch: to exclude it, torch would import its compiler, which takes 2 s."""
+        return False
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run one operation, and write it down."""
         kwargs = kwargs or {}
-        if self._is_fixed((args, kwargs)):
+        if self._is_fixed((*args, *kwargs.values())):
             result = func(*args, **kwargs)
             self.alive += [args, result]
             return result
@@ -154,12 +159,10 @@ class Recorder(TorchDispatchMode):
 
     def graph_of(self, outputs: Sequence[Tensor]) -> Graph:
         """The graph that ends in these tensors; each is a tensor of its own."""
-        from torch._functorch.compile_utils import fx_graph_cse
-
         left_out = [self.unchanged.get(id(x)) for x in outputs]
         ends = zip(outputs, left_out, strict=True)
         self.graph.output(tuple(self._moved(x) if how is None else self._written(*how) for x, how in ends))
-        graph = fx_graph_cse(self.graph)
+        graph = self.graph
         graph.eliminate_dead_code()
         numbers = {place.name: value for place, value in self.constants.values()}
         places = graph.find_nodes(op="placeholder")
@@ -170,10 +173,36 @@ class Recorder(TorchDispatchMode):
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
         if func == aten.copy_.default:
             shape = [self._argument(size) for size in args[0].shape]
-            return self.graph.call_function(aten.expand.default, (self._moved(args[1]), shape))
+            return self._called(aten.expand.default, (self._moved(args[1]), shape))
         arguments, options = (map_aggregate(x, self._argument) for x in (args, kwargs))
-        new = _finite(self.graph, func, arguments) or _gathered(self.graph, func, args, arguments)
-        return new or self.graph.call_function(INSTEAD.get(func) or _without_writing(func), arguments, options)
+        new = self._finite(func, arguments) or self._gathered(func, args, arguments)
+        return new or self._called(INSTEAD.get(func) or _without_writing(func), arguments, options)
+
+    def _called(self, operation: Any, arguments: Any, options: Any = {}) -> fx.Node:  # noqa: B006  not changed
+        """The node of an operation; one of the same arguments is the same node, unless it draws random numbers."""
+        key = (operation, repr((arguments, options)))
+        if key not in self.calls or torch.Tag.nondeterministic_seeded in getattr(operation, "tags", ()):
+            self.calls[key] = self.graph.call_function(operation, arguments, options)
+        return self.calls[key]
+
+    def _finite(self, func: Any, arguments: Any) -> fx.Node | None:
+        """(x = x) · (|x| ≠ ∞), which is what torch makes of isfinite, as one operation again."""
+        if func != aten.mul.Tensor or not all(isinstance(x, fx.Node) for x in arguments):
+            return None
+        same, below = arguments
+        if (same.target, below.target) != (aten.eq.Tensor, aten.ne.Scalar) or same.args[0] is not same.args[1]:
+            return None
+        return self._called(aten.isfinite.default, same.args[:1])
+
+    def _gathered(self, func: Any, values: Any, arguments: Any) -> fx.Node | None:
+        """x[index] along the first axis as `index_select`: ONNX runs the general form at a tenth of the speed."""
+        if func != aten.index.Tensor or len(values[1]) != 1:
+            return None
+        shape = list(values[1][0].shape)
+        x, (place,) = arguments
+        flat = place if len(shape) == 1 else self._called(aten.reshape.default, (place, [-1]))
+        new = self._called(aten.index_select.default, (x, 0, flat))
+        return new if len(shape) == 1 else self._called(aten.unflatten.int, (new, 0, shape))
 
     def _same(self, func: Any, args: Any, kwargs: Any, result: Any) -> Tensor | None:
         """The argument that the result equals: views of the same shape, x + 0 and 1 x."""
@@ -197,7 +226,9 @@ class Recorder(TorchDispatchMode):
 
     def _is_fixed(self, arguments: Any) -> bool:
         """Whether neither an input nor the batch size decides the arguments."""
-        return not tree_any(lambda x: id(x) in self.nodes or self._is_size(x), arguments)
+        if isinstance(arguments, (list, tuple)):
+            return all(map(self._is_fixed, arguments))
+        return id(arguments) not in self.nodes and not self._is_size(arguments)
 
     def _name(self, result: Any, node: Any) -> None:
         """The node of a result; results in a tuple are its items."""
@@ -208,7 +239,7 @@ class Recorder(TorchDispatchMode):
                 self.current[storage].add(id(result))
         elif isinstance(result, (list, tuple)):
             for i, x in enumerate(result):
-                self._name(x, self.graph.call_function(operator.getitem, (node, i)))
+                self._name(x, self._called(operator.getitem, (node, i)))
 
     def _moved(self, value: Tensor) -> fx.Node:
         """The node of a tensor; that of a constant on its first use.
@@ -240,7 +271,7 @@ class Recorder(TorchDispatchMode):
             return x
         if self.size is None:
             self.size = self.graph.call_function(aten.sym_size.int, (self.axis, 0))
-        return self.size if x == self.batch else self.graph.call_function(operator.mul, (self.size, x // self.batch))
+        return self.size if x == self.batch else self._called(operator.mul, (self.size, x // self.batch))
 
     def _is_size(self, x: Any) -> bool:
         """Whether this is a multiple of the example's batch."""
@@ -261,27 +292,6 @@ def _without_writing(func: Any) -> Any:
     if not name.endswith("_") or other is None:
         raise InputError(f"{func} writes in place, which files cannot step; use the form that returns a new tensor")
     return other
-
-
-def _finite(graph: fx.Graph, func: Any, arguments: Any) -> fx.Node | None:
-    """(x = x) · (|x| ≠ ∞), which is what torch makes of isfinite, as one operation again."""
-    if func != aten.mul.Tensor or not all(isinstance(x, fx.Node) for x in arguments):
-        return None
-    same, below = arguments
-    if (same.target, below.target) != (aten.eq.Tensor, aten.ne.Scalar) or same.args[0] is not same.args[1]:
-        return None
-    return graph.call_function(aten.isfinite.default, same.args[:1])
-
-
-def _gathered(graph: fx.Graph, func: Any, values: Any, arguments: Any) -> fx.Node | None:
-    """x[index] along the first axis as `index_select`: ONNX runs the general form at a tenth of the speed."""
-    if func != aten.index.Tensor or len(values[1]) != 1:
-        return None
-    shape = list(values[1][0].shape)
-    x, (place,) = arguments
-    flat = place if len(shape) == 1 else graph.call_function(aten.reshape.default, (place, [-1]))
-    new = graph.call_function(aten.index_select.default, (x, 0, flat))
-    return new if len(shape) == 1 else graph.call_function(aten.unflatten.int, (new, 0, shape))
 
 
 def assembled(
