@@ -40,7 +40,7 @@ class Graph(nn.Module):
     Every node has meta "example": what it gave when it was traced, with `batch` samples, tensors as `Example`.
     """
 
-    def __init__(self, code: fx.GraphModule, constants: Sequence[Tensor], batch: int):
+    def __init__(self, code: fx.Graph, constants: Sequence[Tensor], batch: int):
         super().__init__()
         self.code = code
         self.batch = batch
@@ -55,7 +55,7 @@ class Graph(nn.Module):
 
     def call(self, *arguments: Tensor) -> Any:
         """Evaluate at inputs and constants."""
-        return (self.operator or self.code)(*arguments)
+        return (self.operator or fx.Interpreter(self, graph=self.code).run)(*arguments)
 
     def forward(self, *inputs: Tensor) -> Any:
         """Evaluate at inputs."""
@@ -75,11 +75,10 @@ def traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph
     """
     recorder = Recorder(arguments)
     with torch.no_grad():
-        function(*arguments)  # fills index caches outside the trace
         with recorder:
             outputs = function(*arguments)
         graph = recorder.graph_of(outputs if isinstance(outputs, tuple) else (outputs,))
-        _Examples(graph.code).run(*arguments, *graph.constants)
+        _Examples(graph, graph=graph.code).run(*arguments, *graph.constants)
     return graph
 
 
@@ -124,7 +123,7 @@ class Recorder(TorchDispatchMode):
         self.constants: dict[Any, tuple[fx.Node, Tensor]] = {}
         self.current: dict[int, set[int]] = {}  # by written storage: the tensors whose nodes hold what was written
         self.size: fx.Node | None = None
-        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]
+        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]  # and those of constants after them
         for x, place in zip(inputs, self.places, strict=True):
             place.meta["example"] = _described(x)
             self._name(x, place)
@@ -162,13 +161,11 @@ class Recorder(TorchDispatchMode):
         left_out = [self.unchanged.get(id(x)) for x in outputs]
         ends = zip(outputs, left_out, strict=True)
         self.graph.output(tuple(self._moved(x) if how is None else self._written(*how) for x, how in ends))
-        graph = self.graph
-        graph.eliminate_dead_code()
-        numbers = {place.name: value for place, value in self.constants.values()}
-        places = graph.find_nodes(op="placeholder")
-        constants = {x: numbers[x.name] for x in places if x.name in numbers}
-        inputs, calls = [x for x in places if x not in constants], [x for x in graph.nodes if x.op == "call_function"]
-        return assembled(self.batch, inputs, calls, graph.output_node().args[0], constants)
+        self.graph.eliminate_dead_code()
+        for place, _ in self.constants.values():
+            if not place.users:
+                self.graph.erase_node(place)
+        return Graph(self.graph, [value for place, value in self.constants.values() if place.users], self.batch)
 
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
         if func == aten.copy_.default:
@@ -258,8 +255,9 @@ class Recorder(TorchDispatchMode):
             value = torch.zeros(value.shape, dtype=value.dtype)
         key = (value.dtype, tuple(value.shape), value.detach().cpu().contiguous().numpy().tobytes())
         if key not in self.constants:
-            with self.graph.inserting_before(self.places[0]):
+            with self.graph.inserting_after(self.places[-1]):
                 place = self.graph.placeholder(f"constant_{len(self.constants)}")
+            self.places.append(place)
             self.constants[key] = (place, value.detach().clone(memory_format=torch.contiguous_format))
         return self.constants[key][0]
 
@@ -314,4 +312,4 @@ def assembled(
         new[x] = graph.node_copy(x, lambda y, own=x.target == aten.sym_size.int: axis if own else new[y])
     graph.output(tuple(new[x] for x in results))
     graph.eliminate_dead_code()
-    return Graph(fx.GraphModule(nn.Module(), graph), [constants[x] for x in used], batch)
+    return Graph(graph, [constants[x] for x in used], batch)

@@ -69,7 +69,7 @@ def _inline(outer: fx.Graph, call: fx.Node, graph: Graph) -> None:
     values: dict[Any, Any] = {}  # torch takes a millisecond to describe a tensor, and many nodes have equal ones
     places = iter(arguments)
     with outer.inserting_before(call):
-        for node in graph.code.graph.nodes:
+        for node in graph.code.nodes:
             if node.op == "placeholder":
                 new[node] = next(places)
             elif node.op == "call_function":
@@ -109,4 +109,4 @@ def _sized(sizes: tuple[int, ...], graph: Graph, batch: Any) -> list[Any]:
 
 
 def _results(graph: Graph) -> tuple[fx.Node, ...]:
-    return graph.code.graph.output_node().args[0]  # pyright: ignore[reportReturnType]
+    return graph.code.output_node().args[0]  # pyright: ignore[reportReturnType]
