@@ -62,6 +62,7 @@ def test_what_a_trace_leaves_out_changes_nothing(kept):
     [
         (lambda x: (x + 2) * (x + 2), 2),
         (lambda x: (x + 2) * (x + 3), 3),  # fails if other arguments are taken for the same ones
+        (lambda x: torch.add(x, x, alpha=2) * torch.add(x, x, alpha=3), 3),  # or other options
         (lambda x: torch.where(x > 0.5, x.sum(-1, keepdim=True), x.sum(-1)[:, None]), 5),
         (lambda x: (x / 0.0).atan() + (x / -0.0).atan(), 5),  # fails if -0.0 is 0.0
         (lambda x: torch.rand_like(x) - torch.rand_like(x), 3),  # fails if two draws are one
