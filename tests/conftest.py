@@ -1,4 +1,4 @@
-"""C of the tests is compiled without optimisation; and the rounding shake, on request.
+"""C of the tests is compiled without optimisation, and once; and the rounding shake, on request.
 
 The rounding shake: every fit of the suite from data disturbed in the last digit.
 `HERGLOTZ_SHAKE=SEED` multiplies the positions and inputs that `fit` is given by 1 + 1e-14 ξ, ξ standard normal and
@@ -11,6 +11,7 @@ import gc
 import os
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -70,6 +71,14 @@ def _unoptimised_c():
     """C without optimisation: what it computes does not hang on -O3, which takes the compiler 4 to 8 times as long."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(c_compiler, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in OPTIMISED))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _compiled_once():
+    """Libraries are kept for all tests, workers and runs: their names are the hashes of their sources."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(Path(__file__).parents[1] / "build" / "tests"))
         yield
 
 

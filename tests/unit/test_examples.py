@@ -25,7 +25,6 @@ def test_the_examples_run(tmp_path, monkeypatch, capsys, first):  # fails if an 
     if first > 3 and not any(map(shutil.which, ("cc", "gcc", "clang"))):
         pytest.skip("no C compiler in the PATH")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     names: dict = {}
     for block in BLOCKS[:first]:
         exec(compile(block, str(PAGE), "exec"), names)

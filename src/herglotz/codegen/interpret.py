@@ -31,7 +31,7 @@ def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -
     `program` takes the statements; `inputs` are the numbers of each argument, in its order. An argument without the
     batch axis, as parameters are, has its own shape.
     """
-    nodes = list(graph.code.graph.nodes)
+    nodes = list(graph.code.nodes)
     places = [node for node in nodes if node.op == "placeholder"]
     values: dict[fx.Node, Any] = {}
     for node, numbers in zip(places, inputs, strict=False):

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_any
 
 from herglotz.errors import InputError
 
@@ -41,7 +40,7 @@ class Graph(nn.Module):
     Every node has meta "example": what it gave when it was traced, with `batch` samples, tensors as `Example`.
     """
 
-    def __init__(self, code: fx.GraphModule, constants: Sequence[Tensor], batch: int):
+    def __init__(self, code: fx.Graph, constants: Sequence[Tensor], batch: int):
         super().__init__()
         self.code = code
         self.batch = batch
@@ -56,7 +55,7 @@ class Graph(nn.Module):
 
     def call(self, *arguments: Tensor) -> Any:
         """Evaluate at inputs and constants."""
-        return (self.operator or self.code)(*arguments)
+        return (self.operator or fx.Interpreter(self, graph=self.code).run)(*arguments)
 
     def forward(self, *inputs: Tensor) -> Any:
         """Evaluate at inputs."""
@@ -76,11 +75,10 @@ def traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph
     """
     recorder = Recorder(arguments)
     with torch.no_grad():
-        function(*arguments)  # fills index caches outside the trace
         with recorder:
             outputs = function(*arguments)
         graph = recorder.graph_of(outputs if isinstance(outputs, tuple) else (outputs,))
-        _Examples(graph.code).run(*arguments, *graph.constants)
+        _Examples(graph, graph=graph.code).run(*arguments, *graph.constants)
     return graph
 
 
@@ -112,19 +110,20 @@ class Recorder(TorchDispatchMode):
     records the same at four times the cost: it describes every value a second time.
 
     An operation on numbers that no input and no batch size decides is not written down; its result becomes a constant
-    where an operation that is written down reads it. What changes nothing is left out.
+    where an operation that is written down reads it. What changes nothing is left out, and what repeats is one node.
     """
 
     def __init__(self, inputs: Sequence[Tensor]):
         super().__init__()
         self.graph = fx.Graph()
+        self.calls: dict[tuple[Any, str], fx.Node] = {}  # by operation and arguments
         self.nodes: dict[int, fx.Node] = {}  # by the identity of the tensor, which `alive` keeps
         self.alive: list[Any] = []
         self.unchanged: dict[int, tuple[Any, Any, Any]] = {}  # the operations left out, by their result
         self.constants: dict[Any, tuple[fx.Node, Tensor]] = {}
         self.current: dict[int, set[int]] = {}  # by written storage: the tensors whose nodes hold what was written
         self.size: fx.Node | None = None
-        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]
+        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]  # and those of constants after them
         for x, place in zip(inputs, self.places, strict=True):
             place.meta["example"] = _described(x)
             self._name(x, place)
@@ -133,13 +132,13 @@ class Recorder(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """False: torch would import its compiler, which takes longer than a trace, to be kept out of this one."""
+        """Nothing here is compiled by torch: to exclude it, torch would import its compiler, which takes 2 s."""
         return False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run one operation, and write it down."""
         kwargs = kwargs or {}
-        if self._is_fixed((args, kwargs)):
+        if self._is_fixed((*args, *kwargs.values())):
             result = func(*args, **kwargs)
             self.alive += [args, result]
             return result
@@ -162,20 +161,45 @@ class Recorder(TorchDispatchMode):
         left_out = [self.unchanged.get(id(x)) for x in outputs]
         ends = zip(outputs, left_out, strict=True)
         self.graph.output(tuple(self._moved(x) if how is None else self._written(*how) for x, how in ends))
-        graph = without_repetitions(self.graph)
-        numbers = {place.name: value for place, value in self.constants.values()}
-        places = graph.find_nodes(op="placeholder")
-        constants = {x: numbers[x.name] for x in places if x.name in numbers}
-        inputs, calls = [x for x in places if x not in constants], [x for x in graph.nodes if x.op == "call_function"]
-        return assembled(self.batch, inputs, calls, graph.output_node().args[0], constants)
+        self.graph.eliminate_dead_code()
+        for place, _ in self.constants.values():
+            if not place.users:
+                self.graph.erase_node(place)
+        return Graph(self.graph, [value for place, value in self.constants.values() if place.users], self.batch)
 
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
         if func == aten.copy_.default:
             shape = [self._argument(size) for size in args[0].shape]
-            return self.graph.call_function(aten.expand.default, (self._moved(args[1]), shape))
+            return self._called(aten.expand.default, (self._moved(args[1]), shape))
         arguments, options = (map_aggregate(x, self._argument) for x in (args, kwargs))
-        new = _finite(self.graph, func, arguments) or _gathered(self.graph, func, args, arguments)
-        return new or self.graph.call_function(INSTEAD.get(func) or _without_writing(func), arguments, options)
+        new = self._finite(func, arguments) or self._gathered(func, args, arguments)
+        return new or self._called(INSTEAD.get(func) or _without_writing(func), arguments, options)
+
+    def _called(self, operation: Any, arguments: Any, options: Any = {}) -> fx.Node:  # noqa: B006  not changed
+        """The node of an operation; one of the same arguments is the same node, unless it draws random numbers."""
+        key = (operation, repr((arguments, options)))
+        if key not in self.calls or torch.Tag.nondeterministic_seeded in getattr(operation, "tags", ()):
+            self.calls[key] = self.graph.call_function(operation, arguments, options)
+        return self.calls[key]
+
+    def _finite(self, func: Any, arguments: Any) -> fx.Node | None:
+        """(x = x) · (|x| ≠ ∞), which is what torch makes of isfinite, as one operation again."""
+        if func != aten.mul.Tensor or not all(isinstance(x, fx.Node) for x in arguments):
+            return None
+        same, below = arguments
+        if (same.target, below.target) != (aten.eq.Tensor, aten.ne.Scalar) or same.args[0] is not same.args[1]:
+            return None
+        return self._called(aten.isfinite.default, same.args[:1])
+
+    def _gathered(self, func: Any, values: Any, arguments: Any) -> fx.Node | None:
+        """x[index] along the first axis as `index_select`: ONNX runs the general form at a tenth of the speed."""
+        if func != aten.index.Tensor or len(values[1]) != 1:
+            return None
+        shape = list(values[1][0].shape)
+        x, (place,) = arguments
+        flat = place if len(shape) == 1 else self._called(aten.reshape.default, (place, [-1]))
+        new = self._called(aten.index_select.default, (x, 0, flat))
+        return new if len(shape) == 1 else self._called(aten.unflatten.int, (new, 0, shape))
 
     def _same(self, func: Any, args: Any, kwargs: Any, result: Any) -> Tensor | None:
         """The argument that the result equals: views of the same shape, x + 0 and 1 x."""
@@ -199,7 +223,9 @@ class Recorder(TorchDispatchMode):
 
     def _is_fixed(self, arguments: Any) -> bool:
         """Whether neither an input nor the batch size decides the arguments."""
-        return not tree_any(lambda x: id(x) in self.nodes or self._is_size(x), arguments)
+        if isinstance(arguments, (list, tuple)):
+            return all(map(self._is_fixed, arguments))
+        return id(arguments) not in self.nodes and not self._is_size(arguments)
 
     def _name(self, result: Any, node: Any) -> None:
         """The node of a result; results in a tuple are its items."""
@@ -210,7 +236,7 @@ class Recorder(TorchDispatchMode):
                 self.current[storage].add(id(result))
         elif isinstance(result, (list, tuple)):
             for i, x in enumerate(result):
-                self._name(x, self.graph.call_function(operator.getitem, (node, i)))
+                self._name(x, self._called(operator.getitem, (node, i)))
 
     def _moved(self, value: Tensor) -> fx.Node:
         """The node of a tensor; that of a constant on its first use.
@@ -229,8 +255,9 @@ class Recorder(TorchDispatchMode):
             value = torch.zeros(value.shape, dtype=value.dtype)
         key = (value.dtype, tuple(value.shape), value.detach().cpu().contiguous().numpy().tobytes())
         if key not in self.constants:
-            with self.graph.inserting_before(self.places[0]):
+            with self.graph.inserting_after(self.places[-1]):
                 place = self.graph.placeholder(f"constant_{len(self.constants)}")
+            self.places.append(place)
             self.constants[key] = (place, value.detach().clone(memory_format=torch.contiguous_format))
         return self.constants[key][0]
 
@@ -242,26 +269,11 @@ class Recorder(TorchDispatchMode):
             return x
         if self.size is None:
             self.size = self.graph.call_function(aten.sym_size.int, (self.axis, 0))
-        return self.size if x == self.batch else self.graph.call_function(operator.mul, (self.size, x // self.batch))
+        return self.size if x == self.batch else self._called(operator.mul, (self.size, x // self.batch))
 
     def _is_size(self, x: Any) -> bool:
         """Whether this is a multiple of the example's batch."""
         return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * self.batch and x % self.batch == 0
-
-
-def without_repetitions(graph: fx.Graph) -> fx.Graph:
-    """The graph with every call once, and no call that nothing reads.
-
-    `fx_graph_cse` of torch does the same, and imports torch's compiler, which takes longer than the whole trace.
-    """
-    first: dict[tuple[Any, str, str], fx.Node] = {}
-    for node in graph.nodes:
-        if node.op == "call_function":
-            same = first.setdefault((node.target, repr(node.args), repr(node.kwargs)), node)
-            if same is not node:
-                node.replace_all_uses_with(same)
-    graph.eliminate_dead_code()
-    return graph
 
 
 def _storage(x: Tensor) -> int:
@@ -278,27 +290,6 @@ def _without_writing(func: Any) -> Any:
     if not name.endswith("_") or other is None:
         raise InputError(f"{func} writes in place, which files cannot step; use the form that returns a new tensor")
     return other
-
-
-def _finite(graph: fx.Graph, func: Any, arguments: Any) -> fx.Node | None:
-    """(x = x) · (|x| ≠ ∞), which is what torch makes of isfinite, as one operation again."""
-    if func != aten.mul.Tensor or not all(isinstance(x, fx.Node) for x in arguments):
-        return None
-    same, below = arguments
-    if (same.target, below.target) != (aten.eq.Tensor, aten.ne.Scalar) or same.args[0] is not same.args[1]:
-        return None
-    return graph.call_function(aten.isfinite.default, same.args[:1])
-
-
-def _gathered(graph: fx.Graph, func: Any, values: Any, arguments: Any) -> fx.Node | None:
-    """x[index] along the first axis as `index_select`: ONNX runs the general form at a tenth of the speed."""
-    if func != aten.index.Tensor or len(values[1]) != 1:
-        return None
-    shape = list(values[1][0].shape)
-    x, (place,) = arguments
-    flat = place if len(shape) == 1 else graph.call_function(aten.reshape.default, (place, [-1]))
-    new = graph.call_function(aten.index_select.default, (x, 0, flat))
-    return new if len(shape) == 1 else graph.call_function(aten.unflatten.int, (new, 0, shape))
 
 
 def assembled(
@@ -321,4 +312,4 @@ def assembled(
         new[x] = graph.node_copy(x, lambda y, own=x.target == aten.sym_size.int: axis if own else new[y])
     graph.output(tuple(new[x] for x in results))
     graph.eliminate_dead_code()
-    return Graph(fx.GraphModule(nn.Module(), graph), [constants[x] for x in used], batch)
+    return Graph(graph, [constants[x] for x in used], batch)

@@ -52,30 +52,30 @@ def inlined(program: ExportedProgram) -> ExportedProgram:
     for module in list(program.graph_module.modules()):
         if not isinstance(module, fx.GraphModule):
             continue
+        values: dict[Any, Any] = {}  # torch takes milliseconds to describe a tensor, and many nodes have equal ones
         for node in list(module.graph.nodes):
             if node.target == torch.ops.herglotz.graph.default:
-                _inline(module.graph, node, _graphs[node.args[1]])
+                _inline(module.graph, node, _graphs[node.args[1]], values)
         module.graph.eliminate_dead_code()
         module.recompile()
     _graphs.clear()
     return program
 
 
-def _inline(outer: fx.Graph, call: fx.Node, graph: Graph) -> None:
+def _inline(outer: fx.Graph, call: fx.Node, graph: Graph, values: dict[Any, Any]) -> None:
     arguments: Any = call.args[0]
     example = next(x.meta["val"] for x in arguments if x.meta["val"].ndim)
     batch, mode = example.shape[0], example.fake_mode
     new: dict[fx.Node, Any] = {}
-    values: dict[Any, Any] = {}  # torch takes a millisecond to describe a tensor, and many nodes have equal ones
     places = iter(arguments)
     with outer.inserting_before(call):
-        for node in graph.code.graph.nodes:
+        for node in graph.code.nodes:
             if node.op == "placeholder":
                 new[node] = next(places)
             elif node.op == "call_function":
                 new[node] = outer.node_copy(node, lambda x: new[x])
                 known = node.meta["example"]
-                key = repr(known)
+                key = repr((known, graph.batch, batch))
                 if key not in values:
                     values[key] = _value(known, graph, batch, mode)
                 new[node].meta = {"val": values[key]}
@@ -109,4 +109,4 @@ def _sized(sizes: tuple[int, ...], graph: Graph, batch: Any) -> list[Any]:
 
 
 def _results(graph: Graph) -> tuple[fx.Node, ...]:
-    return graph.code.graph.output_node().args[0]  # pyright: ignore[reportReturnType]
+    return graph.code.output_node().args[0]  # pyright: ignore[reportReturnType]

@@ -16,7 +16,7 @@ def parted(graph: Graph, early: Sequence[bool]) -> tuple[Graph, Graph]:
 
     The first part has only values of one number a sample, which are cheap to keep for every step.
     """
-    own = graph.code.graph
+    own = graph.code
     calls, places = [x for x in own.nodes if x.op == "call_function"], own.find_nodes(op="placeholder")
     inputs = places[: len(early)]
     constants = dict(zip(places[len(early) :], graph.constants, strict=True))

@@ -62,7 +62,8 @@ def driven(tmp_path_factory):
     columns = zip(data.t.tolist(), data.q[:, 0].tolist(), data.u[:, 0].tolist(), strict=True)
     rows = "".join(f"{t!r},{x!r},{u!r},{k}\n" for k, (t, x, u) in enumerate(columns))
     (folder / "driven.csv").write_text("clock,x,drive,ticks\n" + rows)
-    short = ["--level", "forced", "--iterations", "20"]  # how the data are read is the question here
+    # How the data are read is the question here.
+    short = ["--level", "forced", "--iterations", "5", "--objective", "residual"]
     assert main(["fit", str(folder / "driven.csv"), "--out", str(folder / "told"), "--no-plots", *READ, *short]) in (
         0,
         3,
@@ -99,12 +100,13 @@ def test_flags_stand_over_what_was_read(driven):  # fails if a flag beside --con
 def test_python_remembers_how_data_were_read(driven, tmp_path):
     # fails if a run of `hz.fit(path, time=...)` cannot be repeated by --config, or arrays end up in config.json
     file = driven / "driven.csv"
-    run = fit(file, time="clock", coordinates="x", inputs=("drive",), iterations=5, objective="trajectory")
+    few = FitConfig(iterations=5, objective="residual")
+    run = fit(file, few, time="clock", coordinates="x", inputs=("drive",))
     assert run.reading == {"time": "clock", "coordinates": "x", "inputs": ["drive"]}
     save_run(run, tmp_path / "run")
     assert load_run(tmp_path / "run").reading == run.reading
     x = load(file, time="clock", coordinates="x", inputs=(), show=False)
-    assert fit(x.q[:, 0].numpy(), time=x.t.numpy(), iterations=5).reading == {}
+    assert fit(x.q[:, 0].numpy(), few, time=x.t.numpy()).reading == {}
 
 
 @pytest.mark.parametrize(("told", "named"), [(True, ["x"]), (False, []), SLOW("x", "x"), SLOW(("x",), ["x"])])

@@ -23,13 +23,6 @@ KINDS = {"linear": ("linear", 0, True), "affine": ("affine", 0, True), "correcti
 KINDS |= {"both": ("affine", 3, True), "alone": ("linear", 6, False)}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 def damped(n, kind, dtype=torch.float64):
     """A damped model whose every parameter is random; angles and lengths alternate."""
     level, correction, baseline = KINDS[kind]

@@ -46,13 +46,6 @@ CASES: dict[str, dict[str, Any]] = {
 SLOW = [pytest.param(case, marks=pytest.mark.slow) for case in ("sticking", "drag")]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 def damped(case):
     """A damped model of an angle and a length whose every parameter is random."""
     sizes = (1.0, 1.1)

@@ -7,7 +7,6 @@ import pytest
 import torch
 from export_models import randomise
 
-from herglotz.codegen import c_compiler
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.mass import PositionKinetic
@@ -27,15 +26,6 @@ LEVELS: dict[str, dict[str, Any]] = {
     "viscous": {"level": "forced"},
     "dry": {"level": "forced", "coulomb": True, "inputs": 1},
 }
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quick_compiler(tmp_path_factory):
-    """An own cache, and less optimisation: 72 libraries."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(c_compiler, "FLAGS", tuple("-O1" if flag.startswith("-O") else flag for flag in c_compiler.FLAGS))
-        yield
 
 
 def problem(level, activation, mass, batch):

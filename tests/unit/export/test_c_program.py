@@ -1,5 +1,6 @@
 """The header in other programs: compilers, -ffast-math, batches, statuses, a motion at rest, docs/c.md."""
 
+import functools
 import re
 import shutil
 import subprocess
@@ -10,6 +11,8 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.export import export_c, load_c
+from herglotz.export.c_header import c_source, described
+from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.mass import PositionKinetic
 
@@ -29,6 +32,18 @@ def model(n=1, **options):
         for parameter in made.parameters():
             parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
     return made
+
+
+@functools.cache
+def header(level="linear", n=1, box=False, **options):
+    """A header for h from 0.05 to 0.2, without NAME_step_jacobian, which takes most of the time to trace."""
+    made = model(n, level=level, **options)
+    if isinstance(made.kinetic, PositionKinetic):  # so that it bends
+        with torch.no_grad():
+            made.kinetic.network.weights[-1].mul_(10)
+    entries = describe(made, 0.1, {**BOX, "q_low": [-1.0], "q_high": [1.0]} if box else None, (), 30,
+                       {"h_range": [0.05, 0.2]})  # fmt: skip
+    return c_source(made, described(made, entries, "arm", "float64", None), "stepper.h", derivatives=False)
 
 
 def run(tmp_path, code, compiler, *flags):
@@ -73,8 +88,7 @@ int main(void) {
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_statuses_survive_fast_math(tmp_path, compiler, flags):
     # fails if a check for NaN is a comparison, which -ffast-math deletes
-    box = {**BOX, "q_low": [-1.0], "q_high": [1.0]}
-    export_c(model(correction_width=4), tmp_path / "stepper.h", h=0.1, h_range=(0.05, 0.2), box=box, name="arm")
+    (tmp_path / "stepper.h").write_text(header(box=True, correction_width=4))
     words = run(tmp_path, STATUSES, compiler, *flags)
     assert " ".join(words) == "0 5 5 5 5 3 3 3 3 1 1 1 32 16 3 0 3 0"
 
@@ -143,7 +157,7 @@ int main(void) {
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_batches_and_fast_math_agree_with_single_samples(tmp_path, compiler):
     # fails if a lane is another sample's, the last partial register is dropped, or -ffast-math changes the result
-    export_c(model(2, level="affine", correction_width=5), tmp_path / "stepper.h", h=0.1, name="arm")
+    (tmp_path / "stepper.h").write_text(header("affine", 2, correction_width=5))
     plain, fast = (run(tmp_path, ROLLOUT, compiler, *flags) for flags in (("-O2",), FAST))
     for words in (plain, fast):
         assert words[:22] == ["0"] * 22
@@ -230,11 +244,9 @@ int main(void) {
 )
 def test_the_jacobian_is_the_derivative_of_the_equation(tmp_path, level, activation):
     # fails if a second derivative is wrong: Newton would still converge, only slower
-    made = model(2, level=level, correction_width=6, activation=activation, mass_width=3 if level == "full" else 0)
-    if isinstance(made.kinetic, PositionKinetic):  # so that it bends
-        with torch.no_grad():
-            made.kinetic.network.weights[-1].mul_(10)
-    export_c(made, tmp_path / "stepper.h", h=0.1, name="arm")
+    mass = 3 if level == "full" else 0
+    text = header(level, 2, correction_width=6, activation=activation, mass_width=mass)
+    (tmp_path / "stepper.h").write_text(text)
     worst, size = (float(x) for x in run(tmp_path, JACOBIAN, COMPILERS[0], "-O0"))
     assert worst <= 1e-8
     assert size >= 0.01  # the networks are seen beside the kinetic -m/h

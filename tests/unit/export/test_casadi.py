@@ -25,13 +25,6 @@ MODELS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 def function(model, folder, **settings):
     """The model as a function of CasADi, and the file."""
     path = export_casadi(model, folder / "arm.c", h=0.1, **settings)

@@ -15,7 +15,6 @@ import pytest
 import torch
 from export_models import randomise
 
-from herglotz.codegen import c_compiler
 from herglotz.data import Trajectories
 from herglotz.export import ExportedStepper
 from herglotz.export.c_header import c_source, described
@@ -159,15 +158,6 @@ def _traced_once(monkeypatch):
         return made.get(model.config) or made.setdefault(model.config, of(model))
 
     monkeypatch.setattr(Equations, "of", once)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quick_compiler(tmp_path_factory):
-    """An own cache, and no optimisation: a compiler run a case."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(c_compiler, "FLAGS", tuple("-O0" if flag.startswith("-O") else flag for flag in c_compiler.FLAGS))
-        yield
 
 
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")

@@ -53,8 +53,30 @@ def test_what_a_trace_leaves_out_changes_nothing(kept):
 
     graph = traced(function, (x,))
     assert torch.equal(graph(x)[0], function(x))
-    written = {str(node.target) for node in graph.code.graph.nodes if node.op == "call_function"}
+    written = {str(node.target) for node in graph.code.nodes if node.op == "call_function"}
     assert bool(written & {"aten.add.Tensor", "aten.mul.Tensor"}) == kept
+
+
+@pytest.mark.parametrize(
+    ("function", "calls"),
+    [
+        (lambda x: (x + 2) * (x + 2), 2),
+        (lambda x: (x + 2) * (x + 3), 3),  # fails if other arguments are taken for the same ones
+        (lambda x: torch.add(x, x, alpha=2) * torch.add(x, x, alpha=3), 3),  # or other options
+        (lambda x: torch.where(x > 0.5, x.sum(-1, keepdim=True), x.sum(-1)[:, None]), 5),
+        (lambda x: (x / 0.0).atan() + (x / -0.0).atan(), 5),  # fails if -0.0 is 0.0
+        (lambda x: torch.rand_like(x) - torch.rand_like(x), 3),  # fails if two draws are one
+    ],
+)
+def test_what_repeats_is_computed_once(function, calls):
+    # fails if the same operation is written down twice, or another one is taken for it
+    x = torch.rand(example_batch(set()), 1, dtype=torch.float64)
+    graph = traced(function, (x,))
+    assert sum(node.op == "call_function" for node in graph.code.nodes) == calls
+    torch.manual_seed(0)
+    wanted = function(x)
+    torch.manual_seed(0)
+    assert torch.equal(graph(x)[0], wanted)
 
 
 @pytest.mark.parametrize("boxed", [True, False])

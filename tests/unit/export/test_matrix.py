@@ -23,7 +23,7 @@ SUFFIX = {"pt2": "pt2", "onnx": "onnx", "aoti": "pt2"}
 # affine level: rollouts of every batch size, starts and derivatives.
 FILES = {
     "pt2": ("forced",),
-    "onnx": ("conservative", "forced", "order 4", "sticking"),
+    "onnx": ("forced", "order 4", "sticking"),
     "aoti": ("affine", "forced", "order 4", "sticking"),  # a compiler run of 20–60 s for each
 }
 MATRIX = [

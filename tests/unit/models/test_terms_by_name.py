@@ -122,13 +122,12 @@ def test_it_is_verified():
     [("c", torch.float64), ("c", torch.float32), ("onnx", torch.float64)]
     + [pytest.param(*x, marks=pytest.mark.slow) for x in FILES],
 )
-def test_files_step_as_eager_does(form, dtype, tmp_path, monkeypatch):
+def test_files_step_as_eager_does(form, dtype, tmp_path):
     # fails if a file leaves the potential or the force out
     if form == "c" and not any(map(shutil.which, ("cc", "gcc", "clang"))):
         pytest.skip("no C compiler in the PATH")
     model, states = spring(dtype), starts(3, dtype)
     if form == "c":
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         other = compile_c(model)
     else:
         pytest.importorskip("onnxruntime")

@@ -134,9 +134,8 @@ def test_what_would_see_a_translation_is_refused(settings, message):
 
 
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
-def test_translations_hold_in_c(tmp_path, monkeypatch):
+def test_translations_hold_in_c():
     # fails if a traced network reads features without the projection
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     made, x = model(level="linear", correction_width=5, translations=("q1 + q2",)), states(2)
     expected = Stepper(made).rollout(*x, h=0.1, steps=20)
     out = compile_c(made, h=0.1).rollout(*x, h=0.1, steps=20)

@@ -16,9 +16,9 @@ SETTINGS = FitConfig(departures=(6e-4, 2e-3), objective="trajectory")  # with ne
 
 @pytest.fixture(scope="module")
 def posteriors():
-    """Fits of five noisy data sets, with what the noise hides."""
+    """Fits of three noisy data sets, with what the noise hides."""
     found = []
-    for seed in range(5):
+    for seed in range(3):
         data = simulate(scene("damped_pendulum"), trajectories=3, steps=90, h=0.2, noise=NOISE, seed=seed)
         clean = simulate(scene("damped_pendulum"), trajectories=3, steps=90, h=0.2, seed=seed)
         run = fit(data, SETTINGS, progress=False)
@@ -67,7 +67,7 @@ def test_standard_deviation_of_the_damping_rate(posteriors):
         std = float(posterior.standard_deviations()["damping.rate"])
         assert 1e-4 < std < 0.02
         scores.append(abs(run.metrics["rate"] - 0.2) / std)
-    assert sorted(scores)[2] < 2.0
+    assert sorted(scores)[1] < 2.0
     assert max(scores) < 5.0
 
 
