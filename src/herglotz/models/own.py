@@ -126,7 +126,7 @@ class OwnLagrangian(nn.Module):
         L_d, h = self._driven(u), torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
         if isinstance(L_d, ClosedForm):
             return L_d.partials(q0, q1, s0, h, order)
-        return functional_partials(L_d, q0, q1, s0, h.expand(torch.broadcast_shapes(h.shape, s0.shape)), order)
+        return functional_partials(L_d, q0, q1, s0, h, order)
 
     def partials_increment(
         self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1, u: Tensor | None = None
