@@ -63,9 +63,8 @@ def _forces(L_d: Forced, xs: tuple[Tensor, Tensor, Tensor], h: Tensor, order: in
     if found is None or order == 1:
         return None if found is None else Forces(*found)
 
-    def both(*x: Tensor) -> tuple[Tensor, None]:
-        forces = cast(Any, L_d).forces(*x, h)
-        return torch.cat(forces, -1), None
+    def both(*x: Tensor) -> tuple[Tensor, tuple[()]]:  # torch.func takes no None beside a result
+        return torch.cat(cast(Any, L_d).forces(*x, h), -1), ()
 
     n = xs[0].shape[-1]
     F, by, _ = _rows(both, xs)
