@@ -79,6 +79,7 @@ TOP = """\
 #define hz_N {n} /* coordinates */
 #define hz_M {m} /* inputs */
 #define hz_INPUTS {inputs}
+#define hz_PUSHES {pushes} /* numbers that inputs are to a step: forces, or themselves */
 #define hz_SINGLE {single} /* float, not double */
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
 #define hz_STICKING {sticking} /* dry friction can hold a coordinate still */
@@ -296,6 +297,7 @@ def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
         n=entries["dof"],
         m=inputs,
         inputs=int(inputs > 0),
+        pushes=step.m,
         single=int(entries["dtype"] == "float32"),
         explicit=int(step.explicit),
         sticking=int(step.sticks),

@@ -146,8 +146,8 @@ class _AtVelocity:
         return End(self.p0, point.rest.L, point.rest.c)
 
     def typical_increment(self) -> Tensor:
-        """See `StepEquation`."""
-        return torch.zeros_like(self.state.s)
+        """The rounding of positions over h, in epsilons: an L_d that is no model has v of their differences."""
+        return self.state.q.abs().amax(-1) / self.h
 
 
 def _velocity(transform: Transform, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
