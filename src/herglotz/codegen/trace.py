@@ -138,8 +138,8 @@ class Recorder(TorchDispatchMode):
         fixed = self._is_fixed((args, kwargs))
         if not fixed and func in READS:
             raise InputError(
-                "a value is read while the step is traced (.item(), float(), bool(), or `if` on a tensor): a file would "
-                "hold the branch of one sample for all; write it as torch.where"
+                "a value is read while the step is traced (.item(), float(), bool(), or `if` on a tensor): a file "
+                "would hold the branch of one sample for all; write it as torch.where"
             )
         if fixed:
             result = func(*args, **kwargs)

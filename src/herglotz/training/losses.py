@@ -52,12 +52,12 @@ def herglotz_residual(
     q
         (..., K+1, n) positions, K ≥ 2, of any float dtype and device.
     h
-        () or (..., K) time steps between them: `t.diff(dim=-1)`.
+        () or (..., K) time steps between them, in the unit of time: `t.diff(dim=-1)`.
     s0
         (...) action at the first sample, in the unit of L_d; left out: 0. Where L_d depends on s by more than −γs, make
         it a parameter that is trained, too.
     u
-        (..., K, m) input of each step.
+        (..., K, m) input of each step, in its own units.
     preconditioned
         False gives R, in units of momentum, to look at.
 
@@ -129,6 +129,8 @@ def starts(
 ) -> Starts:
     """Return the starts of segments from the recorded positions, s = 0, as leaves that want gradients.
 
+    Source: section 1 of `docs/mathematics.md`: two positions and s are a state.
+
     Parameters
     ----------
     q
@@ -171,10 +173,16 @@ def shooting(
 
     Parameters
     ----------
-    L_d, q, h, u
+    L_d
         As in `herglotz_residual`.
+    q
+        (..., K+1, n) positions, K ≥ 2, in their own units.
+    h
+        () or (..., K) time steps between them, in the unit of time.
     starts
         Of `starts(q, length)`.
+    u
+        (..., K, m) input of each step, in its own units.
     length
         Steps of a segment, as there; left out: one segment.
 

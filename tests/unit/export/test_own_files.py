@@ -59,7 +59,8 @@ def loaded(kind, model, tmp_path):
     return load_onnx(tmp_path / "own.onnx")
 
 
-@pytest.mark.parametrize("kind", ["c", "pt2", "onnx"])
+# slow: 20 s; test_pt2 has the same of models, and the other files the same of modules
+@pytest.mark.parametrize("kind", ["c", pytest.param("pt2", marks=pytest.mark.slow), "onnx"])
 def test_a_file_steps_as_the_module(kind, tmp_path):
     # fails if a file has another derivative, rounds its weights, or takes the input of another step
     model = OwnLagrangian(DrivenArm(), 2, inputs=3)
