@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import Any, cast
 
 from torch import Tensor
 
 from herglotz.mechanics import Partials
 from herglotz.models.capabilities import Capabilities
 
-if TYPE_CHECKING:
-    from herglotz.models.model import ContactLagrangian
-    from herglotz.models.own import OwnLagrangian
-
 
 @dataclass(frozen=True)
 class DrivenLagrangian:
     """A discrete Lagrangian with the derivatives and forces of a model whose inputs are u."""
 
-    model: ContactLagrangian | OwnLagrangian
+    model: Any  # a `ContactLagrangian` or an `OwnLagrangian`, which make it
     u: Tensor  # (..., m)
 
     @property

@@ -50,7 +50,7 @@ def herglotz_residual(
     L_d
         A module or function L_d(q0, q1, s0, h) → (...); with inputs one that has `at(u)`.
     q
-        (..., K+1, n) positions, K ≥ 2, of any float dtype and device.
+        (..., K+1, n) positions, in their own units, K ≥ 2, of any float dtype and device.
     h
         () or (..., K) time steps between them, in the unit of time: `t.diff(dim=-1)`.
     s0

@@ -55,8 +55,8 @@ def inputs_constants(model: ContactLagrangian, dtype: str) -> str:
     given = (torch.eye(m), torch.zeros(m)) if friction is None else (friction.input_map, friction.offset())
     map_, offset = (numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype) for x in given)
     lines = ["/* Inputs u act as input_map u + input_offset. */"]
-    lines.append(f"static const hz_real hz_input_map[hz_PUSHES * hz_M] = {{{map_}}};")
-    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_PUSHES] = {{{offset}}};\n"])
+    lines.append(f"static const hz_real hz_input_map[hz_INPUTS * hz_M] = {{{map_}}};")
+    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_INPUTS] = {{{offset}}};\n"])
 
 
 def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables: dict[tuple[float, ...], str]) -> str:
@@ -88,7 +88,7 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
 
 INPUTS_AT = """
 /* The forces of inputs u are map u + offset. */
-static inline void FN_inputs_at(const REAL theta[hz_P], REAL map[hz_PUSHES * hz_M], REAL offset[hz_PUSHES])"""
+static inline void FN_inputs_at(const REAL theta[hz_P], REAL map[hz_INPUTS * hz_M], REAL offset[hz_INPUTS])"""
 PUSH_SLOPES = """
 /* Their derivatives by theta, row by row. */
-static inline void FN_push_slopes(const REAL *u, const REAL theta[hz_P], REAL slopes[hz_PUSHES * hz_P])"""
+static inline void FN_push_slopes(const REAL *u, const REAL theta[hz_P], REAL slopes[hz_INPUTS * hz_P])"""
