@@ -1,5 +1,7 @@
 """An L_d of one's own with inputs: its parameters and those of its inputs are found, by batches and in float32 too."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import nn
@@ -86,7 +88,7 @@ def recorded(motor, trajectories=2, steps=40, dtype=torch.float64):
     return hz.Trajectories.of(t, out.q.flatten(0, 1), lengths, u=u.flatten(0, 1)).to(dtype=dtype)
 
 
-TRUE = {"k": 1.7, "gamma": 0.2, "b": 0.6}
+TRUE: Any = {"k": 1.7, "gamma": 0.2, "b": 0.6}
 
 
 @pytest.mark.parametrize("kind", [Motor, ClosedMotor])
@@ -138,7 +140,7 @@ def test_batches_are_taken(monkeypatch):  # fails if `batch` is accepted and all
     sizes, whole = [], ResidualProblem.cost_and_gradient
     monkeypatch.setattr(
         ResidualProblem, "cost_and_gradient",
-        lambda problem, x, rows=None: sizes.append(len(rows)) or whole(problem, x, rows),
+        lambda problem, x, rows: sizes.append(len(rows)) or whole(problem, x, rows),
     )  # fmt: skip
     net, data = Motor(), recorded(Motor(**TRUE))
     settings = {"optimiser": "adam", "batch": 16, "iterations": 4, "learning_rate": 0.1}
