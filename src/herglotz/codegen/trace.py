@@ -31,6 +31,7 @@ INSTEAD: dict[Any, Any] = {
     aten.zero_.default: aten.zeros_like.default,
     aten.sgn.default: aten.sign.default,
 }
+READS = (aten._local_scalar_dense.default, aten.equal.default)  # a number of Python, of which no graph knows
 SHAPE_ONLY = ("squeeze_", "unsqueeze_", "transpose_", "t_", "as_strided_")  # these write no number
 
 
@@ -138,7 +139,13 @@ class Recorder(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run one operation, and write it down."""
         kwargs = kwargs or {}
-        if self._is_fixed((*args, *kwargs.values())):
+        fixed = self._is_fixed((*args, *kwargs.values()))
+        if not fixed and func in READS:
+            raise InputError(
+                "a value is read while the step is traced (.item(), float(), bool(), or `if` on a tensor): a file "
+                "would hold the branch of one sample for all; write it as torch.where"
+            )
+        if fixed:
             result = func(*args, **kwargs)
             self.alive += [args, result]
             return result

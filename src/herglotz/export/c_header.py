@@ -78,7 +78,7 @@ TOP = """\
 /* What the model is made of, for the preprocessor. */
 #define hz_N {n} /* coordinates */
 #define hz_M {m} /* inputs */
-#define hz_INPUTS {inputs}
+#define hz_INPUTS {inputs} /* numbers that they are to a step: forces, or themselves */
 #define hz_SINGLE {single} /* float, not double */
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
 #define hz_STICKING {sticking} /* dry friction can hold a coordinate still */
@@ -295,7 +295,7 @@ def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
         guard=f"0x{hashlib.sha256(json.dumps(entries).encode()).hexdigest()[:8]}u",
         n=entries["dof"],
         m=inputs,
-        inputs=int(inputs > 0),
+        inputs=step.m,
         single=int(entries["dtype"] == "float32"),
         explicit=int(step.explicit),
         sticking=int(step.sticks),

@@ -25,8 +25,8 @@ def functional_partials(
     Samples do not interact, so that one product with the Jacobian of the batch is the batch of gradients; second
     derivatives are 2n + 1 products with the Jacobian of these. L_d must be a pure function of tensors.
     """
-    q0, q1, s0, _ = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
-    xs = (q0, q1, s0[..., 0])
+    q0, q1, s, steps = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
+    xs, h = (q0, q1, s[..., 0]), steps[..., 0]
 
     def first(*x: Tensor) -> tuple[Tensor, Tensor]:
         L, pull = cast(Any, vjp(lambda *x: checked(L_d, cast(Any, L_d)(*x, h), x[2]), *x))
@@ -63,9 +63,8 @@ def _forces(L_d: Forced, xs: tuple[Tensor, Tensor, Tensor], h: Tensor, order: in
     if found is None or order == 1:
         return None if found is None else Forces(*found)
 
-    def both(*x: Tensor) -> tuple[Tensor, None]:
-        forces = cast(Any, L_d).forces(*x, h)
-        return torch.cat(forces, -1), None
+    def both(*x: Tensor) -> tuple[Tensor, tuple[()]]:  # torch.func takes no None beside a result
+        return torch.cat(cast(Any, L_d).forces(*x, h), -1), ()
 
     n = xs[0].shape[-1]
     F, by, _ = _rows(both, xs)

@@ -166,10 +166,10 @@ def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor
     """L_d(q0, q1, s0, h), shape (...), with the checks of `partials` and no derivatives."""
     check_arguments(q0, q1, s0)
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
-    shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape)
-    L = checked(L_d, called(L_d, q0, q1, s0, h), torch.empty(shape, device="meta"))
+    a, b, s, _ = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
+    L = checked(L_d, called(L_d, q0, q1, s0, h), s[..., 0])
     if h.ndim:
-        _check_alone(L_d, L, q0.expand(*shape, -1), q1.expand(*shape, -1), s0.expand(shape), h)
+        _check_alone(L_d, L, a, b, s[..., 0], h)
     return L
 
 

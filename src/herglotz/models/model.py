@@ -15,6 +15,7 @@ from herglotz.models.blocks import action_partials, affine_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
 from herglotz.models.drag import Drag, parse_drag
+from herglotz.models.driven import DrivenLagrangian
 from herglotz.models.feature_kinetic import kinetic_term
 from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.friction import CoupledFriction, Friction
@@ -315,36 +316,3 @@ def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping |
         return None
     linear = config.level in ("linear", "forced")
     return LinearDamping(config.rate) if linear else AffineDamping(config, generator)
-
-
-@dataclass(frozen=True)
-class DrivenLagrangian:
-    """A model with its inputs at one step's value: a discrete Lagrangian with closed-form derivatives and forces."""
-
-    model: ContactLagrangian
-    u: Tensor  # (..., m)
-
-    @property
-    def capabilities(self) -> Capabilities:
-        """The model's."""
-        return self.model.capabilities
-
-    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        """L_d, shape (...)."""
-        return self.partials(q0, q1, s0, h).L
-
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1) -> Partials:
-        """See `herglotz.mechanics.partials`."""
-        return self.model.partials(q0, q1, s0, h, order, self.u)
-
-    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """`partials` at (q0, q0 + Δ, s0)."""
-        return self.model.partials_increment(q0, delta, s0, h, order, self.u)
-
-    def typical_increment(self, h: Tensor) -> Tensor:
-        """See `ContactLagrangian.typical_increment`."""
-        return self.model.typical_increment(h)
-
-    def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
-        """F⁻ and F⁺, each (..., n)."""
-        return self.model.forces(q0, q1, s0, h, self.u)

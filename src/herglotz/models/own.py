@@ -14,6 +14,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import ClosedForm, DiscreteLagrangian, Driven, Forced, Partials
 from herglotz.mechanics.functional import functional_partials
 from herglotz.models.capabilities import Capabilities
+from herglotz.models.driven import DrivenLagrangian
 
 # Nothing is known of its terms: every step iterates, and s may enter the motion.
 UNKNOWN = Capabilities(
@@ -90,9 +91,11 @@ class OwnLagrangian(nn.Module):
         check_own(L_d, inputs)
         self.L_d = L_d
         name = getattr(L_d, "__name__", type(L_d).__name__)
-        level = "forced" if isinstance(L_d, Forced) else "full"
+        forced = isinstance(L_d, Forced) or (inputs and isinstance(cast(Driven, L_d).at(torch.zeros(inputs)), Forced))
         one, none = (1.0,) * dof, (False,) * dof
-        self.config = OwnConfig(name, angles or none, scale or one, speed or one, inputs, level)
+        self.config = OwnConfig(
+            name, angles or none, scale or one, speed or one, inputs, "forced" if forced else "full"
+        )
         if next(self.parameters(), None) is None:  # a function has a dtype, too
             self.register_parameter("nothing", nn.Parameter(torch.empty(0, dtype=torch.float64), requires_grad=False))
 
@@ -106,10 +109,10 @@ class OwnLagrangian(nn.Module):
         """Number of inputs m."""
         return self.config.inputs
 
-    def at(self, u: Tensor) -> DrivenOwn:
+    def at(self, u: Tensor) -> DrivenLagrangian:
         """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
         check_own(self.L_d, 1)
-        return DrivenOwn(self, u)
+        return DrivenLagrangian(self, u)
 
     def forward(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0, u: Tensor | None = None
@@ -126,7 +129,7 @@ class OwnLagrangian(nn.Module):
         L_d, h = self._driven(u), torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
         if isinstance(L_d, ClosedForm):
             return L_d.partials(q0, q1, s0, h, order)
-        return functional_partials(L_d, q0, q1, s0, h.expand(torch.broadcast_shapes(h.shape, s0.shape)), order)
+        return functional_partials(L_d, q0, q1, s0, h, order)
 
     def partials_increment(
         self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1, u: Tensor | None = None
@@ -134,37 +137,19 @@ class OwnLagrangian(nn.Module):
         """`partials` at (q0, q0 + Δ, s0); L_d subtracts what is added here, and a short step in float32 rounds."""
         return self.partials(q0, q0 + delta, s0, h, order, u)
 
+    def forces(
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, u: Tensor | None = None
+    ) -> tuple[Tensor, Tensor] | None:
+        """F⁻ and F⁺, each (..., n), in units of momentum; None where L_d has none."""
+        L_d = self._driven(u)
+        return L_d.forces(q0, q1, s0, h) if isinstance(L_d, Forced) else None
+
     def typical_increment(self, h: Tensor) -> Tensor:
         """The size of q1 − q0 at the typical speed, shaped like h."""
         return h * max(self.config.speed)
 
     def _driven(self, u: Tensor | None) -> DiscreteLagrangian:
         return self.L_d if u is None else cast(Driven, self.L_d).at(u)
-
-
-@dataclass(frozen=True)
-class DrivenOwn:
-    """An L_d of one's own with its inputs at one step's value."""
-
-    model: OwnLagrangian
-    u: Tensor  # (..., m)
-    capabilities = UNKNOWN
-
-    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        """L_d, shape (...)."""
-        return cast(Tensor, self.model(q0, q1, s0, h, 0, self.u))
-
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """See `herglotz.mechanics.partials`."""
-        return self.model.partials(q0, q1, s0, h, order, self.u)
-
-    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """See `OwnLagrangian.partials_increment`."""
-        return self.model.partials_increment(q0, delta, s0, h, order, self.u)
-
-    def typical_increment(self, h: Tensor) -> Tensor:
-        """See `OwnLagrangian.typical_increment`."""
-        return self.model.typical_increment(h)
 
 
 def check_own(L_d: Any, inputs: int) -> None:

@@ -28,7 +28,7 @@ from herglotz.mechanics import DiscreteLagrangian, Forces, Partials, momentum_ja
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus
 from herglotz.mechanics.newton import Point, attached
 from herglotz.models import ContactLagrangian
-from herglotz.models.model import DrivenLagrangian
+from herglotz.models.driven import DrivenLagrangian
 from herglotz.stepping.newton import find_root, status_of
 from herglotz.stepping.partials_equation import End
 from herglotz.stepping.state import State, Status
@@ -146,8 +146,8 @@ class _AtVelocity:
         return End(self.p0, point.rest.L, point.rest.c)
 
     def typical_increment(self) -> Tensor:
-        """See `StepEquation`."""
-        return torch.zeros_like(self.state.s)
+        """The rounding of positions over h, in epsilons: an L_d that is no model has v of their differences."""
+        return self.state.q.abs().amax(-1) / self.h
 
 
 def _velocity(transform: Transform, state: State, h: Tensor) -> tuple[Tensor, Tensor]:

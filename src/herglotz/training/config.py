@@ -51,7 +51,7 @@ class FitConfig:
     seed
         Of the initial weights.
     dtype, device
-        Of the whole fit and of the model it returns.
+        Of the whole fit and of the model it returns. An L_d of your own is fitted there, and its run is on the CPU.
     iterations
         Bound on the iterations of the residual objectives (Adam takes 20 times as many); each stage of trajectory
         fitting takes 40 at the most.

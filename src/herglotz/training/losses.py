@@ -21,9 +21,12 @@ from herglotz.mechanics import (
     partials,
 )
 from herglotz.mechanics.partials import value
-from herglotz.stepping import Rollout, State, Stepper, solve
+from herglotz.stepping import Stepper, solve, state_of
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import check_h
+from herglotz.training.solvers.lifted_newton import attached, solve_path
+
+TOL = 1e3  # machine epsilons of a state: what sweeps over all steps at once leave of rounding
 
 
 def herglotz_residual(
@@ -47,14 +50,14 @@ def herglotz_residual(
     L_d
         A module or function L_d(q0, q1, s0, h) → (...); with inputs one that has `at(u)`.
     q
-        (..., K+1, n) positions, K ≥ 2, of any float dtype and device.
+        (..., K+1, n) positions, in their own units, K ≥ 2, of any float dtype and device.
     h
-        () or (..., K) time steps between them: `t.diff(dim=-1)`.
+        () or (..., K) time steps between them, in the unit of time: `t.diff(dim=-1)`.
     s0
         (...) action at the first sample, in the unit of L_d; left out: 0. Where L_d depends on s by more than −γs, make
         it a parameter that is trained, too.
     u
-        (..., K, m) input of each step.
+        (..., K, m) input of each step, in its own units.
     preconditioned
         False gives R, in units of momentum, to look at.
 
@@ -126,6 +129,8 @@ def starts(
 ) -> Starts:
     """Return the starts of segments from the recorded positions, s = 0, as leaves that want gradients.
 
+    Source: section 1 of `docs/mathematics.md`: two positions and s are a state.
+
     Parameters
     ----------
     q
@@ -163,14 +168,21 @@ def shooting(
 
     Each segment starts from two positions and an action of its own, (q1, p1, s1) = FL⁺(q0, q1, s), and steps by
     D1 L_d + c p = 0. Train L_d and the starts together on `.loss`, segments short at first; one segment is the whole
-    trajectory, without joints. Gradients come by the implicit-function theorem.
+    trajectory, without joints. All steps of all segments are solved at once, by Newton's method from the recorded
+    positions; gradients come by the implicit-function theorem, once.
 
     Parameters
     ----------
-    L_d, q, h, u
+    L_d
         As in `herglotz_residual`.
+    q
+        (..., K+1, n) positions, K ≥ 2, in their own units.
+    h
+        () or (..., K) time steps between them, in the unit of time.
     starts
         Of `starts(q, length)`.
+    u
+        (..., K, m) input of each step, in its own units.
     length
         Steps of a segment, as there; left out: one segment.
 
@@ -194,33 +206,46 @@ def shooting(
     fitting = max((K - 1) // length, 1) == S and tuple(batch) == tuple(q.shape[:-2]) and n == q.shape[-1]
     refuse({f"starts of shape {tuple(starts.q0.shape)} are no segments of {length} steps of q {tuple(q.shape)}; "
             "make them by starts(q, length), with the same length": not fitting})  # fmt: skip
-    stepper = Stepper(L_d, throw=True)
-    in_first = slice(0, (S - 1) * length + 1, length)
-    start = stepper.init(*starts, h=h[..., in_first], u=None if u is None else u[..., in_first, :])
-    rows = h[..., 1 : S * length + 1].unflatten(-1, (S, length))
-    given = None if u is None else u[..., 1 : S * length + 1, :].unflatten(-2, (S, length))
-    run = stepper.rollout(*start, h=rows, inputs=given)
-    tail = K - 1 - S * length
-    parts = [
-        torch.cat([starts.q0[..., None, :], run.q[..., : length - 1, :]], -2).flatten(-3, -2),
-        run.q[..., -1, -2:, :],
-    ]
-    if tail:
-        last = State(run.q[..., -1, -1, :], run.p[..., -1, -1, :], run.s[..., -1, -1])
+    in_first, whole = slice(0, (S - 1) * length + 1, length), slice(1, S * length + 1)
+    start = Stepper(L_d).init(*starts, h=h[..., in_first], u=None if u is None else u[..., in_first, :])
+    cut = lambda x, axis: x.unflatten(axis, (S, length))  # noqa: E731  into segments
+    near = q[..., 1 : S * length + 2, :].unfold(-2, length + 1, length).mT
+    x = _motions(L_d, start.joined, cut(h[..., whole], -1), None if u is None else cut(u[..., whole, :], -2), near)
+    parts = [torch.cat([starts.q0[..., None, :], x[..., : length - 1, :n]], -2).flatten(-3, -2), x[..., -1, -2:, :n]]
+    if tail := K - 1 - S * length:
         rest = None if u is None else u[..., -tail:, :]
-        parts.append(stepper.rollout(*last, h=h[..., -tail:], inputs=rest).q[..., 1:, :])
-    return Shooting(torch.cat(parts, -2) - q, _joints(run, starts))
+        parts.append(_motions(L_d, x[..., -1, -1, :], h[..., -tail:], rest, q[..., -tail - 1 :, :])[..., 1:, :n])
+    return Shooting(torch.cat(parts, -2) - q, _joints(x, starts))
 
 
-def _joints(run: Rollout, starts: Starts) -> Tensor:
-    """End of each segment less the start of the next; s by the spread of q over its own change along segments."""
-    q = run.q[..., :-1, :, :]
-    positions = [q[..., -2, :] - starts.q0[..., 1:, :], q[..., -1, :] - starts.q1[..., 1:, :]]
-    s = run.s[..., :-1, -2] - starts.s[..., 1:]
+def _motions(L_d: DiscreteLagrangian, start: Tensor, h: Tensor, u: Tensor | None, near: Tensor) -> Tensor:
+    """The states (..., K+1, 2n+1) of motions from `start` (..., 2n+1), with their derivatives.
+
+    All steps at once, from the positions `near` (..., K+1, n); one after the other where that does not converge.
+    """
+    K, d = h.shape[-1], start.shape[-1]
+    first, steps = start.reshape(-1, d), h.reshape(-1, K)
+    L = driven_by(L_d, None if u is None else u.reshape(-1, K, u.shape[-1]))
     with torch.no_grad():
-        spread, change = (x.square().mean().sqrt() for x in (run.q - run.q.mean(-2, True), run.s - run.s[..., :1]))
+        q = near.reshape(-1, K + 1, near.shape[-1])
+        P = partials(L, q[:, :-1], q[:, 1:], first[:, -1:].expand(steps.shape), steps)
+        along = torch.cat([q[:, 1:], momentum_plus(P), (first[:, -1:] + P.L.cumsum(-1))[..., None]], -1)
+        guess = torch.cat([first[:, None], along], 1)
+        path = solve_path(L, first.detach(), steps, guess, TOL * torch.finfo(q.dtype).eps)
+    if path is None:
+        return Stepper(L_d, throw=True).rollout(*state_of(start), h=h, inputs=u).states.joined
+    return attached(L, path, first, steps).reshape(*h.shape[:-1], K + 1, d)
+
+
+def _joints(x: Tensor, starts: Starts) -> Tensor:
+    """End of each segment less the start of the next; s by the spread of q over its own change along segments."""
+    q, s = x[..., : starts.q0.shape[-1]], x[..., -1]
+    ends = q[..., :-1, :, :]
+    positions = [ends[..., -2, :] - starts.q0[..., 1:, :], ends[..., -1, :] - starts.q1[..., 1:, :]]
+    with torch.no_grad():
+        spread, change = (x.square().mean().sqrt() for x in (q - q.mean(-2, True), s - s[..., :1]))
         by = torch.where(change > 0, spread / change, 0.0)
-    return torch.cat([*positions, (s * by)[..., None]], -1)
+    return torch.cat([*positions, ((s[..., :-1, -2] - starts.s[..., 1:]) * by)[..., None]], -1)
 
 
 def _checked(

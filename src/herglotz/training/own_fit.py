@@ -26,7 +26,7 @@ from herglotz.training.problems.grid import step_inputs
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.run import Run
 from herglotz.training.stages import Stages
-from herglotz.training.task import NOISY
+from herglotz.training.task import NOISY, Task
 from herglotz.training.trajectory_fit import fit_states, fit_trajectories
 
 # Settings that say how to fit; all others say what the model is made of, or look for terms.
@@ -39,43 +39,47 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
     """Train the parameters of L_d, in place, and return the run; see `fit`.
 
     One-step errors J⁻¹R come first. They are the whole fit where they are no larger than those of exact data
-    (`NOISY`), or `config.objective` says so; else multiple shooting goes on from there.
+    (`NOISY`), or `config.objective` says so; else multiple shooting goes on from there. That is done on
+    `config.device`; the data are looked at and the run is judged on the CPU, where it stays.
     """
-    own, seen = _prepared(data, L_d, config)
-    model: Any = own  # it stands in for a `ContactLagrangian`
+    model, seen = _prepared(data, L_d, config)
     task = seen.task(stages)
     with stages.bar:
         _try_derivatives(model, task.data)
-        problem = ResidualProblem(model, task.data, max_step=task.base.max_step, sigma=task.exact)
-        refuse({
-            "batch: the motion of this L_d depends on s, which is carried along whole trajectories; leave batch out, "
-            "or train in a loop of your own (herglotz.losses)": config.batch and problem.carries_s,
-        })  # fmt: skip
-        # A rule of its own leaves errors far above rounding, whose last digits would take hundreds of iterations.
-        result, rms = fit_one_step(replace(task, hurried=True), problem, "one-step error", config.iterations)
-        notes = {"iterations": result.iterations, "reason": result.reason}
-        sigma = max(rms / NOISE_OF_R, task.exact)
-        one_step = config.objective == "residual" or (config.objective == "auto" and sigma <= NOISY * task.size)
-        chosen = cast("Any", None if one_step else fit_trajectories(task, model, sigma))
-        found = cast("Any", fit_states(task, model, sigma) if chosen is None else chosen.fit)
-        notes["follows_data"] = found is not None and (one_step or chosen is not None)
-        if chosen is not None:
-            chosen.fit.problem.parameters.set(chosen.fit.theta)
-            notes |= {
-                "robust": chosen.fit.problem.freedom is not None,
-                "segment_steps": chosen.fit.problem.grid.longest,
-            }
-        states = states_of_pairs(model, task.data) if found is None else found.states()
-        used = None if chosen is None else chosen.fit.problem.used
-        objective = "residual" if one_step else "trajectory"
-        fitted = Fitted(model, states, objective, sigma, notes, used)
-        run = evaluate(task, seen, None, fitted, replace(config, objective=objective))
+        fitted = _fitted(replace(task, data=task.data.to(device=config.device)), model.to(device=config.device))
+        run = evaluate(task, seen, None, fitted, replace(config, objective=fitted.objective))
     run.metrics.update(level=model.config.level, own=model.config.name)
     return run
 
 
+def _fitted(task: Task, model: Any) -> Fitted:  # it stands in for a `ContactLagrangian`
+    """The model as it was found, and the states at the samples, on the CPU."""
+    config = task.config
+    problem = ResidualProblem(model, task.data, max_step=task.base.max_step, sigma=task.exact)
+    refuse({
+        "batch: the motion of this L_d depends on s, which is carried along whole trajectories; leave batch out, "
+        "or train in a loop of your own (herglotz.losses)": config.batch and problem.carries_s,
+    })  # fmt: skip
+    # A rule of its own leaves errors far above rounding, whose last digits would take hundreds of iterations.
+    result, rms = fit_one_step(replace(task, hurried=True), problem, "one-step error", config.iterations)
+    notes = {"iterations": result.iterations, "reason": result.reason}
+    sigma = max(rms / NOISE_OF_R, task.exact)
+    one_step = config.objective == "residual" or (config.objective == "auto" and sigma <= NOISY * task.size)
+    chosen = cast("Any", None if one_step else fit_trajectories(task, model, sigma))
+    found = cast("Any", fit_states(task, model, sigma) if chosen is None else chosen.fit)
+    notes["follows_data"] = found is not None and (one_step or chosen is not None)
+    used = None
+    if chosen is not None:
+        problem = chosen.fit.problem
+        problem.parameters.set(chosen.fit.theta)
+        notes |= {"robust": problem.freedom is not None, "segment_steps": problem.grid.longest}
+        used = problem.used.cpu()
+    states = (states_of_pairs(model, task.data) if found is None else found.states()).cpu()
+    return Fitted(model.cpu(), states, "residual" if one_step else "trajectory", sigma, notes, used)
+
+
 def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagrangian, Look]:
-    """The module as a model on the fit's device, and what is known of the data."""
+    """The module as a model, and what is known of the data, on the CPU."""
     default = FitConfig()
     other = [f.name for f in fields(config) if getattr(config, f.name) != getattr(default, f.name)]
     wrong = ", ".join(name for name in other if name not in TAKEN)
@@ -85,12 +89,12 @@ def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagra
             config.objective not in OBJECTIVES,
     })  # fmt: skip
     data = data if config.use_inputs else replace(data, u=None)
-    data = data.unwrapped().to(dtype=config.torch_dtype, device=config.device)
+    data = data.unwrapped().to(dtype=config.torch_dtype, device="cpu")
     train, unseen = split(data, config)
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
     kept = train.keep(~dropped)
     base = estimate_baseline(kept, substeps=config.substeps)
-    model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device=config.device)
+    model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device="cpu")
     model.s_enters_motion = s_enters_motion(model, kept)
     seen = Look(
         data, train, unseen, kept, dropped, False, data.arrival, {}, (), why_zeros="", friction="",

@@ -131,6 +131,29 @@ def test_full_level_finds_damping_that_depends_on_s(seed):
     assert errors["full"] < 0.3 * min(errors["linear"], errors["affine"]), errors
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_damping_that_affine_networks_learned_is_the_true_one(seed):
+    # fails if ∂g/∂q is missing from the fit, or g stands in for V: of a rate between 0.4 and 0.5 over the data 5e-4 is
+    # missed at most. V is not compared: s + b(q) in the place of s has the same motion and c, and another V.
+
+    def field(q, p, s):
+        rate = (0.3 + 0.2 * torch.cos(q))[..., 0]
+        V, slope = (1 - torch.cos(q) + q * q / 4)[..., 0], torch.sin(q) + q / 2
+        force = -slope + 0.2 * torch.sin(q) * s[..., None] - rate[..., None] * p
+        return p, force, (p * p / 2)[..., 0] - V - rate * s
+
+    q, p, s = starts(12, 1)
+    data = recorded(field, q, p, 2 * s, 0.1, 20)
+    widths = {"potential_width": 6, "correction_width": 4, "damping_width": 6}
+    model, _ = one_step_fit(data, iterations=60, level="affine", s0=2 * s, seed=seed, **widths)
+    low, high = (float(data.q.quantile(x)) for x in (0.02, 0.98))
+    x, h = torch.linspace(low, high, 41).double()[:, None], torch.full((41,), 1e-3).double()
+    with torch.no_grad():
+        rate = -model.partials(x, x, torch.zeros_like(h), h).c.log() / h
+    assert float((rate - (0.3 + 0.2 * torch.cos(x[:, 0]))).abs().max()) < 2e-3
+
+
 def test_a_mass_that_depends_on_position_is_found():
     # fails if m(q̄) is not differentiated, or cannot leave the constant: a bead on a wire, m = 1 + sin²q / 2
     def field(q, p, s):

@@ -46,7 +46,7 @@ def motion(L_d, steps=40, n=1, inputs=None):
 
 
 def least(loss, parameter):
-    """The derivative of a loss by one number, by differences."""
+    """The derivative of a loss by one number, or by all of a tensor together, by differences."""
     ends = []
     for change in (1e-5, -1e-5):
         with torch.no_grad():
@@ -101,15 +101,15 @@ def test_gradients_of_the_losses_are_those_of_differences(bend):  # fails if J, 
     noisy = out.q + 0.01 * torch.randn(out.q.shape, generator=torch.Generator().manual_seed(0)).double()
     starts = hz.losses.starts(noisy, 11)
     losses = [
-        lambda: hz.losses.herglotz_residual(L_d, noisy, H).square().mean(),
-        lambda: hz.losses.shooting(L_d, noisy, H, starts, length=11).misfit.square().sum(),
+        (lambda: hz.losses.herglotz_residual(L_d, noisy, H).square().mean(), ()),
+        (lambda: hz.losses.shooting(L_d, noisy, H, starts, length=11).misfit.square().sum(), starts),
     ]
-    for loss in losses:
+    for loss, further in losses:
         L_d.zero_grad()
         loss().backward()
-        for parameter in L_d.parameters():
-            assert parameter.grad is not None
-            assert float(parameter.grad) == pytest.approx(least(loss, parameter), rel=1e-5)
+        for x in (*L_d.parameters(), *further):
+            assert x.grad is not None
+            assert float(x.grad.sum()) == pytest.approx(least(loss, x), rel=1e-5, abs=1e-8)
 
 
 @pytest.mark.parametrize("length", [1, 7, 13, 100])

@@ -162,7 +162,7 @@ def model_source(
     outputs = {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())}
     by = "const REAL theta[hz_P], " if K else ""
     head = f"\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], {by}FN_potential_t *V)"
-    push = "  REAL push[hz_N]; /* G (u - u0) */\n" if step.m else ""
+    push = "  REAL push[hz_INPUTS];\n" if step.m else ""
     push += "  REAL theta[hz_P];\n" if K else ""
     push += "  REAL bound[hz_N]; /* up to which dry friction holds the move */\n" if step.sticks else ""
     texts = TYPES.format(push=push, problem=step.members("P"),

@@ -14,7 +14,7 @@ from herglotz.codegen.program import Program
 from herglotz.codegen.trace import traced
 from herglotz.export.c_numbers import numbers, text_constant
 from herglotz.export.equation import Equations, dense, example
-from herglotz.models import ContactLagrangian
+from herglotz.models import ContactLagrangian, refuse_own
 from herglotz.stepping.linearise import forward_slopes
 
 MARKED = re.compile(r"#if hz_P\b[^\n]*\n(?:.*?)(?:#else\n(.*?))?#endif /\* hz_P \*/\n", re.DOTALL)
@@ -48,16 +48,15 @@ def identifier(name: str) -> str:
 
 
 def inputs_constants(model: ContactLagrangian, dtype: str) -> str:
-    """The matrix G of the inputs and −G u₀, where the model takes some."""
-    if not model.config.inputs or model.friction is None:
+    """The matrix G of the inputs and −G u₀, where the model takes some; 1 and 0 of an L_d that takes u itself."""
+    if not (m := model.config.inputs):
         return ""
-    map_, offset = (
-        numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype)
-        for x in (model.friction.input_map, model.friction.offset())
-    )
-    lines = ["/* The forces of inputs u are input_map u + input_offset. */"]
-    lines.append(f"static const hz_real hz_input_map[hz_N * hz_M] = {{{map_}}};")
-    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_N] = {{{offset}}};\n"])
+    friction = model.friction
+    given = (torch.eye(m), torch.zeros(m)) if friction is None else (friction.input_map, friction.offset())
+    map_, offset = (numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype) for x in given)
+    lines = ["/* Inputs u act as input_map u + input_offset. */"]
+    lines.append(f"static const hz_real hz_input_map[hz_INPUTS * hz_M] = {{{map_}}};")
+    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_INPUTS] = {{{offset}}};\n"])
 
 
 def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables: dict[tuple[float, ...], str]) -> str:
@@ -65,6 +64,7 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
     if not model.inputs:
         return ""
     equations, program = Equations.of(model, values), Program(tables=tables)
+    refuse_own(model, "a header whose numbers are set at run time, with inputs,", "leave parameters out")
     friction = equations.model.friction
     assert friction is not None  # a model with inputs is a forced one
 
@@ -88,7 +88,7 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
 
 INPUTS_AT = """
 /* The forces of inputs u are map u + offset. */
-static inline void FN_inputs_at(const REAL theta[hz_P], REAL map[hz_N * hz_M], REAL offset[hz_N])"""
+static inline void FN_inputs_at(const REAL theta[hz_P], REAL map[hz_INPUTS * hz_M], REAL offset[hz_INPUTS])"""
 PUSH_SLOPES = """
 /* Their derivatives by theta, row by row. */
-static inline void FN_push_slopes(const REAL *u, const REAL theta[hz_P], REAL slopes[hz_N * hz_P])"""
+static inline void FN_push_slopes(const REAL *u, const REAL theta[hz_P], REAL slopes[hz_INPUTS * hz_P])"""

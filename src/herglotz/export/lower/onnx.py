@@ -47,7 +47,7 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     further = {"init": (("q0", "q1", "s0", "h"), ("p", "s")), "linearise": (("q", "p", "s", "h"), (*said, "jacobian"))}
     properties = {KEY: text}
     further = {name: ((*inputs, *u), outputs) for name, (inputs, outputs) in further.items()}
-    legendre = ("L_v", "L_vv", "grip", "grip_by_v") if entries["model"]["sticking"] else ("L_v", "L_vv")
+    legendre = ("L_v", "L_vv", "grip", "grip_by_v") if entries["model"].get("sticking") else ("L_v", "L_vv")
     further["legendre"] = ("q", "v", "s", "h"), legendre
     for name, (inputs, outputs) in further.items():
         second = graph_of(programs[name], inputs, outputs, {})

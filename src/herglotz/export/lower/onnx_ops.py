@@ -141,6 +141,13 @@ def write_unsqueezed(w: Writer, node: Any) -> str:
     return w.emit("Unsqueeze", w.name(node.args[0]), w.integers(axis_of(node.args[1], node)))
 
 
+def write_squeezed(w: Writer, node: Any) -> str:
+    """Without an axis of one entry; an axis of more, or the batch, stays."""
+    x, axis = node.args
+    one = described(x).shape[axis] == 1
+    return w.emit("Squeeze", w.name(x), w.integers(axis_of(axis, x))) if one else w.name(x)
+
+
 def write_size(w: Writer, node: Any) -> str:
     """The size of an axis."""
     x, axis = node.args

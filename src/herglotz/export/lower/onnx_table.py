@@ -128,6 +128,7 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.select.int: ops.write_select,
     operator.getitem: ops.write_item,
     aten.unsqueeze.default: ops.write_unsqueezed,
+    aten.squeeze.dim: ops.write_squeezed,
     aten.index_select.default: ops.write_select,
     aten.index.Tensor: ops.write_index,
     aten.cat.default: ops.write_cat,

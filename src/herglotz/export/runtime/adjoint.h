@@ -14,11 +14,11 @@
 static inline int hz_step_vjp(const hz_state *before, const hz_state *after, hz_real h,
     hz_TAKES_U hz_TAKES_THETA const hz_real *of, hz_real *by_state,
     hz_WITH_U(hz_real *by_input) hz_WITH_THETA(hz_real *by_theta) hz_real *by_h) {
-  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS * hz_N + hz_P };
+  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS + hz_P };
   hz_problem P;
   hz_real pulled[WIDTH], move[hz_N];
 #if hz_P && hz_INPUTS
-  hz_real hz_input_map[hz_N * hz_M], hz_input_offset[hz_N], push_by_theta[hz_N * hz_P];
+  hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS], push_by_theta[hz_INPUTS * hz_P];
 #endif /* hz_P */
   int i, j;
   if (hz_before(before, h)) return hz_before(before, h);
@@ -50,7 +50,7 @@ static inline int hz_step_vjp(const hz_state *before, const hz_state *after, hz_
 #if hz_INPUTS
   for (j = 0; by_input && j < hz_M; j++) {
     by_input[j] = hz_R(0.0);
-    for (i = 0; u && i < hz_N; i++) by_input[j] += pulled[SIZE + 1 + i] * hz_input_map[i * hz_M + j];
+    for (i = 0; u && i < hz_INPUTS; i++) by_input[j] += pulled[SIZE + 1 + i] * hz_input_map[i * hz_M + j];
   }
 #else
   (void)j;
@@ -59,7 +59,7 @@ static inline int hz_step_vjp(const hz_state *before, const hz_state *after, hz_
   for (j = 0; by_theta && j < hz_P; j++) by_theta[j] = pulled[WIDTH - hz_P + j];
 #if hz_INPUTS
   for (j = 0; by_theta && u && j < hz_P; j++)
-    for (i = 0; i < hz_N; i++) by_theta[j] += pulled[SIZE + 1 + i] * push_by_theta[i * hz_P + j];
+    for (i = 0; i < hz_INPUTS; i++) by_theta[j] += pulled[SIZE + 1 + i] * push_by_theta[i * hz_P + j];
 #endif
 #endif /* hz_P */
   return hz_CONVERGED;

@@ -93,14 +93,14 @@ static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA 
    hz_DIVERGED, and the state stays. */
 static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual, hz_real *by_state,
     hz_WITH_U(hz_real *by_input) hz_WITH_THETA(hz_real *by_theta) hz_real *by_h) {
-  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS * hz_N + hz_P };
+  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS + hz_P };
   const hz_state before = *state;
   hz_problem P;
   hz_real slopes[SIZE * WIDTH], move[hz_N];
   int i, j;
   const int status = hz_step(state, h, hz_WITH_U(u) hz_WITH_THETA(theta) residual);
 #if hz_P && hz_INPUTS
-  hz_real hz_input_map[hz_N * hz_M], hz_input_offset[hz_N], push_by_theta[hz_N * hz_P];
+  hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS], push_by_theta[hz_INPUTS * hz_P];
 #endif /* hz_P */
   if (status & 15) return status;
   for (i = 0; i < hz_N; i++) {
@@ -137,7 +137,7 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAK
 #endif
       by_theta[i * hz_P + j] = slopes[i * WIDTH + WIDTH - hz_P + j];
 #if hz_INPUTS
-      for (k = 0; u && k < hz_N; k++)
+      for (k = 0; u && k < hz_INPUTS; k++)
         by_theta[i * hz_P + j] += slopes[i * WIDTH + SIZE + 1 + k] * push_by_theta[k * hz_P + j];
 #endif
     }
@@ -146,7 +146,7 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAK
     for (j = 0; by_input && j < hz_M; j++) {
       int k;
       by_input[i * hz_M + j] = hz_R(0.0);
-      for (k = 0; k < hz_N; k++)
+      for (k = 0; k < hz_INPUTS; k++)
         by_input[i * hz_M + j] += slopes[i * WIDTH + SIZE + 1 + k] * hz_input_map[k * hz_M + j];
     }
 #endif

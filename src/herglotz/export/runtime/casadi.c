@@ -18,7 +18,7 @@
 extern "C" {
 #endif
 
-enum { NAME_SIZE = 2 * hz_N + 1, NAME_IN = 2 + hz_INPUTS };
+enum { NAME_SIZE = 2 * hz_N + 1, NAME_IN = 2 + (hz_INPUTS > 0) };
 
 static const casadi_int NAME_vector[3] = {NAME_SIZE, 1, 1}; /* rows, columns, dense */
 static const casadi_int NAME_scalar[3] = {1, 1, 1};

@@ -38,14 +38,14 @@ static inline void hz_lose(hz_state *state) {
 #define hz_TAKES_U const hz_real *u,
 #define hz_WITH_U(argument) argument,
 
-/* G (u - u0); no inputs where u is null. */
-static inline void hz_push(const hz_real *u, hz_TAKES_THETA hz_real push[hz_N]) {
+/* What inputs are to the step: forces G (u - u0), or themselves where L_d takes them; 0 where u is null. */
+static inline void hz_push(const hz_real *u, hz_TAKES_THETA hz_real push[hz_INPUTS]) {
   int i, j;
 #if hz_P
-  hz_real hz_input_map[hz_N * hz_M], hz_input_offset[hz_N];
+  hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS];
   hz_inputs_at(theta->value, hz_input_map, hz_input_offset);
 #endif /* hz_P */
-  for (i = 0; i < hz_N; i++) {
+  for (i = 0; i < hz_INPUTS; i++) {
     push[i] = u ? hz_input_offset[i] : hz_R(0.0);
     for (j = 0; u && j < hz_M; j++) push[i] += hz_input_map[i * hz_M + j] * u[j];
   }

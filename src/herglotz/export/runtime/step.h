@@ -300,12 +300,12 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
   P->s0 = state->s;
 #if hz_INPUTS
   for (w = 0; w < FN_WIDTH; w++) {
-    hz_real push[hz_N];
+    hz_real push[hz_INPUTS];
 #if hz_P
     const hz_parameters theta = FN_theta(P, w);
 #endif /* hz_P */
     hz_push(u[w], hz_WITH_THETA(&theta) push);
-    for (i = 0; i < hz_N; i++) FN_LANE(P->push[i], w) = push[i];
+    for (i = 0; i < hz_INPUTS; i++) FN_LANE(P->push[i], w) = push[i];
   }
 #endif
   FN_begin(P, t.move);

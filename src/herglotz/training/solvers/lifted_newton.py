@@ -19,8 +19,17 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
+from herglotz.mechanics import (
+    DiscreteLagrangian,
+    Partials,
+    momentum_jacobian,
+    momentum_plus,
+    momentum_residual,
+    partials,
+    step_derivative,
+)
 from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
+from herglotz.models import capabilities
 from herglotz.progress import beat
 from herglotz.stepping import State, Status, solve, solve_step
 from herglotz.training.distributed import add_over_processes, own_parts
@@ -43,7 +52,7 @@ class Path:
 
 
 def solve_path(
-    L_d: FixedModel,  # at the inputs of every step, where it takes any
+    L_d: DiscreteLagrangian,  # at the inputs of every step, where it takes any
     start: Tensor,  # (S, 2n+1) first states
     h: Tensor,  # (S, K)
     guess: Tensor,  # (S, K+1, 2n+1)
@@ -56,8 +65,8 @@ def solve_path(
 
 
 def _swept(
-    step: Callable[[FixedModel, Tensor, Tensor], tuple[Tensor, Tensor] | None], L_d: FixedModel, start: Tensor,
-    h: Tensor, guess: Tensor, tol: float, sweeps: int,
+    step: Callable[[DiscreteLagrangian, Tensor, Tensor], tuple[Tensor, Tensor] | None], L_d: DiscreteLagrangian,
+    start: Tensor, h: Tensor, guess: Tensor, tol: float, sweeps: int,
 ) -> Path | None:  # fmt: skip
     x = torch.cat([start[:, None], guess[:, 1:]], 1)
     previous = float("inf")
@@ -79,6 +88,22 @@ def _swept(
             return Path(x, A)  # A is that of states off by at most NEAR
         previous = size
     return None
+
+
+def attached(
+    L_d: DiscreteLagrangian,
+    path: Path,
+    start: Tensor,  # (S, 2n+1)
+    h: Tensor,  # (S, K)
+) -> Tensor:
+    """The states (S, K+1, 2n+1) of a path from `start` with their first derivatives by θ, u, h and `start`.
+
+    One more sweep, which is zero in value: the derivative of Newton's step is that of its solution (implicit-function
+    theorem).
+    """
+    y, A = linear_steps(L_d, path.x, h)
+    moved = linear_recurrence(A.detach(), (y - path.x[:, 1:])[..., None], (start - path.x[:, 0])[..., None])
+    return path.x + moved[..., 0]
 
 
 def linear_recurrence(
@@ -114,7 +139,7 @@ def linear_recurrence(
     return torch.cat([states, starts[-1][:, None]], 1)[:, : K + 1]
 
 
-def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+def all_steps(L_d: DiscreteLagrangian, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
     """Φ̃ at every state but the last, and its derivative; None if any step fails."""
     n = (x.shape[-1] - 1) // 2
     q0, p0, s0 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n]
@@ -127,14 +152,15 @@ def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | 
     return y, step_derivative(P, p0)
 
 
-def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+def linear_steps(L_d: DiscreteLagrangian, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
     """The same with F linear about the next state's q; exact, and equal to `all_steps`, where F = 0 there.
 
     Where friction is set-valued, the inclusion with F linear is solved: it holds or lets go what it then should.
     """
     n = (x.shape[-1] - 1) // 2
     q0, p0, s0, q1 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n], x[:, 1:, :n]
-    if sticking := L_d.capabilities.sticking:
+    made_of = capabilities(L_d)
+    if sticking := made_of is not None and made_of.sticking:
         q1 = torch.where((q1 - q0).abs() <= STILL * torch.finfo(x.dtype).eps * q0.abs(), q0, q1)
     P = partials(L_d, q0, q1, s0, h, order=2)
     if sticking:
@@ -171,9 +197,7 @@ def step_derivatives(L_d: FixedModel, path: Path, grid: SegmentGrid) -> Tensor:
     if path.A is not None:
         return path.A
     there = torch.arange(path.x.shape[1], device=path.x.device) <= grid.end[:, None]
-    stepped = linear_steps(L_d, torch.where(there[..., None], path.x, path.x[:, :1]), grid.h)
-    assert stepped is not None  # an equation that is linear has a solution
-    return stepped[1]
+    return linear_steps(L_d, torch.where(there[..., None], path.x, path.x[:, :1]), grid.h)[1]
 
 
 def parameter_derivatives(
