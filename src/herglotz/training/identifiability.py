@@ -45,8 +45,12 @@ def information_of(posterior: Laplace, rows: Tensor) -> Tensor:
 
 
 def joint_of(posterior: Laplace, least: float) -> Joint:
-    """What the data say of all numbers together, if they are known no better than to `least`, in units of q."""
+    """What the data say of all numbers together, if they are known no better than to `least`, in units of q.
+
+    On the CPU, wherever the fit was: these are a few numbers that words are made of.
+    """
     P, sigma = len(posterior.theta), posterior.sigma
     rounding = max(1.0, least / (sigma * posterior.inflation)) ** 2
     alone = posterior.information.diagonal()[:P].clamp_min(1e-300).rsqrt() * max(1.0, least / sigma)
-    return Joint(posterior.covariance[:P, :P] * rounding, alone, information_of(posterior, torch.arange(P)))
+    every = posterior.covariance[:P, :P] * rounding, alone, information_of(posterior, torch.arange(P))
+    return Joint(*(x.cpu() for x in every))

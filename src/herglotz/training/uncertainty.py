@@ -75,7 +75,7 @@ class Laplace:
         self.run = run
         data = run.data.unwrapped()
         rows = leading_rows(data.lengths, run.train_lengths)
-        out = torch.zeros(data.samples, dtype=torch.bool)
+        out = torch.zeros(data.samples, dtype=torch.bool, device=data.q.device)
         out[run.metrics.get("outlier_samples", [])] = True
         states, train, out = run.states.joined[rows], data.rows(rows, run.train_lengths), out[rows]
         if run.config.robust != "off":
