@@ -1,0 +1,186 @@
+"""The header where memory and time are counted: calls, stack, the bound of Newton's iteration, a Cortex-M4, Rust."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from export_models import randomise
+
+from herglotz.export import export_c, load_c
+from herglotz.models import ContactLagrangian, ModelConfig
+
+ROOT = Path(__file__).resolve().parents[3]
+needs_gcc = pytest.mark.skipif(not shutil.which("gcc"), reason="no gcc in the PATH")
+ARM = ("arm-none-eabi-gcc", "qemu-system-arm", "make", "gcc")
+BOX = {"q_low": [-2.0], "q_high": [2.0], "p_low": [-2.0], "p_high": [2.0], "s_low": [-9.0], "s_high": [9.0]}
+# Functions of <math.h> that the runtime names, what GCC makes of sin and cos of one number, and how it moves memory.
+MATH = {"sin", "cos", "sincos", "exp", "expm1", "sqrt", "atanh", "pow", "floor", "log", "fabs"}
+ALLOWED = MATH | {f"{name}f" for name in MATH} | {"memset", "memcpy", "memmove"}
+
+
+def pendulum():
+    """An angle with a network of two layers of 16 units beside the terms of every model."""
+    model = ContactLagrangian(ModelConfig(correction_width=16))
+    with torch.no_grad():
+        randomise(model, 0.05, seed=1)
+    return model
+
+
+def rubbing():
+    """Two driven coordinates that dry friction can hold, and a mass that depends on position."""
+    sizes = (1.0, 1.0)
+    config = ModelConfig((True, False), "forced", sizes, sizes, sizes, (0.0, 0.0), potential_width=3, mass_width=3,
+                         coulomb=True, sticking=True, inputs=1)  # fmt: skip
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        randomise(model, 0.05, seed=2)
+        for name in ("viscous", "coulomb", "breakaway"):
+            model.get_parameter(f"friction.{name}").abs_()
+    return model
+
+
+@pytest.fixture(scope="module")
+def headers(tmp_path_factory):
+    """Folders with stepper.h: the pendulum in float and double, and one with all that a header can hold."""
+    folders = {name: tmp_path_factory.mktemp(name) for name in ("float", "double", "extras")}
+    export_c(pendulum(), folders["float"] / "stepper.h", h=0.1, box=BOX, dtype="float32")
+    export_c(pendulum(), folders["double"] / "stepper.h", h=0.1, box=BOX)
+    chosen: Any = ("friction.viscous", "damping.rate")
+    export_c(rubbing(), folders["extras"] / "stepper.h", h=0.1, parameters=chosen, extras=("adjoint", "filter"))
+    return folders
+
+
+def compiled(folder, *flags):
+    """Every function of a header as an object file; the folder has what GCC says of its calls and stack."""
+    (folder / "use.c").write_text('#include "stepper.h"\n')
+    words = ["gcc", "-std=c99", "-O1", "-fkeep-inline-functions", "-fno-pic", "-fno-stack-protector", *flags]
+    subprocess.run([*words, "-c", "use.c", "-o", "use.o"], cwd=folder, check=True)
+    return folder / "use.o"
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["float", "extras"])
+def test_nothing_is_called_but_the_mathematics(headers, name):
+    # fails if a function of the header prints, allocates, or asks for any library but libm
+    found = subprocess.run(["nm", "-u", compiled(headers[name])], capture_output=True, text=True, check=True).stdout
+    called = set(re.findall(r"U (\w+)", found))
+    assert {"cosf", "cos", "sincosf", "sincos"} & called
+    assert called <= ALLOWED, called - ALLOWED
+
+
+def graph(folder):
+    """Bytes of stack and kind of each function, and which functions each one calls, from GCC's call graph."""
+    text = (folder / "use.ci").read_text()
+    nodes = re.findall(r'node: \{ title: "([^"]*)" label: "[^"]*?\\n(\d+) bytes \(([\w,]+)\)', text)
+    edges = re.findall(r'edge: \{ sourcename: "([^"]*)" targetname: "([^"]*)"', text)
+    calls: dict[str, set[str]] = {}
+    for caller, callee in edges:
+        calls.setdefault(caller, set()).add(callee)
+    return {name.split(":")[-1]: (int(size), kind) for name, size, kind in nodes}, {
+        caller.split(":")[-1]: {name.split(":")[-1] for name in names} for caller, names in calls.items()
+    }
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["double", "extras"])
+def test_the_stack_is_known_when_it_is_compiled(headers, name):
+    # fails if a function allocates on the stack by a number of the run time, or calls itself
+    compiled(headers[name], "-fcallgraph-info=su")
+    frames, calls = graph(headers[name])
+    assert {"stepper_step", "stepper_evaluate", "stepper_take"} <= set(frames)
+    assert {kind for _, kind in frames.values()} == {"static"}
+
+    def deepest(function, above=()):
+        assert function not in above, f"{function} calls itself by {above}"
+        below = [deepest(callee, (*above, function)) for callee in calls.get(function, ())]
+        return frames.get(function, (0, ""))[0] + max(below, default=0)
+
+    total = {function: deepest(function) for function in frames}
+    assert total["stepper_step"] >= frames["stepper_step"][0] + frames["stepper_evaluate"][0]
+    if name == "double":
+        assert total["stepper_step"] <= 6 * 1024  # docs/microcontroller.md says so
+
+
+BOUND = """
+#include <stdio.h>
+static int evaluations;
+#include "counted.h"
+int main(void) {
+  int k, most = 0, worst = 0;
+  for (k = 0; k < 2000; k++) {
+    stepper_state x = {{-2.0 + 0.002 * k}, {(k % 41) - 20.0}, 0.0, 1.0};
+    int status;
+    evaluations = 0;
+    status = stepper_step(&x, 0.1 + 0.001 * k, 0) & 15;
+    if (evaluations > most) most = evaluations;
+    if (status > worst) worst = status;
+  }
+  printf("%d %d %d\\n", most, worst, stepper_max_iterations);
+  return 0;
+}
+"""
+
+
+@needs_gcc
+@pytest.mark.parametrize("limit", [30, 2])
+def test_a_constant_of_the_header_bounds_the_iteration(headers, tmp_path, limit):
+    # fails if Newton's loop goes on beyond NAME_max_iterations, or ends there without its status
+    text = (headers["double"] / "stepper.h").read_text()
+    assert text.count("stepper_max_iterations = 30 }") == 1
+    text = text.replace("stepper_max_iterations = 30", f"stepper_max_iterations = {limit}")
+    text, calls = re.subn(r"stepper_evaluate(?:_first)?\(P, t\)(?=;)", r"(evaluations++, \g<0>)", text)
+    assert calls == 3
+    (tmp_path / "counted.h").write_text(text)
+    (tmp_path / "use.c").write_text(BOUND)
+    subprocess.run(["gcc", "-std=c99", "-O1", "use.c", "-o", "use", "-lm"], cwd=tmp_path, check=True)
+    printed = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout
+    most, worst, said = map(int, printed.split())
+    assert said == limit
+    assert most <= limit + 1
+    assert (worst, most) == (1, 3) if limit == 2 else worst in (0, 1)
+
+
+@pytest.fixture(scope="module")
+def on_cortex_m4(headers, tmp_path_factory):
+    """What the example prints on the emulated board and on this computer, and the folder of the program."""
+    if missing := [tool for tool in ARM if not shutil.which(tool)]:
+        pytest.skip(f"no {missing[0]}: apt install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm make gcc")
+    build = tmp_path_factory.mktemp("cortex_m4")
+
+    def printed(target):
+        words = ["make", "-s", "-C", ROOT / "examples" / "cortex_m4", f"HEADER={headers['float']}/stepper.h"]
+        done = subprocess.run([*words, f"BUILD={build}", target], capture_output=True, text=True, check=False, timeout=99)
+        assert done.returncode == 0, done.stderr[:3000]
+        rows = [line.split() for line in done.stdout.splitlines()]
+        states = [list(map(float, row)) for row in rows if row[0].isdigit()]
+        return states, {row[0]: int(row[1]) for row in rows if not row[0].isdigit()}
+
+    return printed("measure"), printed("host"), build / "cortex_m4.elf"
+
+
+def test_a_cortex_m4_steps_as_this_computer(on_cortex_m4, headers):
+    # fails if what the header computes depends on the processor: int of 16 bits, lanes of registers, double where float
+    # is meant; 1e-5 is what float keeps of double over 1000 steps
+    (states, said), (here, _), _ = on_cortex_m4
+    assert said["status"] == 0
+    assert [row[0] for row in states] == [100.0 * k for k in range(11)]
+    away = torch.tensor(states) - torch.tensor(here)
+    assert float(away.abs().max()) <= 1e-5
+    x = torch.tensor([1.0], dtype=torch.float64)
+    zero = torch.zeros(1, dtype=torch.float64)
+    exact = load_c(headers["double"] / "stepper.h").rollout(x, zero, zero[0], h=0.1, steps=1000).q[::100, 0]
+    assert float((exact - torch.tensor([row[1] for row in states], dtype=torch.float64)).abs().max()) <= 1e-5
+
+
+def test_a_cortex_m4_needs_little(on_cortex_m4):
+    # fails if constants go to RAM, numbers in double or their emulation come in, or the stack holds lanes of registers
+    (_, said), _, program = on_cortex_m4
+    assert said["flash"] <= 24 * 1024
+    assert said["stack"] < said["ram"] <= 2 * 1024
+    assert 0 < said["mean"] <= said["most"] <= 4 * said["mean"]
+    symbols = subprocess.run(["arm-none-eabi-nm", program], capture_output=True, text=True, check=True).stdout
+    assert not re.findall(r" (__aeabi_d\w+|__aeabi_f2d|malloc|printf|_sbrk)$", symbols, re.MULTILINE)
