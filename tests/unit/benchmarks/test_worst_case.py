@@ -8,10 +8,9 @@ from benchmarks import worst_case
 
 
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
-@pytest.mark.parametrize("along", [False, True])
-def test_counts_of_short_runs(along):
+def test_counts_of_a_short_run():
     # fails if failed steps or evaluations are not counted, or a quantile is taken of the wrong side; no time is judged
-    found = worst_case.times("driven mass, dry friction", along, 3000)
+    found = worst_case.times("driven mass, dry friction", True, 1000)
     assert found["failed"] == 0
     assert 1 <= found["evaluations_median"] <= found["evaluations_q9999"] <= found["evaluations_worst"] <= 31
     assert found["evaluations_worst"] > 3  # steps that begin to stick or to slip take more than the others

@@ -15,7 +15,7 @@ from herglotz.stepping import Stepper
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "tutorials" / "from_rust.md"
 TOOLS = ("cc", "ar", "rustc")
-BOX = {"q_low": [-0.1], "q_high": [0.6], "p_low": [-1.0], "p_high": [1.0], "s_low": [-9.0], "s_high": [9.0]}
+BOX = {"q_low": [-0.05], "q_high": [0.6], "p_low": [-1.0], "p_high": [1.0], "s_low": [-9.0], "s_high": [9.0]}
 
 
 def test_the_program_of_the_page_steps_as_the_model(tmp_path):
@@ -45,6 +45,6 @@ def test_the_program_of_the_page_steps_as_the_model(tmp_path):
     exact = torch.stack([motion.q[1:, 0], motion.p[1:, 0]], -1)
     assert float((found - exact).abs().max()) <= 1e-12
     outside = [k for k, row in enumerate(rows) if row[3:] == ["outside", "the", "data"]]
-    left = [k for k in range(20) if (motion.q[k : k + 2] < -0.1).any()]
+    left = [k for k in range(20) if (motion.q[k : k + 2] < -0.05).any()]
     assert outside == left
     assert 0 < len(left) < 20
