@@ -1,4 +1,4 @@
-"""The header from Rust: the files and commands that docs/tutorials/from_rust.md shows."""
+"""The header from Rust: the files and commands that docs/from_rust.md shows."""
 
 import re
 import shlex
@@ -13,7 +13,7 @@ from herglotz.export import export_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "tutorials" / "from_rust.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "from_rust.md"
 TOOLS = ("cc", "ar", "rustc")
 BOX = {"q_low": [-0.05], "q_high": [0.6], "p_low": [-1.0], "p_high": [1.0], "s_low": [-9.0], "s_high": [9.0]}
 
