@@ -49,6 +49,8 @@ FLAGS = (
          type=positive, nargs=2, metavar=("LOW", "HIGH")),
     flag("--name", "what every name in a C header begins with, so that headers of two models fit into one program "
          "(default: the name of the file)", metavar="PREFIX"),
+    flag("--dtype", "numbers of the C: float32 for a microcontroller (default float64, or what tune chose)",
+         choices=("float64", "float32")),
     flag("--parameters", "numbers of the model that a C program sets at run time, friction.viscous[0] or "
          "friction.viscous for all of them, with bounds if wanted: damping.rate=0:2", nargs="+",
          metavar="NAME[=LOW:HIGH]"),
@@ -68,6 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
     if kicks.is_file() and form == "c":
         if arguments.name is not None:
             raise InputError("--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out")
+        if arguments.dtype is not None:
+            raise InputError("--dtype: kicks that tune chose have the numbers that it chose; leave --dtype out")
         if arguments.parameters is not None or arguments.extras is not None:
             raise InputError("--parameters, --extras: kicks that tune chose have neither; leave them out")
         return _kicks(arguments, kicks)
@@ -87,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         form,
         h_range=arguments.h_range,
         name=arguments.name,
+        dtype=arguments.dtype,
         parameters=parsed(arguments.parameters or ()),
         extras=arguments.extras or (),
     )

@@ -38,6 +38,7 @@ def export_run(
     *,
     h_range: tuple[float, float] | None = None,
     name: str | None = None,
+    dtype: str | None = None,
     parameters: Chosen = (),
     extras: Sequence[str] = (),
 ) -> Path:
@@ -57,6 +58,8 @@ def export_run(
         rounding, and 0.2 means a step of 0.2000000000000002 too.
     name
         Prefix of every name in C, as of `export_c`, and the identifier of an FMU; None: that of the file.
+    dtype
+        Of the numbers in C, "float64" or "float32"; None: float64, or what `herglotz tune` chose.
     parameters
         Numbers that a C header takes at run time, as of `export_c`.
     extras
@@ -65,8 +68,8 @@ def export_run(
     Raises
     ------
     InputError
-        If the name has another end, the format cannot hold the model, a prefix is given for a format without C, or
-        parameters for another one than a C header.
+        If the name has another end, the format cannot hold the model, a prefix or a dtype is given for a format
+        without C, or parameters for another one than a C header.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
@@ -74,6 +77,8 @@ def export_run(
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
     if name is not None and kind not in IN_C:
         raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
+    if dtype is not None and kind not in IN_C:
+        raise InputError(f"{path}: dtype {dtype} is of C headers only, not of {kind}; leave it out")
     if (parameters or extras) and kind != "c":
         raise InputError(f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out")
     (q, p, s), t = run.last_fitted()
@@ -89,8 +94,10 @@ def export_run(
         **({"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]} if run.model.inputs else {}),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
-    if run.setting and kind in IN_C:
+    if run.setting and kind in IN_C and dtype in (None, run.setting["dtype"]):
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
+    elif dtype is not None:  # a tolerance of tune is one of its own dtype
+        described["dtype"] = dtype
     if name is not None:
         described["name"] = name
     if parameters:

@@ -16,7 +16,7 @@ from herglotz.cli import main
 from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
 from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
-from herglotz.export import compare, load_exported
+from herglotz.export import compare, export_run, load_exported
 from herglotz.export.load import read_header
 from herglotz.export.metadata import KEY
 from herglotz.training import load_run, save_run
@@ -134,6 +134,24 @@ def test_the_prefix_of_a_header(tiny_run, tmp_path, capsys):
     assert "is of C headers only" in capsys.readouterr().err
     assert main(["export", str(tiny_run), "--out", str(out), "--force", "--name", "2 arms"]) == 2
     assert "must be a C identifier" in capsys.readouterr().err
+
+
+def test_the_numbers_of_a_header(tiny_run, tmp_path, capsys):
+    # fails if --dtype is not that of the header, is taken in silence where it means nothing, or a tuned run keeps the
+    # tolerance of its double in float
+    out = tmp_path / "a.h"
+    assert main(["export", str(tiny_run), "--out", str(out), "--dtype", "float32"]) == 0
+    assert "typedef float a_real;" in out.read_text()
+    plain = read_header(out)[1]
+    assert plain["dtype"] == "float32"
+    assert main(["export", str(tiny_run), "--out", str(tmp_path / "a.onnx"), "--dtype", "float32"]) == 2
+    assert "is of C headers only" in capsys.readouterr().err
+    tuned = load_run(tiny_run)
+    tuned.metrics["tuned"] = {"chosen": {"dtype": "float64", "tol": 1e-12}}
+    export_run(tuned, out, dtype="float32")
+    assert read_header(out)[1]["newton_tolerance"] == plain["newton_tolerance"]
+    export_run(tuned, out)
+    assert read_header(out)[1]["newton_tolerance"] == 1e-12
 
 
 def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys):

@@ -90,16 +90,20 @@ static inline hz_real hz_atanh(hz_real x) {
 
 static inline hz_real hz_choose(hz_real a, hz_real b, hz_real x, hz_real y) { return a > b ? x : y; }
 
-#ifdef __GNUC__
 /* Registers of numbers, as wide as the processor's, with GCC and clang: what they hold side by side is the units of a
-   layer or, in batches, the samples. Any other compiler goes number by number. */
+   layer or, in batches, the samples. Another compiler goes number by number, and so does a processor without such
+   registers (Cortex-M): there they would only take stack. */
+#ifdef __GNUC__
 #if defined(__AVX512F__)
 #define hz_LANE_BYTES 64
 #elif defined(__AVX__)
 #define hz_LANE_BYTES 32
-#else
+#elif defined(__SSE2__) || defined(__aarch64__) || defined(__VSX__) || defined(__wasm_simd128__)
 #define hz_LANE_BYTES 16
 #endif
+#endif
+
+#ifdef hz_LANE_BYTES
 #if hz_SINGLE
 typedef int hz_signed_t;
 #else

@@ -1,12 +1,12 @@
 /* Matrix products and sums of long rows. */
 
 /* y_k += sum_j w_jk x_j, where w is (inputs, outputs) and t its transpose. Long rows of outputs are summed side by
-   side, without sums across lanes; a few outputs of many inputs are dot products. With GCC's and clang's vector types
+   side, without sums across lanes; a few outputs of many inputs are dot products. With vector types
    sums stay in registers: left alone, some compilers vectorise the wrong loop and lose a factor of ten. */
 static inline void hz_product(int inputs, int outputs, const hz_real *w, const hz_real *t, const hz_real *x,
     hz_real *hz_RESTRICT y) {
   int j, k = 0;
-#ifdef __GNUC__
+#ifdef hz_LANE_BYTES
   enum { L = hz_LANES };
   for (; k + 4 * L <= outputs; k += 4 * L) {
     hz_part *to = (hz_part *)(y + k);
@@ -74,7 +74,7 @@ static inline void hz_product(int inputs, int outputs, const hz_real *w, const h
 static inline hz_real hz_sum(int count, const hz_real *x) {
   hz_real sum = hz_R(0.0);
   int k = 0;
-#ifdef __GNUC__
+#ifdef hz_LANE_BYTES
   hz_lanes part = hz_spread(hz_R(0.0));
   int half, i;
   for (; k + hz_LANES <= count; k += hz_LANES) part += *(const hz_part *)(x + k);
