@@ -29,7 +29,7 @@ from herglotz.export.lower.c_parameters import (
     without_parameters,
 )
 from herglotz.export.metadata import check_metadata, describe, from_json
-from herglotz.export.parameters import Chosen, described_parameters
+from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step_parts import pushed
 from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
@@ -177,6 +177,7 @@ def export_c(
     extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
     if parameters:
         extra["parameters"] = described_parameters(model, parameters)
+        extra |= moved_numbers(model, extra["parameters"])
     if extras:
         check_extras(extras, model.dof, MAX_DERIVATIVES)
         extra["extras"] = list(extras)
@@ -196,6 +197,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     """
     velocities, derivatives = derivatives, derivatives and entries["dof"] <= MAX_DERIVATIVES
     chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
+    model = with_moved_numbers(model, entries)
     equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)  # rounded once, when numbers are written
     step = StepInC(equations)
     inputs, parameters = inputs_constants(model, entries["dtype"]), ""
