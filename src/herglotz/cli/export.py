@@ -49,11 +49,13 @@ FLAGS = (
          type=positive, nargs=2, metavar=("LOW", "HIGH")),
     flag("--name", "what every name in a C header begins with, so that headers of two models fit into one program "
          "(default: the name of the file)", metavar="PREFIX"),
+    flag("--dtype", "numbers in C: float32 as a microcontroller computes, or float64 (default: as the run has them)",
+         choices=("float32", "float64")),
     flag("--parameters", "numbers of the model that a C program sets at run time, friction.viscous[0] or "
          "friction.viscous for all of them, with bounds if wanted: damping.rate=0:2", nargs="+",
          metavar="NAME[=LOW:HIGH]"),
-    flag("--between", "a number NAME of --parameters that moves all numbers of the model at once, as a payload does: 0 is "
-         "RUN and 1 this one, a fit of the same terms", metavar="NAME=RUN"),
+    flag("--between", "a number NAME of --parameters that moves all numbers of the model at once, as a payload does: 0 "
+         "is this run and 1 is that one, a fit of the same terms", metavar="NAME=RUN"),
     flag("--extras", "what else a C header holds: adjoint (vector-Jacobian products of steps and rollouts), filter "
          "(a Kalman filter with the noise of the fit)", nargs="+", choices=("adjoint", "filter")),
     FORCE,
@@ -95,6 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         name=arguments.name,
         parameters=parsed(arguments.parameters or ()),
         extras=arguments.extras or (),
+        dtype=arguments.dtype,
     )
     in_c = form not in ("pt2", "aoti", "onnx")
     if in_c:  # the header is read, not compiled: no compiler is needed to write it

@@ -40,6 +40,7 @@ def export_run(
     name: str | None = None,
     parameters: Chosen = (),
     extras: Sequence[str] = (),
+    dtype: str | None = None,
 ) -> Path:
     """Write the model of a run as one file that steps without this package.
 
@@ -61,12 +62,14 @@ def export_run(
         Numbers that a C header takes at run time, as of `export_c`.
     extras
         What else a C header holds, as of `export_c`; a filter has the noise of the fit as `NAME_noise_of_fit`.
+    dtype
+        "float32" or "float64" in C, whatever the model's own; None: that, or what `tune` chose.
 
     Raises
     ------
     InputError
-        If the name has another end, the format cannot hold the model, a prefix is given for a format without C, or
-        parameters for another one than a C header.
+        If the name has another end, the format cannot hold the model, a prefix or a dtype is given for a format without
+        C, or parameters for another one than a C header.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
@@ -74,6 +77,8 @@ def export_run(
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
     if name is not None and kind not in IN_C:
         raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
+    if dtype is not None and kind not in IN_C:
+        raise InputError(f"{path}: a dtype is of C alone, not of {kind}; leave it out")
     if (parameters or extras) and kind != "c":
         raise InputError(f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out")
     (q, p, s), t = run.last_fitted()
@@ -91,6 +96,8 @@ def export_run(
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and kind in IN_C:
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
+    if dtype is not None:
+        described |= {"dtype": dtype, "tolerance": None}
     if name is not None:
         described["name"] = name
     if parameters:

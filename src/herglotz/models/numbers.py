@@ -42,11 +42,11 @@ def lines(model: ContactLagrangian) -> Mapping[str, Line]:
 def combined(model: ContactLagrangian, name: str, values: Mapping[str, float]) -> ContactLagrangian:
     """A copy of the model with a number `name` that moves several: 0 is the model as it is, and 1 has these values.
 
-    x(λ) = x + λ (x₁ − x), and for a mass e^{2x} of `log_diagonal` e^{2x(λ)} = e^{2x} + λ (e^{2x₁} − e^{2x}). A load that
-    a body takes up adds to L in proportion to it; that the first mass is 1 (gauge) divides all of L by one number, and
-    lines stay lines. So the models of all loads lie on the line between those of two loads, where no constant mass lies
-    between coordinates (`off_diagonal`); λ grows with the load, but not in proportion to it. A number that is named
-    beside it stands as it is given.
+    x(λ) = x + λ (x₁ − x), and for a mass e^{2x} of `log_diagonal` e^{2x(λ)} = e^{2x} + λ (e^{2x₁} − e^{2x}). A load
+    that a body takes up adds to L in proportion to it; that the first mass is 1 (gauge) divides all of L by one number,
+    and lines stay lines. So the models of all loads lie on the line between those of two loads, where no constant mass
+    lies between coordinates (`off_diagonal`); λ grows with the load, but not in proportion to it. A number that is
+    named beside it stands as it is given.
 
     Raise InputError if the name is none or taken, nothing moves, a value is no finite number, or the model has no such
     number or moves it by another name already. Weights of a network have no line between them.

@@ -47,8 +47,8 @@ class Belief(NamedTuple):
 
     state: State  # (n,), (n,), ()
     theta: Tensor  # (K,)
-    covariance: Tensor  # (F, F) of q, p, s where the motion depends on it, and θ; with L earlier samples (F + FL, F + FL)
-    earlier: Tensor | None = None  # (L, F) the same numbers at earlier samples, the newest first
+    covariance: Tensor  # (F, F) of q, p, s where the motion depends on it, and θ; (F + FL, F + FL) with earlier samples
+    earlier: Tensor | None = None  # (L, F) the same numbers at these, the newest first
 
 
 class KalmanFilter:

@@ -88,7 +88,8 @@ def blocks(found):
 @pytest.mark.parametrize("case", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.slow) for x in CASES])
 def test_steps_at_other_numbers_are_those_of_the_model_with_them(case):
     # fails if a number stays what it was when the header was written, in a step, a guess, a start, the map of inputs,
-    # a momentum, V at q0 or a derivative; if lanes have other numbers than a sample by itself; or a derivative is another number's
+    # a momentum, V at q0 or a derivative; if lanes have other numbers than a sample by itself; or a derivative is
+    # another number's
     model, states, u = problem(case)
     names = named(model)
     entries = describe(model, H, None, (), 30, {"h_range": None, "parameters": described_parameters(model, names)})
