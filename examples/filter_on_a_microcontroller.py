@@ -5,8 +5,7 @@
 # late; a filter that knows the motion is neither. This page goes from a recording to a Kalman filter in C: in single
 # precision, without allocation, as a microcontroller runs it.
 #
-# A pendulum with a motor, recorded at 50 Hz by an encoder whose steps are a third of a degree. Its motor's torque is
-# not quite what the drive says:
+# A pendulum with a motor, recorded at 50 Hz by an encoder whose steps are a third of a degree:
 
 # %%
 import numpy as np
@@ -24,13 +23,13 @@ def moved(theta, omega, torque):
     return theta, omega
 
 
-def recorded(count, theta=0.8):
+def recorded(count, theta=0.8, unknown=0.0):
     """Times, encoder readings, torques and, for comparison, the velocity."""
     t, omega, rows = h * np.arange(count), 0.0, []
     torque = np.repeat(rng.uniform(-2, 2, count // 25 + 1), 25)[:count]
     for now, acting in zip(t, torque, strict=True):
         rows.append((now, step * np.round(theta / step), acting, omega))
-        theta, omega = moved(theta, omega, acting + 0.05 * rng.normal())
+        theta, omega = moved(theta, omega, acting + unknown * rng.normal())
     return np.array(rows).T
 
 
@@ -47,8 +46,8 @@ print(f"{round(h / run.h)} steps of {1000 * run.h:g} ms a sample")
 
 # %% [markdown]
 # The loop of the controller: a reading comes, the filter steps to it and takes it in. The fit knows the noise of the
-# readings; how large the forces are that the model does not know is ours to say, here 0.05 N·m a sample, of which the
-# arm (8 rad/s² for a N·m, mass 1) makes 0.05 · 8 · √0.02 of momentum a root second.
+# readings; how large the forces are that the model does not know is ours to say: torques of 0.05 N·m, others at each
+# sample, give an arm of 8 rad/s² a N·m (whose mass is the unit, 1) a momentum of 0.05 · 8 · √0.02 a root second.
 
 # %%
 from pathlib import Path
@@ -86,13 +85,13 @@ int main(void) {
 """)
 
 # %% [markdown]
-# Another recording, of other torques, goes through it. On this machine the compiler is `cc`; for a Cortex-M4F it is
-# `arm-none-eabi-gcc -mcpu=cortex-m4 -mfloat-abi=hard`, with the same file.
+# Another recording, of other torques, goes through it; there the arm is pushed, too. On this machine the compiler is
+# `cc`; for a Cortex-M4F it is `arm-none-eabi-gcc -mcpu=cortex-m4 -mfloat-abi=hard`, with the same file.
 
 # %%
 import subprocess
 
-t, theta, torque, omega = recorded(300, theta=-0.5)
+t, theta, torque, omega = recorded(300, theta=-0.5, unknown=0.05)
 subprocess.run(["cc", "-O2", "-std=c99", "loop.c", "-o", "loop", "-lm"], check=True)
 lines = "".join(f"{a:.6g} {b:.6g}\n" for a, b in zip(theta, torque, strict=True))
 done = subprocess.run("./loop", input=lines, capture_output=True, text=True, check=True)

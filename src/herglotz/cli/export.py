@@ -86,6 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.between is not None:
         name, _, other = arguments.between.partition("=")
+        if not other:
+            raise InputError(f"--between takes NAME=RUN, as in payload=runs/loaded, got '{arguments.between}'")
         result = between(result, name, load_run(Path(other)))
 
     warn_of_misfit(result, "the file will not step as the recorded system does")

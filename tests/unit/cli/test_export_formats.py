@@ -241,8 +241,8 @@ def test_a_number_between_two_runs(tiny_run, tmp_path, capsys):
     assert found["between"] == {"load": {"damping.rate": pytest.approx(rate + 0.2, rel=1e-12)}}
     assert "typedef float arm_real" in text
     assert _is_of(text, path, run.model)
-    for other, said in (("load", "No such"), (f"load={tiny_run}", "nothing differs for load")):
+    for other, said in (("load", "takes NAME=RUN"), (f"load={tiny_run}", "nothing differs for load")):
         capsys.readouterr()
         again = ["--between", other, "--parameters", "load", "--force"]
         assert main(["export", str(tiny_run), "--out", str(path), *again]) == 2
-        assert said.lower() in capsys.readouterr().err.lower()
+        assert said in capsys.readouterr().err

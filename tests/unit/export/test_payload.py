@@ -93,7 +93,8 @@ def test_a_changed_payload_is_found_in_five_seconds():
 
     best, _ = followed(new, [], [], [])
     ours, theta = followed(with_payload(old), ["payload"], [0.005], [0.05])
-    stays, _ = followed(old, [], [], [])
-    print(f"a second ahead: {ours / best:.2f}, numbers that stay {stays / best:.1f}, of {best:.2g} rad")
+    (tip, now, double) = (values_of(x, ["kinetic.sum.coefficient"])[0] for x in (old, new, arm(1.6)))
+    print(f"a second ahead: {ours:.2g} rad, {best:.2g} with the true numbers")
     assert theta[CHANGE - 10].abs() < 0.02
-    assert ours <= 1.2 * best < stays / 10
+    assert abs(float(theta[-1]) - (now - tip) / (double - tip)) < 0.02
+    assert ours <= 1.2 * best
