@@ -225,7 +225,7 @@ def measured(folder: Path) -> dict[str, Any]:
 
     def followed(q: Array, momentum: Array) -> Followed:
         y, v = q[::STRIDE], (q[1] - q[0]) / h
-        p = model.velocity_derivatives(*(torch.tensor(x)[None] for x in (q[0], v)), torch.zeros(1).double())[0][0]
+        p = model.velocity_derivatives(torch.tensor(q[:1]), torch.tensor(v)[None], torch.zeros(1).double())[0][0]
         start = np.concatenate([y[0], p.detach().numpy()])
         std = [*sensor, 0.1, 0.1, *([0.0] * model.s_enters_motion)]
         return Followed(model, STRIDE * h, steps, y, [*sensor, *momentum], std, start=start)

@@ -138,7 +138,8 @@ def with_values(model: ContactLagrangian, values: Mapping[str, float]) -> Contac
 
     Raise InputError if the model has no number of a name, or a value is not finite.
     """
-    new, every, own = copy.deepcopy(model), numbers_of(model), lines(model)
+    every, own = numbers_of(model), lines(model)
+    new: Any = copy.deepcopy(model)
     chosen(model, list(values))
     for name, value in sorted(values.items(), key=lambda x: x[0] not in own):  # what moves several moves first
         if name not in every and name not in own:

@@ -56,7 +56,7 @@ def test_a_header_moves_all_numbers(tmp_path):
     with torch.no_grad():
         torch.testing.assert_close(ours.init_qv(*state, h=H).p, eager.init_qv(*state, H).p, rtol=1e-12, atol=1e-12)
     with pytest.raises(InputError, match=r"payload is 0\.4 in the model; export the model at 0"):
-        export_c(eager.L_d, tmp_path / "x.h", h=H, parameters=["payload"])
+        export_c(with_values(model, values), tmp_path / "x.h", h=H, parameters=["payload"])
 
 
 def test_a_changed_payload_is_found_in_five_seconds():
