@@ -15,7 +15,7 @@ from herglotz.stepping import State, Stepper
 from herglotz.stepping.filter import KalmanFilter, Noise
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="neither gcc nor clang in the PATH")
-H, SENSOR, CHANGE, AHEAD = 0.02, 1e-3, 150, 50
+H, SENSOR, CHANGE, AHEAD = 0.02, 1e-3, 100, 50
 NAMES = ["kinetic.base.log_diagonal", "kinetic.sum.coefficient", "potential.stiffness", "friction.viscous",
          "friction.input_map"]  # fmt: skip
 
@@ -75,7 +75,7 @@ def test_a_changed_payload_is_found_in_five_seconds():
         then = Stepper(new).rollout(*start, h=H, steps=len(t) - CHANGE - 1, inputs=u[CHANGE:-1])
     q = torch.cat([first.q[:-1], then.q])
     y = q + SENSOR * torch.randn(q.shape, generator=make, dtype=torch.float64)
-    rows = range(CHANGE + 250, CHANGE + 250 + 2 * AHEAD, 5)
+    rows = range(CHANGE + 250, CHANGE + 250 + 2 * AHEAD, 10)
 
     def followed(model, names, wander, std):
         kalman = KalmanFilter(model, Noise([SENSOR] * 2, [0.01] * 2, wander), names,
