@@ -277,6 +277,7 @@ int main(void) {
   arm_filter f, g;
   arm_past past[2], kept[2];
   arm_smoother s;
+  int i;
   printf("%d ", arm_filter_start(&f, &arm_start, 0, std));
   g = f;
   printf("%d ", arm_filter_predict(&f, 0.1, &noise));
@@ -296,10 +297,16 @@ int main(void) {
   g = f;
   g.P[1][0] = nan;
   printf("%d ", arm_smoother_start(&s, &g, past, 2));
+  f.P[arm_F - 1][0] = f.P[0][arm_F - 1] = 0.05; /* theta leaves its bounds with what is measured */
+  f.P[arm_F - 1][arm_F - 1] = 100.0;
   printf("%d ", arm_smoother_start(&s, &f, past, 2));
   printf("%d ", arm_smoothed(&s, 1) == 0);
   printf("%d ", arm_smoother_predict(&s, 0.1, &noise));
   printf("%d ", arm_smoother_update(&s, y, &noise, 0));
+  for (i = 0; i < 2; i++) {
+    const double value = (i ? &s.now : &past[0].then)->theta.value[0];
+    printf("%d ", value == arm_lowest.value[0] || value == arm_highest.value[0]);
+  }
   kept[0] = past[0];
   g = s.now;
   noise.momentum[0] = -1.0;
@@ -326,7 +333,7 @@ def test_what_is_no_number_changes_nothing(double_pendulum, tmp_path):
     )  # fmt: skip
     assert built.returncode == 0, built.stderr[:2000]
     words = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout.split()
-    assert " ".join(words) == "0 0 5 5 5 5 1 5 0 0 1 1 0 5 5 5 0 1 0 0 5 5 5 5 1 1"
+    assert " ".join(words) == "0 0 5 5 5 5 1 5 0 0 1 1 0 5 5 5 0 1 0 0 1 1 5 5 5 5 1 1"
     if not shutil.which("nm"):
         pytest.skip("no nm")
     library = '#include "stepper.h"\nint f(arm_filter *x, const double *y, const arm_noise *n, double *v);\n' + (
