@@ -402,6 +402,13 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     for end in (len(kept) - 1, 2 * len(kept) - 1):  # the last sample waits for none
         torch.testing.assert_close(smooth.covariance[end], found.covariance[end], rtol=1e-12, atol=0)
         assert bool((smooth.covariance[end - 10 : end, 0, 0] < found.covariance[end - 10 : end, 0, 0]).all())
+    for first in (0, len(kept)):
+        assert smooth.covariance[first, 0, 0] < 0.9 * found.covariance[first, 0, 0]
+    begin = Trajectories.of(t[:14], y[:14], (14,), names=("a",), units=("rad",), angles=(True,))
+    until = hz.filter(run, begin, {"friction.viscous": (0.3, 0.0)}, lag=10)  # 3 waits for 13, here and there
+    for row in range(4):
+        torch.testing.assert_close(until.state.q[row], smooth.state.q[row], rtol=1e-9, atol=1e-12)
+    assert abs(float(until.state.q[5] - smooth.state.q[5])) > 1e-6
     truth = exact[:, kept].reshape(-1, 1)
     misses = [float((x.state.q - truth)[5:-5].square().mean().sqrt()) for x in (found, smooth)]
     assert misses[1] <= 0.8 * misses[0]
