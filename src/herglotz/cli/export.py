@@ -54,6 +54,8 @@ FLAGS = (
     flag("--parameters", "numbers of the model that a C program sets at run time, friction.viscous[0] or "
          "friction.viscous for all of them, with bounds if wanted: damping.rate=0:2", nargs="+",
          metavar="NAME[=LOW:HIGH]"),
+    flag("--between", "a number NAME of --parameters that moves all numbers of the model at once, as a payload does: 0 "
+         "is this run and 1 is that one, a fit of the same terms", metavar="NAME=RUN"),
     flag("--extras", "what else a C header holds: adjoint (vector-Jacobian products of steps and rollouts), filter "
          "(a Kalman filter with the noise of the fit)", nargs="+", choices=("adjoint", "filter")),
     FORCE,
@@ -82,7 +84,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.export import export_run, load_exported
     from herglotz.export.load import read_header
-    from herglotz.export.parameters import parsed
+    from herglotz.export.parameters import between, parsed
+
+    if arguments.between is not None:
+        name, _, other = arguments.between.partition("=")
+        if not other:
+            raise InputError(f"--between takes NAME=RUN, as in payload=runs/loaded, got '{arguments.between}'")
+        result = between(result, name, load_run(Path(other)))
 
     warn_of_misfit(result, "the file will not step as the recorded system does")
     export_run(

@@ -18,4 +18,5 @@ from herglotz.export.lower.aoti import export_aoti as export_aoti
 from herglotz.export.lower.onnx import export_onnx as export_onnx
 from herglotz.export.lower.pt2 import export_pt2 as export_pt2
 from herglotz.export.metadata import weights_digest as weights_digest
+from herglotz.export.parameters import between as between
 from herglotz.export.run_file import export_run as export_run

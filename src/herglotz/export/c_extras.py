@@ -10,6 +10,8 @@ from herglotz.export.c_numbers import numbers
 from herglotz.export.metadata import EXTRAS
 from herglotz.models import ContactLagrangian
 
+FILES = {"adjoint": ("adjoint",), "filter": ("filter", "smoother")}  # of `export/runtime`
+
 
 def check_extras(extras: object, dof: int, most: int) -> None:
     """Refuse what there is not, and a filter of more coordinates than derivatives are written out for."""
@@ -26,7 +28,7 @@ def extras_source(model: ContactLagrangian, entries: Mapping[str, Any], file: Ca
     for name in entries.get("extras", ()):
         if name == "filter":
             found.append(f"#define hz_CARRIES_S {int(model.s_enters_motion)} /* the motion depends on s */\n")
-        found.append(file(f"{name}.h"))
+        found += [file(f"{x}.h") for x in FILES[name]]
         if name == "filter" and (noise := entries.get("noise")):
             rows = [noise["position"], noise["momentum"]]
             rows += [noise["theta"]] if entries.get("parameters") else []

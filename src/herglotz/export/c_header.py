@@ -29,7 +29,7 @@ from herglotz.export.lower.c_parameters import (
     without_parameters,
 )
 from herglotz.export.metadata import check_metadata, describe, from_json
-from herglotz.export.parameters import Chosen, described_parameters
+from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step_parts import pushed
 from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
@@ -177,6 +177,7 @@ def export_c(
     extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
     if parameters:
         extra["parameters"] = described_parameters(model, parameters)
+        extra |= moved_numbers(model, extra["parameters"])
     if extras:
         check_extras(extras, model.dof, MAX_DERIVATIVES)
         extra["extras"] = list(extras)
@@ -192,11 +193,11 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     """The text of the header.
 
     Without `derivatives` NAME_step_jacobian, NAME_init_qv and NAME_velocity are left out. Beyond 8 coordinates the
-    first one is: it is most of the work. With numbers that are set at run time the other two are.
+    first one is: it is most of the work.
     """
-    velocities = derivatives and not entries.get("parameters")
-    derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
+    velocities, derivatives = derivatives, derivatives and entries["dof"] <= MAX_DERIVATIVES
     chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
+    model = with_moved_numbers(model, entries)
     equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)  # rounded once, when numbers are written
     step = StepInC(equations)
     inputs, parameters = inputs_constants(model, entries["dtype"]), ""
@@ -212,7 +213,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
     parts += [as_scalars(emitted.slopes), api]
-    parts += [as_scalars(emitted.momentum), runtime("velocity.h")] if velocities else []
+    parts += [as_scalars(emitted.momentum), shown(runtime("velocity.h"))] if velocities else []
     parts += extras_source(model, entries, lambda name: shown(runtime(name)))
     parts += ["#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))

@@ -68,13 +68,13 @@ class CLibrary:
     def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """The momenta p of velocities, NaN where there is none, and statuses."""
         p, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self.differentiates().herglotz_momenta(*_arguments(len(s), q, v, s, h, p, status))
+        self.differentiates().herglotz_momenta(*_arguments(len(s), q, v, s, h, *self._theta, p, status))
         return p, status
 
     def velocity(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """The velocities v of momenta, NaN where there is none, and statuses."""
         v, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self.differentiates().herglotz_velocities(*_arguments(len(s), q, p, s, h, v, status))
+        self.differentiates().herglotz_velocities(*_arguments(len(s), q, p, s, h, *self._theta, v, status))
         return v, status
 
     def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -138,7 +138,7 @@ def stepper_of(library: CLibrary, path: str, velocities: bool) -> ExportedSteppe
     programs: dict[str, Any] = {"init": library.init}
     if library.dof <= MAX_DERIVATIVES:
         programs["linearise"] = library.linearise
-    if velocities and not library.parameters:
+    if velocities:
         programs |= {"momentum": library.momentum, "velocity": library.velocity}
     again = lambda values: stepper_of(library.with_values(values), path, velocities)  # noqa: E731
     return ExportedStepper(programs, library.metadata, path, "c", library, again)

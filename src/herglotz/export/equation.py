@@ -165,7 +165,7 @@ class Equations:
         def found(*x: Tensor) -> tuple[Tensor, ...]:
             return tuple(dense(y) for y in legendre(self.model, *x) if y is not None)
 
-        return traced(found, (q, v, s, h))
+        return self.traced(found, (q, v, s, h))
 
     def _traced(self, function: Callable[..., Any]) -> Graph:
         q, p, s, h, *u = example(self.model, 0.1)

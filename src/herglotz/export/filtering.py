@@ -60,8 +60,12 @@ def filter(
     recording: Trajectories,
     parameters: Mapping[str, tuple[float, float]] | None = None,
     noise: Noise | None = None,
+    lag: int = 0,
 ) -> Filtered:
     """Follow a recording by an extended Kalman filter on the run's step: x = x⁻ + P_q (y − q)/S at each sample.
+
+    With a `lag` each sample is what is known of it `lag` samples later, or at the end of its trajectory: fixed-lag
+    smoothing.
 
     Each trajectory starts at its first two samples. The same filter stands in a C header that is exported with
     `extras=["filter"]` (`docs/c.md`).
@@ -77,6 +81,8 @@ def filter(
         it wanders in the root of a unit of time, in the number's own unit.
     noise
         Standard deviations in the units of the data; by default those of the fit (`noise_of`).
+    lag
+        Samples that each one waits for; the time of the work grows with the square of it.
 
     Returns
     -------
@@ -86,8 +92,8 @@ def filter(
     Raises
     ------
     InputError
-        If the recording is not of the run, has trajectories of fewer than two samples, or leaves where the model has
-        steps.
+        If the recording is not of the run, has trajectories of fewer than two samples or of no more than the lag, or
+        leaves where the model has steps.
     """
     chosen = dict(parameters or {})
     model = copy.deepcopy(run.model).double()
@@ -101,16 +107,22 @@ def filter(
     for first, length in zip(data.offsets, data.lengths, strict=True):
         if length < 2:
             raise InputError(f"{data.source or 'data'}: a trajectory has {length} sample; a filter starts at two")
+        if not 0 <= lag < length:
+            raise InputError(f"lag must be 0 to {length - 1}, as a trajectory has {length} samples, got {lag}")
         belief, surprise = _started(kalman, data, first, std), math.nan
         for row in range(first, first + length):
             h = float(data.t[row] - data.t[row - 1]) if row > first else float(data.t[row + 1] - data.t[row])
             if row > first:
                 parts = max(1, math.ceil(h / run.h_range[1] - 1e-6))
+                belief = kalman.remember(belief, lag) if lag else belief
                 for k in range(parts):
                     part = torch.tensor((k + 0.5) / parts, dtype=torch.float64)
                     belief = kalman.predict(belief, h / parts, _input(model, data, row - 1, part))
                 belief, surprise = kalman.update(belief, data.q[row])
-            beliefs.append(belief)
+            beliefs.append(kalman.smoothed(belief, 0))
+            # The sample that waits no longer; all of them at the end.
+            for back in range(1, lag + 1) if row + 1 == first + length else [lag] * (lag <= row - first):
+                beliefs[row - back] = kalman.smoothed(belief, back)
             surprises.append(surprise)
             steps.append(min(h, run.h_range[1]))
     return _told(kalman, model, data, beliefs, surprises, steps)

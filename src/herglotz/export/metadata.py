@@ -87,6 +87,7 @@ class Metadata(_Needed, total=False):
     extras: list[str]  # of `EXTRAS`
     noise: dict[str, list[float]]  # of a filter: standard deviations of position, momentum and theta
     parameters: dict[str, tuple[float, float | None, float | None]]  # set at run time: default, low, high
+    between: dict[str, dict[str, float]]  # those of them that move several numbers: the values of these at 1
 
 
 def describe(

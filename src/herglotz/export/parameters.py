@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from herglotz.errors import InputError
-from herglotz.models import ContactLagrangian
-from herglotz.models.numbers import chosen, values_of
+from herglotz.models import ContactLagrangian, numbers_of
+from herglotz.models.numbers import chosen, combined, lines, values_of, with_values
+from herglotz.training import Run
 
 Bounds = tuple[float | None, float | None]
 # By name, or by name with bounds; None: no bound on that side.
@@ -55,6 +57,40 @@ def described_parameters(model: ContactLagrangian, parameters: Chosen) -> dict[s
                 )
             found[name] = [value, low, high]
     return found
+
+
+def between(run: Run, name: str, other: Run) -> Run:
+    """The run with a number `name` that moves all numbers of its model: 0 is this run, and 1 another one.
+
+    As of a payload: fits of the same terms without it and with it, and loads between and beyond them lie on this line
+    (`herglotz.models.numbers.combined`). The name goes into `parameters` of `export` and of `hz.filter`.
+
+    Raise InputError if the models have other numbers, or differ in a network's weights or not at all.
+    """
+    own, theirs = numbers_of(run.model), numbers_of(other.model)
+    if odd := sorted(set(own) ^ set(theirs)):
+        raise InputError(f"{name}: {odd[0]} is a number of one of the runs alone; fit the other with the first's plan")
+    values = dict(zip(theirs, values_of(other.model, list(theirs)), strict=True))
+    return replace(run, model=combined(run.model, name, values))
+
+
+def moved_numbers(model: ContactLagrangian, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry of a file's metadata where one of the parameters stands for several: these, and their values at 1."""
+    found = {}
+    for name, line in lines(model).items():
+        if name in parameters:
+            if line.value:
+                raise InputError(f"{name} is {line.value:g} in the model; export the model at 0")
+            names = [x for x, (parameter, _) in numbers_of(model).items() if parameter in line.ends]
+            found[name] = dict(zip(names, values_of(with_values(model, {name: 1.0}), names), strict=True))
+    return {"between": found} if found else {}
+
+
+def with_moved_numbers(model: ContactLagrangian, entries: Mapping[str, Any]) -> ContactLagrangian:
+    """The model with the numbers of a file's metadata that stand for several, where it has not got them itself."""
+    for name, values in entries.get("between", {}).items():
+        model = model if name in lines(model) else combined(model, name, values)
+    return model
 
 
 def checked_values(entries: Mapping[str, Any], values: Mapping[str, float]) -> list[float]:

@@ -4,15 +4,69 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.func import functional_call
 
 from herglotz.errors import InputError
 from herglotz.models.model import ContactLagrangian, numbers_of
+
+
+class Line(NamedTuple):
+    """A number λ that stands for several: those of a model on the line between two others."""
+
+    value: float  # of λ in the model
+    ends: dict[str, tuple[Tensor, Tensor]]  # by parameter, its values at λ = 0 and at 1
+
+    def at(self, amount: Tensor) -> dict[str, Tensor]:
+        """The parameters at λ, ()."""
+        return {name: _between(name, x0.to(amount), x1.to(amount), amount) for name, (x0, x1) in self.ends.items()}
+
+
+def _between(name: str, x0: Tensor, x1: Tensor, amount: Tensor) -> Tensor:
+    if not name.endswith("log_diagonal"):
+        return x0 + amount * (x1 - x0)
+    grown = amount * torch.expm1(2 * (x1 - x0))  # the mass e^{2x}, less its own at λ = 0, over that
+    return x0 + torch.atanh(grown / (grown + 2))
+
+
+def lines(model: ContactLagrangian) -> Mapping[str, Line]:
+    """The numbers of a model that stand for several, by name."""
+    return getattr(model, "lines", {})
+
+
+def combined(model: ContactLagrangian, name: str, values: Mapping[str, float]) -> ContactLagrangian:
+    """A copy of the model with a number `name` that moves several: 0 is the model as it is, and 1 has these values.
+
+    x(λ) = x + λ (x₁ − x), and for a mass e^{2x} of `log_diagonal` e^{2x(λ)} = e^{2x} + λ (e^{2x₁} − e^{2x}). A load
+    that a body takes up adds to L in proportion to it; that the first mass is 1 (gauge) divides all of L by one number,
+    and lines stay lines. So the models of all loads lie on the line between those of two loads, where no constant mass
+    lies between coordinates (`off_diagonal`); λ grows with the load, but not in proportion to it. A number that is
+    named beside it stands as it is given.
+
+    Raise InputError if the name is none or taken, nothing moves, a value is no finite number, or the model has no such
+    number or moves it by another name already. Weights of a network have no line between them.
+    """
+    every = numbers_of(model)
+    chosen(model, list(values))
+    if not re.fullmatch(r"[A-Za-z]\w*", name) or any(re.match(rf"{name}(\W|$)", x) for x in (*every, *lines(model))):
+        raise InputError(f"'{name}' must be a word of letters, digits and _ that the model's numbers do not begin with")
+    moved = {key: x for key, x in values.items() if values_of(model, [key]) != [x]}
+    parameters = {every[key][0] for key in moved}
+    taken = sorted(x for x in parameters if any(x in line.ends for line in lines(model).values()))
+    networks = [key for key in moved if ".network." in key]
+    if not moved or taken or networks:
+        why = f"nothing differs for {name}" if not moved else f"{(taken or networks)[0]} cannot be moved by {name}"
+        raise InputError(f"{why}; give other values of numbers that are no weights of a network, each by one name")
+    end = with_values(model, moved)
+    ends = {x: tuple(m.get_parameter(x).detach().clone() for m in (model, end)) for x in sorted(parameters)}
+    new: Any = copy.deepcopy(model)
+    new.lines = {**lines(model), name: Line(0.0, ends)}  # pyright: ignore[reportArgumentType]
+    return new
 
 
 def chosen(model: ContactLagrangian, names: Sequence[str]) -> list[str]:
@@ -20,7 +74,7 @@ def chosen(model: ContactLagrangian, names: Sequence[str]) -> list[str]:
 
     Raise InputError if a name is none, or one number is named twice.
     """
-    every, found = list(numbers_of(model)), []
+    every, found = [*numbers_of(model), *lines(model)], []
     for name in names:
         own = [x for x in every if x == name or x.startswith((f"{name}[", f"{name}."))]
         if not own:
@@ -35,8 +89,12 @@ def chosen(model: ContactLagrangian, names: Sequence[str]) -> list[str]:
 
 def values_of(model: ContactLagrangian, names: Sequence[str]) -> list[float]:
     """The present values of these numbers."""
-    every = numbers_of(model)
-    return [float(model.get_parameter(every[name][0]).detach().reshape(-1)[every[name][1]]) for name in names]
+    every, own = numbers_of(model), lines(model)
+    return [
+        own[name].value if name in own
+        else float(model.get_parameter(every[name][0]).detach().reshape(-1)[every[name][1]])
+        for name in names
+    ]  # fmt: skip
 
 
 class WithNumbers(nn.Module):
@@ -56,6 +114,7 @@ class WithNumbers(nn.Module):
                 parameter, entry = every[name]
                 places.setdefault(parameter, []).append((entry, k))
         self.places = {key: torch.tensor(rows).T for key, rows in places.items()}
+        self.lines = [(k, lines(model)[name]) for k, name in enumerate(names) if name in lines(model)]
 
     def forward(self, *arguments: Any) -> Any:
         """Evaluate with the model's own parameters."""
@@ -64,9 +123,11 @@ class WithNumbers(nn.Module):
     def at(self, *arguments: Any) -> Any:
         """f(*arguments, θ)."""
         *first, theta = arguments
-        named = {}
+        own_names, named = {name for name, _ in self.model.named_parameters()}, {}
+        for k, line in self.lines:
+            named |= {f"model.{name}": x for name, x in line.at(theta[k]).items() if name in own_names}
         for name, (entries, k) in self.places.items():
-            own = self.model.get_parameter(name).detach()
+            own = named.get(f"model.{name}", self.model.get_parameter(name).detach())
             put = torch.index_put(own.reshape(-1), (entries,), theta[k])
             named[f"model.{name}"] = put.reshape(own.shape)
         return functional_call(self, named, tuple(first))
@@ -77,13 +138,19 @@ def with_values(model: ContactLagrangian, values: Mapping[str, float]) -> Contac
 
     Raise InputError if the model has no number of a name, or a value is not finite.
     """
-    new, every = copy.deepcopy(model), numbers_of(model)
+    every, own = numbers_of(model), lines(model)
+    new: Any = copy.deepcopy(model)
     chosen(model, list(values))
-    for name, value in values.items():
-        if name not in every:
+    for name, value in sorted(values.items(), key=lambda x: x[0] not in own):  # what moves several moves first
+        if name not in every and name not in own:
             raise InputError(f"{name} stands for several numbers of the model; name each of them")
         if not math.isfinite(value):
             raise InputError(f"{name} must be a finite number, got {value}")
+        if name in own:
+            for key, x in own[name].at(torch.tensor(value, dtype=torch.float64)).items():
+                new.get_parameter(key).data.copy_(x)
+            new.lines = {**lines(new), name: own[name]._replace(value=value)}
+            continue
         parameter, entry = every[name]
         new.get_parameter(parameter).data.view(-1)[entry] = value
     return new

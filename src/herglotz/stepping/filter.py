@@ -10,7 +10,11 @@ so that q and p get their share of each other. Positions y = q + e are taken in 
 
     S = P_ii + σ_i²,    x ← x + P_i (y_i − q_i)/S,    P ← P − P_i P_iᵀ/S.
 
-Source: A. Gelb (ed.), Applied optimal estimation (1974), sections 4.2 and 6.1.
+A fixed-lag smoother is the same filter of a longer state: x and copies of x at the last samples, which steps leave as
+they are and positions move by their covariance. `export/runtime/smoother.h` keeps only the blocks of it that change.
+
+Source: A. Gelb (ed.), Applied optimal estimation (1974), sections 4.2 and 6.1; B. D. O. Anderson & J. B. Moore, Optimal
+filtering (1979), section 7.3.
 """
 
 from __future__ import annotations
@@ -43,7 +47,8 @@ class Belief(NamedTuple):
 
     state: State  # (n,), (n,), ()
     theta: Tensor  # (K,)
-    covariance: Tensor  # (F, F) of q, p, s where the motion depends on it, and θ
+    covariance: Tensor  # (F, F) of q, p, s where the motion depends on it, and θ; (F + FL, F + FL) with earlier samples
+    earlier: Tensor | None = None  # (L, F) the same numbers at these, the newest first
 
 
 class KalmanFilter:
@@ -75,6 +80,7 @@ class KalmanFilter:
         self.model, self.noise, self.n = model, noise, model.dof
         self.names = chosen(model, parameters)
         self.kept = 2 * self.n + model.s_enters_motion  # of q, p[, s] in the filter's state
+        self.size = self.kept + len(self.names)  # F
         sizes = {"position": self.n, "momentum": self.n, "theta": len(self.names)}
         for name, size in sizes.items():
             row = getattr(noise, name)
@@ -88,7 +94,7 @@ class KalmanFilter:
 
     def start(self, state: State, std: Tensor, theta: Tensor | None = None) -> Belief:
         """A belief at a state, (n,), (n,), (), with standard deviations (F,); θ is by default that of the model."""
-        size = self.kept + len(self.names)
+        size = self.size
         if std.shape != (size,) or not bool((std.isfinite() & (std >= 0)).all()):
             raise InputError(f"std needs {size} finite standard deviations of q, p[, s] and θ, got {std.tolist()}")
         theta = std.new_tensor(values_of(self.model, self.names)) if theta is None else theta
@@ -100,16 +106,36 @@ class KalmanFilter:
         Raise InputError if the model has no step there.
         """
         found = self._stepped(belief, h, u)
-        kept, P = self.kept, belief.covariance
+        kept, size, P = self.kept, self.size, belief.covariance
         A = torch.eye(len(P), dtype=P.dtype)
         A[:kept, :kept] = found.by_state[:kept, :kept]
         if found.by_parameters is not None:
-            A[:kept, kept:] = found.by_parameters[:kept]
+            A[:kept, kept:size] = found.by_parameters[:kept]
         W = P.new_zeros(len(P))
         W[self.n : 2 * self.n] = P.new_tensor(self.noise.momentum).square() * (h / 2)
-        W[kept:] = P.new_tensor(self.noise.theta).square() * (h / 2)
+        W[kept:size] = P.new_tensor(self.noise.theta).square() * (h / 2)
         P = A @ (P + torch.diag(W)) @ A.T
-        return Belief(found.step.state, belief.theta, (P + P.T) / 2 + torch.diag(W))
+        return belief._replace(state=found.step.state, covariance=(P + P.T) / 2 + torch.diag(W))
+
+    def remember(self, belief: Belief, lag: int) -> Belief:
+        """The belief with the present sample among the earlier ones, of which the last `lag` are kept."""
+        now, size = self._row(belief)[None], self.size
+        earlier = now if belief.earlier is None else torch.cat([now, belief.earlier])[:lag]
+        every = torch.arange(len(belief.covariance))
+        places = torch.cat([every[:size], every])[: size * (1 + len(earlier))]
+        return belief._replace(earlier=earlier, covariance=belief.covariance[places][:, places])
+
+    def smoothed(self, belief: Belief, back: int) -> Belief:
+        """What is known of the sample before the last `back` remembered ones.
+
+        s is that of the belief where the motion does not depend on it. Raise InputError if there is no such sample.
+        """
+        count = 0 if belief.earlier is None else len(belief.earlier)
+        if not 0 <= back <= count:
+            raise InputError(f"back must be 0 to {count}, the samples that are remembered, got {back}")
+        own = slice(back * self.size, (back + 1) * self.size)
+        x = self._row(belief) if belief.earlier is None or not back else belief.earlier[back - 1]
+        return Belief(*self._parts(x, belief.state.s), belief.covariance[own, own])
 
     def update(self, belief: Belief, y: Tensor) -> tuple[Belief, float]:
         """The belief with measured positions y (n,) taken in, and the squared innovation over its variance, summed.
@@ -118,9 +144,8 @@ class KalmanFilter:
         """
         if not bool(y.isfinite().all()):
             raise InputError(f"measured positions must be finite, got {y.tolist()}; leave that sample out")
-        (q, p, s), theta, P = belief
-        x, surprise = torch.cat([q, p, s[None]])[: self.kept], 0.0
-        x = torch.cat([x, theta])
+        P, surprise = belief.covariance, 0.0
+        x = torch.cat([self._row(belief), *(() if belief.earlier is None else belief.earlier)])
         for i in range(self.n):
             own = self.noise.position[i] ** 2
             miss, variance = float(y[i] - x[i]), float(P[i, i]) + own
@@ -130,9 +155,20 @@ class KalmanFilter:
             gain = P[:, i] / variance
             x, P = x + gain * miss, P - torch.outer(gain, gain) * variance
             P[i] = P[:, i] = gain * own  # without cancellation
-        s = x[2 * self.n] if self.kept > 2 * self.n else s
-        theta = torch.minimum(torch.maximum(x[self.kept :], self.low), self.high)
-        return Belief(State(x[: self.n], x[self.n : 2 * self.n], s), theta, P), surprise
+        rows = x.reshape(-1, self.size)
+        rows[:, self.kept :] = torch.minimum(torch.maximum(rows[:, self.kept :], self.low), self.high)
+        earlier = None if belief.earlier is None else rows[1:]
+        return Belief(*self._parts(rows[0], belief.state.s), P, earlier), surprise
+
+    def _row(self, belief: Belief) -> Tensor:
+        """The numbers (F,) of the filter's state."""
+        q, p, s = belief.state
+        return torch.cat([torch.cat([q, p, s[None]])[: self.kept], belief.theta])
+
+    def _parts(self, x: Tensor, s: Tensor) -> tuple[State, Tensor]:
+        """State and θ of these numbers, with this s where the motion does not depend on it."""
+        n, kept = self.n, self.kept
+        return State(x[:n], x[n : 2 * n], x[2 * n] if kept > 2 * n else s), x[kept:]
 
     def velocity(self, belief: Belief, h: Tensor | float, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The velocity (n,) and its covariance (n, n); of many beliefs at once where no θ is estimated.

@@ -5,6 +5,7 @@ import re
 import shutil
 import zipfile
 from argparse import Namespace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,8 +18,9 @@ from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
 from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
 from herglotz.export import compare, export_run, load_exported
-from herglotz.export.load import read_header
+from herglotz.export.load import _is_of, read_header
 from herglotz.export.metadata import KEY
+from herglotz.models.numbers import values_of, with_values
 from herglotz.training import load_run, save_run
 
 pytest.importorskip("onnxruntime")
@@ -239,3 +241,24 @@ def test_parameters_and_extras_of_a_header(tiny_run, tmp_path, capsys):
     capsys.readouterr()
     assert main(["export", str(tiny_run), "--out", str(tmp_path / "arm.onnx"), *asked]) == 2
     assert "C headers only" in capsys.readouterr().err
+
+
+def test_a_number_between_two_runs(tiny_run, tmp_path, capsys):
+    # fails if the command takes one run for the other or loses the bounds, the header is not generated again from the
+    # first run alone, or its numbers are not of the type that was asked for
+    run = load_run(tiny_run)
+    (rate,) = values_of(run.model, ["damping.rate"])
+    save_run(replace(run, model=with_values(run.model, {"damping.rate": rate + 0.2})), tmp_path / "loaded")
+    path = tmp_path / "arm.h"
+    asked = ["--between", f"load={tmp_path / 'loaded'}", "--parameters", "load=0:2", "--dtype", "float32"]
+    assert main(["export", str(tiny_run), "--out", str(path), *asked]) == 0
+    text, found = read_header(path)
+    assert found["parameters"] == {"load": [0.0, 0.0, 2.0]}
+    assert found["between"] == {"load": {"damping.rate": pytest.approx(rate + 0.2, rel=1e-12)}}
+    assert "typedef float arm_real" in text
+    assert _is_of(text, path, run.model)
+    for other, said in (("load", "takes NAME=RUN"), (f"load={tiny_run}", "nothing differs for load")):
+        capsys.readouterr()
+        again = ["--between", other, "--parameters", "load", "--force"]
+        assert main(["export", str(tiny_run), "--out", str(path), *again]) == 2
+        assert said in capsys.readouterr().err

@@ -83,7 +83,52 @@ int follow(long runs, long steps, double h, const double *std, const double *noi
   }
   return status & 15;
 }
+/* Smooths y, of which every third row is no sample, and tells the estimates, covariances and velocities of all lags. */
+int smooth(long steps, double h, const double *std, const double *noises, const double *start, const double *y, int lag,
+           double *found, double *covariance, double *speed, double *surprise) {
+  arm_past past[8];
+  arm_smoother smoother;
+  arm_filter filter;
+  arm_noise noise;
+  arm_state x = arm_start;
+  long k;
+  int i, j, back, status;
+  for (i = 0; i < arm_N; i++) {
+    noise.position[i] = noises[i];
+    noise.momentum[i] = noises[arm_N + i];
+    x.q[i] = start[i];
+    x.p[i] = start[arm_N + i];
+  }
+  for (i = 0; i < arm_P; i++) noise.theta[i] = noises[2 * arm_N + i];
+  status = arm_filter_start(&filter, &x, 0, std) | arm_smoother_start(&smoother, &filter, past, lag);
+  for (k = 0; k < steps; k++) {
+    status |= arm_smoother_predict(&smoother, h, &noise);
+    if (k % 3 != 2) status |= arm_smoother_update(&smoother, y + k * arm_N, &noise, surprise++);
+  }
+  for (back = 0; back <= lag; back++) {
+    const arm_filter *at = arm_smoothed(&smoother, back);
+    if (!at) return -1;
+    for (i = 0; i < arm_N; i++) {
+      *found++ = at->x.q[i];
+      found[arm_N - 1] = at->x.p[i];
+    }
+    found += arm_N;
+    for (i = 0; i < arm_P; i++) *found++ = at->theta.value[i];
+    for (i = 0; i < arm_F; i++)
+      for (j = 0; j < arm_F; j++) *covariance++ = at->P[i][j];
+    status |= arm_filter_velocity(at, h, speed, 0);
+    speed += arm_N;
+  }
+  return (status & 15) | (arm_smoothed(&smoother, lag + 1) != 0 || arm_smoothed(&smoother, -1) != 0) << 5;
+}
 """
+
+
+@pytest.fixture(scope="module")
+def library(double_pendulum, tmp_path_factory):
+    path = tmp_path_factory.mktemp("filter") / "stepper.h"
+    export_c(double_pendulum, path, h=H, name="arm", parameters=NAMES, extras=["filter"])
+    return build(path.read_text(), LOOPS)
 
 
 @pytest.fixture(scope="module")
@@ -102,11 +147,8 @@ def double_pendulum():
 
 
 @pytest.fixture(scope="module")
-def followed(double_pendulum, tmp_path_factory):
+def followed(library):
     """A function that simulates and follows: everything that `follow` writes."""
-    path = tmp_path_factory.mktemp("filter") / "stepper.h"
-    export_c(double_pendulum, path, h=H, name="arm", parameters=NAMES, extras=["filter"])
-    library = build(path.read_text(), LOOPS)
 
     def run(runs, steps, std, noise=NOISE, seed=0):
         n, K, F = 2, 2, 6
@@ -140,6 +182,38 @@ def test_it_is_its_twin_in_python(followed, double_pendulum):
     assert error[0, -1].isfinite().all()
     assert kalman.names == NAMES
     assert (belief.theta - torch.tensor(values_of(double_pendulum, NAMES)).double()).abs().max() > 1e-4
+
+
+def test_the_smoother_is_its_twin_in_python(library, followed, double_pendulum):
+    # fails if the ring of C loses or swaps samples, a sample that is missing moves the lag, or the blocks that C keeps
+    # are not those of the filter of a longer state, which the twin is
+    start, out = followed(1, 17, STD)
+    y, n, F, lag = out[4][0], 2, 6, 5
+    noises = torch.tensor([x for row in NOISE for x in row], dtype=torch.float64)
+    sizes = ((F,), (F, F), (n,))
+    found, covariance, speed = (torch.full((lag + 1, *size), torch.nan, dtype=torch.float64) for size in sizes)
+    surprise = torch.full((17,), torch.nan, dtype=torch.float64)
+    lists = (address(x) for x in (STD, noises, start, y))
+    counts = (ctypes.c_long(17), ctypes.c_double(H))
+    outputs = map(address, (found, covariance, speed, surprise))
+    assert library.smooth(*counts, *lists, ctypes.c_int(lag), *outputs) == 0
+    kalman = KalmanFilter(double_pendulum, NOISE, NAMES)
+    belief, surprises = kalman.start(State(start[:2], start[2:], start.new_zeros(())), STD), []
+    for k in range(17):
+        belief = kalman.predict(belief if k % 3 == 0 and k else kalman.remember(belief, lag), H)
+        if k % 3 != 2:
+            belief, own = kalman.update(belief, y[k])
+            surprises.append(own)
+    torch.testing.assert_close(surprise[: len(surprises)], surprise.new_tensor(surprises), rtol=1e-9, atol=0)
+    for back in range(lag + 1):
+        at = kalman.smoothed(belief, back)
+        wanted = torch.cat([at.state.q, at.state.p, at.theta])
+        torch.testing.assert_close(found[back], wanted, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(covariance[back], at.covariance, rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(speed[back], kalman.velocity(at, H)[0], rtol=1e-10, atol=1e-10)
+    for back in (-1, lag + 1):
+        with pytest.raises(InputError, match="back must be 0 to 5"):
+            kalman.smoothed(belief, back)
 
 
 def test_its_covariance_is_that_of_its_errors(followed):
@@ -193,6 +267,7 @@ def test_velocities_are_better_than_those_of_constant_acceleration(followed):
 PROGRAM = """
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include "stepper.h"
 int main(void) {
   const double nan = strtod("nan", 0), y[2] = {0.1, 0.2}, bad[2] = {0.1, nan};
@@ -200,6 +275,9 @@ int main(void) {
   double std[arm_F] = {0.1, 0.1, 0.1, 0.1, 0.1}, v[2], left, surprise[2];
   arm_noise noise = {{0.01, 0.01}, {0.1, 0.1}, {0.0}};
   arm_filter f, g;
+  arm_past past[2], kept[2];
+  arm_smoother s;
+  int i;
   printf("%d ", arm_filter_start(&f, &arm_start, 0, std));
   g = f;
   printf("%d ", arm_filter_predict(&f, 0.1, &noise));
@@ -214,7 +292,29 @@ int main(void) {
   printf("%d %d ", arm_filter_update(&f, y, &noise, surprise), arm_filter_update(&g, turned, &noise, surprise + 1));
   printf("%d ", fabs(surprise[0] - surprise[1]) < 1e-9 && fabs(f.x.q[0] - g.x.q[0]) < 1e-12);
   printf("%d ", f.theta.value[0] >= arm_lowest.value[0] && f.theta.value[0] <= arm_highest.value[0]);
-  printf("%d\\n", arm_filter_velocity(&f, 0.1, v, 0));
+  printf("%d ", arm_filter_velocity(&f, 0.1, v, 0));
+  printf("%d %d ", arm_smoother_start(&s, &f, past, 0), arm_smoother_start(&s, &f, 0, 2));
+  g = f;
+  g.P[1][0] = nan;
+  printf("%d ", arm_smoother_start(&s, &g, past, 2));
+  f.P[arm_F - 1][0] = f.P[0][arm_F - 1] = 0.05; /* theta leaves its bounds with what is measured */
+  f.P[arm_F - 1][arm_F - 1] = 100.0;
+  printf("%d ", arm_smoother_start(&s, &f, past, 2));
+  printf("%d ", arm_smoothed(&s, 1) == 0);
+  printf("%d ", arm_smoother_predict(&s, 0.1, &noise));
+  printf("%d ", arm_smoother_update(&s, y, &noise, 0));
+  for (i = 0; i < 2; i++) {
+    const double value = (i ? &s.now : &past[0].then)->theta.value[0];
+    printf("%d ", value == arm_lowest.value[0] || value == arm_highest.value[0]);
+  }
+  kept[0] = past[0];
+  g = s.now;
+  noise.momentum[0] = -1.0;
+  printf("%d %d ", arm_smoother_predict(&s, 0.1, &noise), arm_smoother_update(&s, y, &noise, 0));
+  noise.momentum[0] = 0.1;
+  printf("%d %d ", arm_smoother_predict(&s, nan, &noise), arm_smoother_update(&s, bad, &noise, 0));
+  printf("%d ", !memcmp(kept, past, sizeof *past) && !memcmp(&g, &s.now, sizeof g) && arm_smoothed(&s, 2) == 0);
+  printf("%d\\n", arm_smoothed(&s, 1) == &past[0].then);
   return 0;
 }
 """
@@ -233,12 +333,15 @@ def test_what_is_no_number_changes_nothing(double_pendulum, tmp_path):
     )  # fmt: skip
     assert built.returncode == 0, built.stderr[:2000]
     words = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout.split()
-    assert " ".join(words) == "0 0 5 5 5 5 1 5 0 0 1 1 0"
+    assert " ".join(words) == "0 0 5 5 5 5 1 5 0 0 1 1 0 5 5 5 0 1 0 0 1 1 5 5 5 5 1 1"
     if not shutil.which("nm"):
         pytest.skip("no nm")
     library = '#include "stepper.h"\nint f(arm_filter *x, const double *y, const arm_noise *n, double *v);\n' + (
+        "int g(arm_smoother *x, const double *y, const arm_noise *n);\n"
         "int f(arm_filter *x, const double *y, const arm_noise *n, double *v) { return arm_filter_predict(x, 0.1, n) | "
         "arm_filter_update(x, y, n, v) | arm_filter_velocity(x, 0.1, v, 0); }\n"
+        "int g(arm_smoother *x, const double *y, const arm_noise *n) { return arm_smoother_predict(x, 0.1, n) | "
+        "arm_smoother_update(x, y, n, 0); }\n"
     )
     (tmp_path / "f.c").write_text(library)
     compile_ = [str(COMPILER), "-std=c99", "-O2", "-c", str(tmp_path / "f.c"), "-o", str(tmp_path / "f.o")]
@@ -294,3 +397,21 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     theta, std = found.theta[-1, 0], found.covariance[-1, -1, -1].sqrt()
     assert std < 0.1
     assert abs(float(theta) - 0.4) <= 3 * std
+    smooth = hz.filter(run, data, {"friction.viscous": (0.3, 0.0)}, lag=10)
+    torch.testing.assert_close(smooth.surprise, found.surprise, rtol=1e-9, atol=1e-12, equal_nan=True)
+    for end in (len(kept) - 1, 2 * len(kept) - 1):  # the last sample waits for none
+        torch.testing.assert_close(smooth.covariance[end], found.covariance[end], rtol=1e-12, atol=0)
+        assert bool((smooth.covariance[end - 10 : end, 0, 0] < found.covariance[end - 10 : end, 0, 0]).all())
+    for first in (0, len(kept)):
+        assert smooth.covariance[first, 0, 0] < 0.9 * found.covariance[first, 0, 0]
+    begin = Trajectories.of(t[:14], y[:14], (14,), names=("a",), units=("rad",), angles=(True,))
+    until = hz.filter(run, begin, {"friction.viscous": (0.3, 0.0)}, lag=10)  # 3 waits for 13, here and there
+    for row in range(4):
+        torch.testing.assert_close(until.state.q[row], smooth.state.q[row], rtol=1e-9, atol=1e-12)
+    assert abs(float(until.state.q[5] - smooth.state.q[5])) > 1e-6
+    truth = exact[:, kept].reshape(-1, 1)
+    misses = [float((x.state.q - truth)[5:-5].square().mean().sqrt()) for x in (found, smooth)]
+    assert misses[1] <= 0.8 * misses[0]
+    for lag in (-1, len(kept)):
+        with pytest.raises(InputError, match=f"lag must be 0 to {len(kept) - 1}.*got {lag}"):
+            hz.filter(run, data, lag=lag)

@@ -88,7 +88,8 @@ def blocks(found):
 @pytest.mark.parametrize("case", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.slow) for x in CASES])
 def test_steps_at_other_numbers_are_those_of_the_model_with_them(case):
     # fails if a number stays what it was when the header was written, in a step, a guess, a start, the map of inputs,
-    # V at q0 or a derivative; if lanes have other numbers than a sample by itself; or a derivative is another number's
+    # a momentum, V at q0 or a derivative; if lanes have other numbers than a sample by itself; or a derivative is
+    # another number's
     model, states, u = problem(case)
     names = named(model)
     entries = describe(model, H, None, (), 30, {"h_range": None, "parameters": described_parameters(model, names)})
@@ -101,6 +102,8 @@ def test_steps_at_other_numbers_are_those_of_the_model_with_them(case):
     with torch.no_grad():
         wanted = eager.rollout(*states, h=H, steps=4, **inputs)
         begin = eager.init(states.q, states.q + 0.05, states.s, H, first)
+        moving = eager.init_qv(*states, H)  # p stands for a velocity
+        v = eager.velocity(moving, H)
     found = ours.rollout(*states, h=H, steps=4, **inputs)
     alone = ours.rollout(*(x[0] for x in states), h=H, steps=4, **single)
     for name in ("q", "p", "s"):
@@ -109,6 +112,10 @@ def test_steps_at_other_numbers_are_those_of_the_model_with_them(case):
         assert (getattr(alone, name) - getattr(wanted, name)[0]).abs().max() <= 1e-12 * size, name
     assert (ours.init(states.q, states.q + 0.05, states.s, H, first).p - begin.p).abs().max() <= 1e-12
     assert (stepper.rollout(*states, h=H, steps=4, **inputs).q - wanted.q).abs().max() > 1e-4
+    torch.testing.assert_close(ours.init_qv(*states, h=H).p, moving.p, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(ours.velocity(moving, H), v, rtol=1e-12, atol=1e-12)
+    if model.dof > 1:  # one coordinate has the mass 1
+        assert (stepper.init_qv(*states, h=H).p - moving.p).abs().max() > 1e-4
     slopes = blocks(eager.linearise(states, H, first, names))
     assert (blocks(ours.linearise(states, H, first)) - slopes).abs().max() <= 1e-10 * slopes.abs().max()
 

@@ -15,6 +15,7 @@ from herglotz.export import compile_c
 from herglotz.export.c_header import c_source, described
 from herglotz.export.c_stepper import compiled
 from herglotz.export.metadata import describe
+from herglotz.export.parameters import described_parameters
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, StepError, Stepper
 
@@ -74,6 +75,41 @@ def test_where_no_velocity_has_this_momentum():
         assert float(stepper.velocity(State(q[:1], p[:1], s[:1]), 0.1)) == pytest.approx(0.5, rel=1e-14)
         with pytest.raises(StepError, match=r"no velocity at sample \(1,\)"):
             stepper.velocity(State(q, p, s), 0.1)
+
+
+OF_NUMBERS = """
+#include "stepper.h"
+int both(double value, double *out) {
+  const double q[2] = {0.3, -0.2}, v[2] = {0.4, 0.1};
+  model_state x = {{7.0, 7.0}, {7.0, 7.0}, 7.0, 7.0}, usual, null;
+  model_parameters theta = model_defaults;
+  double speed[2] = {7.0, 7.0};
+  int status = model_init_qv(q, v, 0.0, 0.1, &model_defaults, &usual) | model_init_qv(q, v, 0.0, 0.1, 0, &null);
+  theta.value[0] = value;
+  status += model_init_qv(q, v, 0.0, 0.1, &theta, &x);
+  status += 16 * model_velocity(status ? &usual : &x, 0.1, &theta, speed);
+  out[0] = x.p[1];
+  out[1] = speed[0];
+  out[2] = usual.p[1];
+  out[3] = null.p[1];
+  return status;
+}
+"""
+
+
+def test_numbers_out_of_bounds_have_no_velocity():
+    # fails if numbers that are set at run time are not checked before p or v is made of them, are not used, or null is
+    # not the defaults
+    model = model_of(2, "linear")
+    chosen = described_parameters(model, {"kinetic.log_diagonal": (-1.0, 1.0)})
+    entries = describe(model, 0.1, None, (), 30, {"h_range": None, "parameters": chosen})
+    library = build(c_source(model, described(model, entries, "model", "float64", None), "stepper.h"), OF_NUMBERS)
+    out = (ctypes.c_double * 4)()
+    for value, status in ((2.0, 5), (NAN, 5), (0.5, 0)):
+        assert library.both(ctypes.c_double(value), out) == 17 * status
+        assert ([*out[:2]] == [7.0, 7.0]) == bool(status)
+    assert out[1] == pytest.approx(0.4, rel=1e-14)
+    assert out[2] == out[3] != pytest.approx(out[0], rel=1e-3)
 
 
 @pytest.mark.parametrize("case", ["sticking", "m(q), coupled"])

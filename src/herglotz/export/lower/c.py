@@ -222,12 +222,13 @@ def _slopes_source(equations: Equations, step: StepInC) -> str:
 def _momentum_source(equations: Equations, step: StepInC) -> str:
     """The Legendre transform p = L_v as a C function: `herglotz.stepping.velocity`."""
     program, n = Program(tables=step.program.tables), step.n
-    sizes = {"q": n, "v": n, "s": 0, "h": 0}
+    sizes = {"q": n, "v": n, "s": 0, "h": 0, **({"theta": len(equations.numbers)} if equations.numbers else {})}
     arrays = interpret(program, equations.momentum, [program.given(name, size) for name, size in sizes.items()])
     named = zip(("p", "by_v", "grip", "grip_by_v"), arrays, strict=False)
     outputs = {name: list(x.ravel()) for name, x in named}
     head = "\n/* L_v and L_vv at (q, v, s); of set-valued friction (h/2) r(q, v) and its slope by v. */\n"
     head += "static inline void FN_momentum(const REAL q[hz_N], const REAL v[hz_N], REAL s, REAL h,\n    "
+    head += "const REAL theta[hz_P], " if equations.numbers else ""
     head += ", ".join(f"REAL {name}[{'hz_N * hz_N' if name == 'by_v' else 'hz_N'}]" for name in outputs)
     return whole(program, f"{head})", outputs)
 

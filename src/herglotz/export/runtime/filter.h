@@ -64,11 +64,10 @@ static inline void hz_filter_spread(hz_real P[hz_F][hz_F], hz_real h, const hz_n
 #endif /* hz_P */
 }
 
-/* One step of h > 0: P becomes A P A' with A the derivative of the step, and what unknown forces add. Returns the status
-   of hz_step_jacobian, or hz_BAD_INPUT for noise that is none; the filter changes on success only. */
-static inline int hz_filter_predict(hz_filter *filter, hz_real h, hz_TAKES_U const hz_noise *noise) {
+/* hz_filter_predict, which gives A too. */
+static inline int hz_filter_move(hz_filter *filter, hz_real h, hz_TAKES_U const hz_noise *noise, hz_real A[hz_F][hz_F]) {
   enum { SIZE = 2 * hz_N + 1, KEPT = 2 * hz_N + hz_CARRIES_S };
-  hz_real by_state[SIZE * SIZE], A[hz_F][hz_F], P[hz_F][hz_F], half[hz_F][hz_F];
+  hz_real by_state[SIZE * SIZE], P[hz_F][hz_F], half[hz_F][hz_F];
 #if hz_P
   hz_real by_theta[SIZE * hz_P];
 #endif /* hz_P */
@@ -106,46 +105,79 @@ static inline int hz_filter_predict(hz_filter *filter, hz_real h, hz_TAKES_U con
   return status;
 }
 
-/* Take measured positions y in, one after the other, as their noise is independent; angles count modulo a turn.
-   `surprise` (may be null) receives the squared innovation over its variance, summed: hz_N on average. Numbers of theta
-   stay within their bounds. hz_BAD_INPUT where y or the noise is not finite; the filter changes on success only. */
-static inline int hz_filter_update(hz_filter *filter, const hz_real y[hz_N], const hz_noise *noise, hz_real *surprise) {
-  enum { KEPT = 2 * hz_N + hz_CARRIES_S };
-  hz_real gain[hz_F], total = hz_R(0.0);
-  int i, j, k;
-  if (!hz_all_finite(y) || !hz_noise_usable(noise)) return hz_BAD_INPUT;
-  for (i = 0; i < hz_N; i++) {
-    const hz_real own = noise->position[i] * noise->position[i], variance = filter->P[i][i] + own;
-    hz_real miss = y[i] - filter->x.q[i];
-    if (hz_is_angle[i]) {
-      const hz_real turn = hz_R(6.28318530717958647693);
-      miss -= turn * hz_floor_of(miss / turn + hz_R(0.5));
-    }
-    total += miss * miss / variance;
-    for (j = 0; j < hz_F; j++) gain[j] = filter->P[j][i] / variance;
-    for (j = 0; j < hz_N; j++) {
-      filter->x.q[j] += gain[j] * miss;
-      filter->x.p[j] += gain[hz_N + j] * miss;
-    }
-    if (hz_CARRIES_S) filter->x.s += gain[KEPT - 1] * miss;
-#if hz_P
-    for (j = 0; j < hz_P; j++) filter->theta.value[j] += gain[KEPT + j] * miss;
-#endif /* hz_P */
-    for (j = 0; j < hz_F; j++)
-      for (k = 0; k <= j; k++) {
-        /* P - gain variance gain', without cancellation in the row and column of what is measured */
-        if (j != i && k != i) filter->P[j][k] -= gain[j] * gain[k] * variance;
-        filter->P[k][j] = filter->P[j][k];
-      }
-    for (j = 0; j < hz_F; j++) filter->P[i][j] = filter->P[j][i] = gain[j] * own;
+/* One step of h > 0: P becomes A P A' with A the derivative of the step, and what unknown forces add. Returns the status
+   of hz_step_jacobian, or hz_BAD_INPUT for noise that is none; the filter changes on success only. */
+static inline int hz_filter_predict(hz_filter *filter, hz_real h, hz_TAKES_U const hz_noise *noise) {
+  hz_real A[hz_F][hz_F];
+  return hz_filter_move(filter, h, hz_WITH_U(u) noise, A);
+}
+
+/* Add gain * miss to what is estimated. */
+static inline void hz_filter_shift(hz_filter *filter, const hz_real gain[hz_F], hz_real miss) {
+  int j;
+  for (j = 0; j < hz_N; j++) {
+    filter->x.q[j] += gain[j] * miss;
+    filter->x.p[j] += gain[hz_N + j] * miss;
   }
+  if (hz_CARRIES_S) filter->x.s += gain[2 * hz_N] * miss;
 #if hz_P
+  for (j = 0; j < hz_P; j++) filter->theta.value[j] += gain[hz_F - hz_P + j] * miss;
+#endif /* hz_P */
+}
+
+/* Numbers of theta stay within their bounds. */
+static inline void hz_filter_bound(hz_filter *filter) {
+#if hz_P
+  int j;
   for (j = 0; j < hz_P; j++) {
     hz_real *value = filter->theta.value + j;
     if (*value < hz_lowest.value[j]) *value = hz_lowest.value[j];
     if (*value > hz_highest.value[j]) *value = hz_highest.value[j];
   }
+#else
+  (void)filter;
 #endif /* hz_P */
+}
+
+/* The innovation of one measured position, its variance, the part of that which is noise, and the gain. */
+typedef struct {
+  hz_real miss, variance, own, gain[hz_F];
+} hz_innovation;
+
+/* Take measured position i in. */
+static inline void hz_filter_take(hz_filter *filter, int i, hz_real y, const hz_noise *noise, hz_innovation *found) {
+  int j, k;
+  found->own = noise->position[i] * noise->position[i];
+  found->variance = filter->P[i][i] + found->own;
+  found->miss = y - filter->x.q[i];
+  if (hz_is_angle[i]) {
+    const hz_real turn = hz_R(6.28318530717958647693);
+    found->miss -= turn * hz_floor_of(found->miss / turn + hz_R(0.5));
+  }
+  for (j = 0; j < hz_F; j++) found->gain[j] = filter->P[j][i] / found->variance;
+  hz_filter_shift(filter, found->gain, found->miss);
+  for (j = 0; j < hz_F; j++)
+    for (k = 0; k <= j; k++) {
+      /* P - gain variance gain', without cancellation in the row and column of what is measured */
+      if (j != i && k != i) filter->P[j][k] -= found->gain[j] * found->gain[k] * found->variance;
+      filter->P[k][j] = filter->P[j][k];
+    }
+  for (j = 0; j < hz_F; j++) filter->P[i][j] = filter->P[j][i] = found->gain[j] * found->own;
+}
+
+/* Take measured positions y in, one after the other, as their noise is independent; angles count modulo a turn.
+   `surprise` (may be null) receives the squared innovation over its variance, summed: hz_N on average. Numbers of theta
+   stay within their bounds. hz_BAD_INPUT where y or the noise is not finite; the filter changes on success only. */
+static inline int hz_filter_update(hz_filter *filter, const hz_real y[hz_N], const hz_noise *noise, hz_real *surprise) {
+  hz_innovation found;
+  hz_real total = hz_R(0.0);
+  int i;
+  if (!hz_all_finite(y) || !hz_noise_usable(noise)) return hz_BAD_INPUT;
+  for (i = 0; i < hz_N; i++) {
+    hz_filter_take(filter, i, y[i], noise, &found);
+    total += found.miss * found.miss / found.variance;
+  }
+  hz_filter_bound(filter);
   if (surprise) *surprise = total;
   return hz_CONVERGED;
 }

@@ -84,12 +84,12 @@ void herglotz_inits(long batch, const hz_real *q0, const hz_real *q1, const hz_r
 #ifdef hz_VELOCITIES
 /* Momenta of positions and velocities; h is one a sample. */
 void herglotz_momenta(long batch, const hz_real *q, const hz_real *v, const hz_real *s, const hz_real *h,
-    hz_real *p_out, unsigned char *status_out) {
+    hz_TAKES_THETA hz_real *p_out, unsigned char *status_out) {
   long b;
   int i;
   for (b = 0; b < batch; b++) {
     hz_state x;
-    const int status = 15 & hz_init_qv(q + b * hz_N, v + b * hz_N, s[b], h[b], &x);
+    const int status = 15 & hz_init_qv(q + b * hz_N, v + b * hz_N, s[b], h[b], hz_WITH_THETA(theta) &x);
     status_out[b] = (unsigned char)status;
     for (i = 0; !status && i < hz_N; i++) p_out[b * hz_N + i] = x.p[i];
   }
@@ -97,12 +97,12 @@ void herglotz_momenta(long batch, const hz_real *q, const hz_real *v, const hz_r
 
 /* And back. */
 void herglotz_velocities(long batch, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
-    hz_real *v_out, unsigned char *status_out) {
+    hz_TAKES_THETA hz_real *v_out, unsigned char *status_out) {
   long b;
   for (b = 0; b < batch; b++) {
     hz_state x;
     load(q, p, s, b, &x);
-    status_out[b] = (unsigned char)(15 & hz_velocity(&x, h[b], v_out + b * hz_N));
+    status_out[b] = (unsigned char)(15 & hz_velocity(&x, h[b], hz_WITH_THETA(theta) v_out + b * hz_N));
   }
 }
 #endif

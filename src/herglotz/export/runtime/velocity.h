@@ -9,12 +9,13 @@ typedef struct {
   hz_real p[hz_N], by_v[hz_N * hz_N], grip[hz_N], grip_by_v[hz_N];
 } hz_legendre;
 
-static inline void hz_legendre_at(const hz_real q[hz_N], const hz_real v[hz_N], hz_real s, hz_real h, hz_legendre *at) {
+static inline void hz_legendre_at(const hz_real q[hz_N], const hz_real v[hz_N], hz_real s, hz_real h,
+    hz_TAKES_THETA hz_legendre *at) {
 #if hz_STICKING
-  hz_momentum(q, v, s, h, at->p, at->by_v, at->grip, at->grip_by_v);
+  hz_momentum(q, v, s, h, hz_WITH_THETA(theta->value) at->p, at->by_v, at->grip, at->grip_by_v);
 #else
   int i;
-  hz_momentum(q, v, s, h, at->p, at->by_v);
+  hz_momentum(q, v, s, h, hz_WITH_THETA(theta->value) at->p, at->by_v);
   for (i = 0; i < hz_N; i++) at->grip[i] = at->grip_by_v[i] = hz_R(0.0);
 #endif
 }
@@ -61,7 +62,8 @@ static inline hz_real hz_largest(const hz_real x[hz_N]) {
 /* The state at q with the velocity v, in hz_units over the unit of time, and the action s; sigma starts at 1. h is the
    step that the motion goes on with: it matters where dry friction can hold a coordinate, and is checked as that of a
    step. `out` is written on success only. Returns a status. */
-static inline int hz_init_qv(const hz_real q[hz_N], const hz_real v[hz_N], hz_real s, hz_real h, hz_state *out) {
+static inline int hz_init_qv(const hz_real q[hz_N], const hz_real v[hz_N], hz_real s, hz_real h,
+    hz_TAKES_THETA hz_state *out) {
   hz_legendre at;
   hz_state next;
   int i;
@@ -72,7 +74,11 @@ static inline int hz_init_qv(const hz_real q[hz_N], const hz_real v[hz_N], hz_re
   next.s = s;
   next.sigma = hz_R(1.0);
   if (hz_before(&next, h)) return hz_BAD_INPUT;
-  hz_legendre_at(q, v, s, h, &at);
+#if hz_P
+  if (!theta) theta = &hz_defaults;
+  if (!hz_in_bounds(theta)) return hz_BAD_INPUT;
+#endif /* hz_P */
+  hz_legendre_at(q, v, s, h, hz_WITH_THETA(theta) &at);
   for (i = 0; i < hz_N; i++)
     next.p[i] = at.p[i] + (v[i] > hz_R(0.0) ? at.grip[i] : v[i] < hz_R(0.0) ? -at.grip[i] : hz_R(0.0));
   if (!hz_all_finite(next.p)) return hz_DIVERGED;
@@ -83,15 +89,19 @@ static inline int hz_init_qv(const hz_real q[hz_N], const hz_real v[hz_N], hz_re
 /* The velocity of a state that steps of h have made: the inverse of hz_init_qv, by Newton from rest; a move that does
    not lessen what is left of p is halved. `v` is written on success only. Returns a status: hz_SINGULAR or
    hz_MAX_ITERATIONS where no velocity with this p is found. */
-static inline int hz_velocity(const hz_state *state, hz_real h, hz_real v[hz_N]) {
+static inline int hz_velocity(const hz_state *state, hz_real h, hz_TAKES_THETA hz_real v[hz_N]) {
   hz_legendre at;
   hz_real z[hz_N], base[hz_N], move[hz_N], own[hz_N], bound[hz_N], G[hz_N], A[hz_N * hz_N], now[hz_N];
   hz_real scale = hz_R(0.0), merit, before = hz_R(0.0), last = hz_R(0.0), part = hz_R(1.0);
   int i, j, sweep, iteration, better;
   const int status = hz_before(state, h);
   if (status) return status;
+#if hz_P
+  if (!theta) theta = &hz_defaults;
+  if (!hz_in_bounds(theta)) return hz_BAD_INPUT;
+#endif /* hz_P */
   for (i = 0; i < hz_N; i++) z[i] = move[i] = base[i] = now[i] = hz_R(0.0);
-  hz_legendre_at(state->q, z, state->s, h, &at);
+  hz_legendre_at(state->q, z, state->s, h, hz_WITH_THETA(theta) &at);
   for (i = 0; i < hz_N; i++) {
     own[i] = hz_fabs(at.by_v[i * hz_N + i]);
     bound[i] = hz_STICKING ? at.grip[i] / own[i] : hz_R(0.0);
@@ -105,7 +115,7 @@ static inline int hz_velocity(const hz_state *state, hz_real h, hz_real v[hz_N])
     }
   for (iteration = 0; iteration <= hz_max_iterations; iteration++) {
     for (i = 0; i < hz_N; i++) now[i] = hz_beyond(z[i], bound[i]);
-    hz_legendre_at(state->q, now, state->s, h, &at);
+    hz_legendre_at(state->q, now, state->s, h, hz_WITH_THETA(theta) &at);
     for (i = 0; i < hz_N; i++) {
       const int slides = !hz_STICKING || now[i] != hz_R(0.0);
       const hz_real sign = now[i] > hz_R(0.0) ? hz_R(1.0) : hz_R(-1.0);
