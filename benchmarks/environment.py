@@ -1,8 +1,9 @@
 """Environment steps a second beside MuJoCo's: `python benchmarks/environment.py [--quick] [--out FOLDER]`.
 
 A pendulum and a cart with a pole are simulated by MuJoCo (RK4, steps of 1 ms), their motion under random inputs is
-recorded and fitted, and `hz.VectorEnv` of the fit is stepped against MuJoCo itself at the same step. Ours is the whole
-environment: step in C, velocities, reward, checks, observations and resets. MuJoCo's is its physics alone, without a
+recorded with noise and fitted, and `hz.VectorEnv` of the fit is stepped against MuJoCo itself. An environment step is
+20 ms; the fit says how many steps of the model that is, and MuJoCo takes the same steps. Ours is the whole environment: steps in C,
+velocities, reward, checks, observations and resets. MuJoCo's is its physics alone, without a
 reward, by the faster of its two batches, `mujoco.rollout` and `mujoco.batch`, without contacts and constraints, whose
 integrator is its own default (semi-implicit Euler, order 1) and RK4. Both have one thread and the same inputs, a new
 one each step; what is compared is timed in turn within each repeat, in processor time. Needs mujoco and gymnasium:
@@ -24,8 +25,9 @@ import herglotz as hz
 from benchmarks import harness
 from benchmarks.harness import seconds
 
-H = 0.02  # of all steps that are compared
-FINE = 0.001  # of the recorded motion
+H = 0.02  # of an environment step, in s
+FINE = 0.001  # step of the recorded motion, in s
+NOISE = 5e-3  # of recorded positions, in m and rad
 BATCHES = (1, 64, 4096)
 OPTION = '<mujoco><option timestep="{h}" integrator="{integrator}"><flag contact="disable" constraint="disable"/></option>'
 SYSTEMS = {
@@ -59,15 +61,16 @@ def motion(mujoco: Any, system: str, h: float, integrator: str, start: np.ndarra
 
 
 def recordings(mujoco: Any, system: str) -> list[dict[str, np.ndarray]]:
-    """Four recordings of 4 s under a force that changes every 0.2 s; a cart is held on its track by a spring."""
+    """Four recordings of 4 s under a force that changes every 0.2 s."""
     draw, found = np.random.default_rng(0), []
     for start in (0.5, 2.0, -2.8, -1.5):
         q = np.zeros(len(COORDINATES[system]))
         q[-1] = start
         u = FORCE[system] * draw.uniform(-1, 1, 20).repeat(10)
         path = motion(mujoco, system, FINE, "RK4", q, u)
-        found.append({"t[s]": H * np.arange(201), **dict(zip(COORDINATES[system], path.T, strict=True)),
-                      "force[N]": np.r_[u, u[-1]]})  # fmt: skip
+        path += NOISE * draw.normal(size=path.shape)
+        columns = dict(zip(COORDINATES[system], path.T, strict=True))
+        found.append({"t[s]": H * np.arange(201), **columns, "force[N]": np.r_[u, u[-1]]})
     return found
 
 
@@ -87,18 +90,21 @@ def environment(run: hz.Run, count: int) -> Any:
     return made
 
 
-def mujoco_ways(mujoco: Any, system: str, integrator: str, count: int) -> dict[str, Callable[[np.ndarray], Any]]:
-    """One step of `count` simulations on this thread, by each of MuJoCo's batches."""
+def mujoco_ways(
+    mujoco: Any, system: str, integrator: str, h: float, count: int
+) -> dict[str, Callable[[np.ndarray], Any]]:
+    """H of `count` simulations in steps of h on this thread, by each of MuJoCo's batches."""
     from mujoco import rollout  # pyright: ignore[reportMissingImports]
 
-    model = model_of(mujoco, system, H, integrator)
+    model, parts = model_of(mujoco, system, h, integrator), round(H / h)
     size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    state, sensors = np.zeros((count, 1, size)), np.zeros((count, 1, 0))
-    state[:, 0, model.nq] = 0.1
+    state, sensors = np.zeros((count, parts, size)), np.zeros((count, parts, 0))
+    state[:, -1, model.nq] = 0.1
     pool, data, models = rollout.Rollout(nthread=0), [mujoco.MjData(model)], [model] * count
 
     def by_rollout(u: np.ndarray) -> None:
-        pool.rollout(models, data, state[:, 0], u[:, None], nstep=1, state=state, sensordata=sensors, skip_checks=True)
+        held = {"control": u[:, None].repeat(parts, 1), "nstep": parts}
+        pool.rollout(models, data, state[:, -1].copy(), **held, state=state, sensordata=sensors, skip_checks=True)
 
     ways: dict[str, Callable[[np.ndarray], Any]] = {"mujoco.rollout": by_rollout}
     try:
@@ -110,7 +116,7 @@ def mujoco_ways(mujoco: Any, system: str, integrator: str, count: int) -> dict[s
 
     def by_batch(u: np.ndarray) -> None:
         control[:] = u
-        batch.step()
+        batch.step(nstep=parts)
 
     return ways | {"mujoco.batch": by_batch}
 
@@ -123,9 +129,7 @@ def errors(mujoco: Any, system: str, run: hz.Run) -> Row:
     exact = motion(mujoco, system, FINE, "RK4", start, u)
     parts = round(H / run.h)
     ours = run.rollout(100 * parts, q0=start, v0=0 * start, inputs=u.repeat(parts)[:, None], h=run.h).q[::parts]
-    found = {"ours": ours} | {
-        name: motion(mujoco, system, H, name, start, u) for name in ("Euler", "RK4")
-    }
+    found = {"ours": ours} | {name: motion(mujoco, system, run.h, name, start, u) for name in ("Euler", "RK4")}
     return {name: float(np.sqrt(np.mean((q - exact)[:, -1] ** 2))) for name, q in found.items()}
 
 
@@ -136,7 +140,7 @@ def compared(mujoco: Any, system: str, run: hz.Run, count: int, quick: bool) -> 
     steps = max(16, (2_000 if quick else 20_000) // count)
     found = []
     for integrator in ("Euler", "RK4"):
-        calls = {"ours": env.step} | mujoco_ways(mujoco, system, integrator, count)
+        calls = {"ours": env.step} | mujoco_ways(mujoco, system, integrator, run.h, count)
 
         def many(call: Callable[[np.ndarray], Any], steps: int = steps) -> None:
             for k in range(steps):
@@ -164,7 +168,7 @@ def table(found: Row) -> str:
     ]  # fmt: skip
     head = ("system", "B", "ours, ns a step", "MuJoCo, ns a step", "by", "ratio", "range")
     lines = [*harness.table(head, rows), ""]
-    head = ("system", "ours, rad", "MuJoCo Euler", "MuJoCo RK4", "our step / s")
+    head = ("system", "ours, rad", "MuJoCo Euler, rad", "MuJoCo RK4, rad", "step of all, s")
     lines += harness.table(head, [
         [name, *(f"{e[key]:.2g}" for key in ("ours", "Euler", "RK4")), f"{e['h']:g}"] for name, e in found["errors"].items()
     ])  # fmt: skip

@@ -182,7 +182,7 @@ static inline int hz_run_batch(long count, hz_state *states, const hz_job *job, 
   for (b = 0; b < count; b += some) {
     for (w = 0; w < hz_SIDE && b + w < count; w++) {
       status[w] = possible ? hz_before(states + b + w, *job->h) : hz_BAD_INPUT;
-      flags[w] = status[w] ? 0 : hz_outside_box(states + b + w) | hz_outside_h(*job->h);
+      flags[w] = status[w] ? 0 : hz_outside_h(*job->h);
     }
     some = possible ? hz_run_some(states + b, b, count, job, status, flags) : 1;
     for (w = 0; w < some; w++) {
