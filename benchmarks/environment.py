@@ -2,12 +2,14 @@
 
 A pendulum and a cart with a pole are simulated by MuJoCo (RK4, steps of 1 ms), their motion under random inputs is
 recorded with noise and fitted, and `hz.VectorEnv` of the fit is stepped against MuJoCo itself. An environment step is
-20 ms; the fit says how many steps of the model that is, and MuJoCo takes the same steps. Ours is the whole environment: steps in C,
-velocities, reward, checks, observations and resets. MuJoCo's is its physics alone, without a
-reward, by the faster of its two batches, `mujoco.rollout` and `mujoco.batch`, without contacts and constraints, whose
-integrator is its own default (semi-implicit Euler, order 1) and RK4. Both have one thread and the same inputs, a new
-one each step; what is compared is timed in turn within each repeat, in processor time. Needs mujoco and gymnasium:
-`pip install 'herglotz[gymnasium]' mujoco`. Writes environment.json and environment.md.
+20 ms; the fit says how many steps of the model that is, and MuJoCo takes the same steps.
+
+Ours is the whole environment: steps in C, velocities, reward, checks, observations and resets. MuJoCo's is its physics
+alone, without contacts, constraints and a reward, by the faster of its two batches, `mujoco.rollout` and
+`mujoco.batch`, and with two integrators: its default (semi-implicit Euler, order 1) and RK4. Both have one thread and
+the same inputs, new ones each step; what is compared is timed in turn within each repeat, in processor time.
+
+Needs mujoco and gymnasium: `pip install 'herglotz[gymnasium]' mujoco`. Writes environment.json and environment.md.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ H = 0.02  # of an environment step, in s
 FINE = 0.001  # step of the recorded motion, in s
 NOISE = 5e-3  # of recorded positions, in m and rad
 BATCHES = (1, 64, 4096)
-OPTION = '<mujoco><option timestep="{h}" integrator="{integrator}"><flag contact="disable" constraint="disable"/></option>'
+OPTION = (
+    '<mujoco><option timestep="{h}" integrator="{integrator}"><flag contact="disable" constraint="disable"/></option>'
+)
 SYSTEMS = {
     "pendulum": """<worldbody><body><joint name="theta" type="hinge" axis="0 1 0" damping="0.1"/>
       <inertial pos="0 0 -0.5" mass="1" diaginertia="0.02 0.02 0.02"/></body></worldbody>
@@ -169,10 +173,9 @@ def table(found: Row) -> str:
     head = ("system", "B", "ours, ns a step", "MuJoCo, ns a step", "by", "ratio", "range")
     lines = [*harness.table(head, rows), ""]
     head = ("system", "ours, rad", "MuJoCo Euler, rad", "MuJoCo RK4, rad", "step of all, s")
-    lines += harness.table(head, [
-        [name, *(f"{e[key]:.2g}" for key in ("ours", "Euler", "RK4")), f"{e['h']:g}"] for name, e in found["errors"].items()
-    ])  # fmt: skip
-    return "\n".join(lines)
+    keys = ("ours", "Euler", "RK4", "h")
+    rows = [[name, *(f"{one[key]:.2g}" for key in keys)] for name, one in found["errors"].items()]
+    return "\n".join([*lines, *harness.table(head, rows)])
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -43,12 +43,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     An observation is (q, v), 2n numbers in the units of the data and these over its unit of time; an angle lies within
     half a turn of the middle of its recorded range. An action is u, m numbers in the units of the data; beyond the
-    bounds it saturates, as an actuator does. p = ∂L/∂v is made of v at a reset, and v of p after each step (`docs/c.md`).
+    bounds it saturates, as an actuator does. p = ∂L/∂v is made of v at a reset, and v of p after each step
+    (`docs/c.md`).
 
     An environment ends (`terminated`) where a step fails and where a state leaves the box of the data that the model
-    was fitted to: it learned nothing beyond. `infos["status"]`, (B,), then has the `Status` of the step, plus 16 for the
-    box, and `infos["_status"]` says of which environments. No observation is NaN: after a failed step it is that of the
-    last good state, and a position outside the box is put on its end.
+    was fitted to: beyond it the model extrapolates. `infos["status"]`, (B,), then has the `Status` of the step, plus 16
+    for the box, and `infos["_status"]` says of which environments. No observation is NaN: after a failed step it is
+    that of the last good state, and a position outside the box is put on its end.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         h: float | None = None,
         steps_per_action: int = 1,
         max_episode_steps: int | None = None,
-        autoreset_mode: str | Mode = "NextStep",
+        autoreset_mode: str | gymnasium.vector.AutoresetMode = "NextStep",
         dtype: str = "float64",
         trust_code: bool = False,
     ):
@@ -227,14 +228,14 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         drawn = tuple(self._draw(self.np_random, count))
         refuse({f"reset must return (q, v) or (q, v, s), got {len(drawn)} entries": len(drawn) not in (2, 3)})
         parts = {"q": (count, n), "v": (count, n), "s": (count,)}
-        arrays = [np.ascontiguousarray(x, self._own) for x in (*drawn, np.zeros(count))[:3]]
+        q, v, s = arrays = [np.ascontiguousarray(x, self._own) for x in (*drawn, np.zeros(count))[:3]]
         for (name, shape), x in zip(parts.items(), arrays, strict=True):
             refuse({f"reset: {name} must have the shape {shape}, got {x.shape}": x.shape != shape})
             if not np.isfinite(x).all():
                 row = int((~np.isfinite(x)).reshape(count, -1).any(1).argmax())
                 raise InputError(f"reset: {name} of row {row} is NaN or inf; draw finite numbers")
-        q, v, s = arrays
-        p, _ = self._library.momentum(*map(torch.from_numpy, arrays), self._h.expand(count).contiguous())
+        tensors = (torch.from_numpy(x) for x in (q, v, s))
+        p, _ = self._library.momentum(*tensors, h=self._h.expand(count).contiguous())
         states = np.concatenate([q, p.numpy(), s[:, None], np.ones((count, 1), self._own)], 1)
         observed, status = np.zeros((count, 2 * n), self._own), np.zeros(count, np.int32)
         self._call(states, np.zeros((count, self._u.shape[1]), self._own), 0, (observed, status))()
@@ -258,13 +259,14 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise InputError(f"reward: {rewards[row]} for environment {row} at {at}; give finite rewards")
         return rewards
 
-    def _answer(self, name: str, given: Any, kind: type) -> Array:
+    def _answer(self, name: str, answer: Any, kind: type) -> Array:
         """(B,) numbers or booleans that a user's function gave, as an array of their own."""
-        found = np.array(given)
+        found = np.array(answer)
         right = found.dtype == bool if kind is bool else found.dtype.kind in "fiub"
         if found.shape != (self.num_envs,) or not right:
             wanted = "booleans" if kind is bool else "numbers"
-            raise InputError(f"{name} must return ({self.num_envs},) {wanted}, got {found.dtype} of shape {found.shape}")
+            given = f"{found.dtype} of shape {found.shape}"
+            raise InputError(f"{name} must return ({self.num_envs},) {wanted}, got {given}")
         return found.astype(kind, copy=False)
 
 
@@ -301,7 +303,8 @@ def _library_of(stepper: ExportedStepper) -> CLibrary:
         f"{path}: the model takes no inputs, so there is no action; fit a recording of a driven motion":
             not stepper.inputs,
         f"{path}: the inputs {', '.join(terms)} follow from others and are no actions; fit without them": bool(terms),
-        f"{path}: the header holds no velocities; export it again, without parameters": "velocity" not in stepper.programs,
+        f"{path}: the header holds no velocities; export it again, without parameters":
+            "velocity" not in stepper.programs,
     })  # fmt: skip
     arrival = metadata.get("arrival", {})
     late = {name: value for name in ("delay", "lag") if (value := arrival.get(name))}
@@ -316,10 +319,10 @@ def _library_of(stepper: ExportedStepper) -> CLibrary:
 def _positions(stepper: ExportedStepper) -> tuple[Array, Array]:
     """(n,) lowest and highest observed positions: those of the box, of an angle at most a turn."""
     box, angles = stepper.metadata["box"], np.array(stepper.metadata["angles"], bool)
-    low, high = (np.array(box[f"q_{end}"]) if box else np.full(stepper.dof, x) for end, x in
-                 (("low", -np.inf), ("high", np.inf)))  # fmt: skip
-    middle = np.where(np.isfinite(low), (low + high) / 2, 0.0) if box else np.zeros(stepper.dof)
-    return np.where(angles, np.maximum(low, middle - np.pi), low), np.where(angles, np.minimum(high, middle + np.pi), high)
+    high = np.array(box["q_high"]) if box else np.full(stepper.dof, np.inf)
+    low = np.array(box["q_low"]) if box else -high
+    middle, turns = (low + high) / 2 if box else 0 * angles, angles & (high - low > 2 * np.pi)
+    return np.where(turns, middle - np.pi, low), np.where(turns, middle + np.pi, high)
 
 
 def _input_bounds(stepper: ExportedStepper, low: Any, high: Any) -> tuple[Array, Array]:

@@ -53,7 +53,8 @@ class Mode(enum.Enum):
 
 
 def batch_space(one, count):
-    return Box(*(np.repeat(end[None], count, 0) for end in (one.low, one.high)), one.dtype)
+    low, high = (np.repeat(end[None], count, 0) for end in (one.low, one.high))
+    return Box(low, high, one.dtype)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -148,7 +149,7 @@ def test_the_same_seed_gives_the_same_motion(stepper):  # fails if starts are no
 
 
 def test_the_next_step_resets(stepper):
-    # fails if an episode is cut a step early or late, its reset counts as a step, gives a reward, or moves by the action
+    # fails if an episode is cut a step early or late, its reset counts as a step, or gives a reward or a move
     env = made(stepper, max_episode_steps=3, reset=fixed(0.25, 0.0))
     env.reset(seed=0)
     for k in range(8):
@@ -180,7 +181,7 @@ def test_the_same_step_resets(stepper):
 
 
 def test_a_user_resets(stepper):  # fails if an ended environment steps on, or others are reset with it
-    ends = lambda q, v, u: q[:, 0] > 0.3  # noqa: ARG005, E731
+    ends = lambda q, *_: q[:, 0] > 0.3  # noqa: E731
     starts = np.array([[0.29], [0.0]])
     draw = lambda _, count: (starts[:count], np.full((count, 1), 0.9))  # noqa: E731
     env = made(stepper, num_envs=2, autoreset_mode="Disabled", reset=draw, terminated=ends)
@@ -224,7 +225,7 @@ def test_a_failed_step_ends_one_environment():
     fast = np.zeros((B, 1))
     fast[2] = 1e300  # the action of a step is beyond the largest number
     starts = lambda _, count: (np.full((count, 1), 0.5), fast[:count])  # noqa: E731
-    env = made(compile_c(pendulum(), h=H), reset=starts, reward=lambda q, v, u: q[:, 0])
+    env = made(compile_c(pendulum(), h=H), reset=starts, reward=lambda q, *_: q[:, 0])
     first, _ = env.reset()
     observed, _, terminated, _, infos = env.step(np.zeros((B, 1)))
     assert terminated.tolist() == infos["_status"].tolist() == [i == 2 for i in range(B)]
@@ -275,8 +276,8 @@ def test_a_header_and_a_run_give_the_range_of_inputs(tmp_path):
     model, n = pendulum(), 30
     u = torch.linspace(-1, 2, n, dtype=torch.float64)[:, None]
     with torch.no_grad():
-        motion = Stepper(model).rollout(*(torch.zeros(x, dtype=torch.float64) for x in (1, 1)),
-                                        torch.tensor(0.0).double(), h=H, steps=n - 1, inputs=u[:-1])  # fmt: skip
+        still = torch.zeros(1, dtype=torch.float64)
+        motion = Stepper(model).rollout(still, still, still[0], h=H, steps=n - 1, inputs=u[:-1])
     data = replace(hz.Trajectories.of(H * np.arange(n), motion.q, u=u, angles=(True,), source="X", hold="zero"),
                    columns=(("F", "input", "N"),))  # fmt: skip
     states = State(motion.q, motion.p, motion.s)
@@ -331,9 +332,9 @@ def test_what_is_no_environment_is_refused(tmp_path):
 
 
 WRONG = [
-    (lambda g, k: (np.zeros((k, 1)),), r"reset must return \(q, v\) or \(q, v, s\), got 1 entries"),
-    (lambda g, k: (np.zeros(k), np.zeros((k, 1))), r"reset: q must have the shape \(7, 1\), got \(7,\)"),
-    (lambda g, k: (np.zeros((k, 1)), np.full((k, 1), np.inf)), "reset: v of row 0 is NaN or inf; draw finite numbers"),
+    (lambda _, k: (np.zeros((k, 1)),), r"reset must return \(q, v\) or \(q, v, s\), got 1 entries"),
+    (lambda _, k: (np.zeros(k), np.zeros((k, 1))), r"reset: q must have the shape \(7, 1\), got \(7,\)"),
+    (lambda _, k: (np.zeros((k, 1)), np.full((k, 1), np.inf)), "reset: v of row 0 is NaN or inf; draw finite numbers"),
     (fixed(2.5, 0.0), r"reset: row 0, q = \[2.5\], v = \[0.0\], is outside the box of the fitted data"),
 ]
 
@@ -347,9 +348,9 @@ def test_a_wrong_start_is_named(stepper, reset, message):  # fails if an episode
 def test_wrong_answers_and_actions_are_named(stepper):
     # fails if a NaN reaches an agent, or an array of another shape is spread over environments
     cases: list[tuple[dict[str, Any], str]] = [
-        ({"reward": lambda q, v, u: q}, r"reward must return \(7,\) numbers, got float64 of shape \(7, 1\)"),
-        ({"reward": lambda q, v, u: np.where(q[:, 0] == q[4, 0], np.nan, 0.0)}, "reward: nan for environment 4 at q ="),
-        ({"terminated": lambda q, v, u: q[:, 0]}, r"terminated must return \(7,\) booleans, got float64"),
+        ({"reward": lambda q, *_: q}, r"reward must return \(7,\) numbers, got float64 of shape \(7, 1\)"),
+        ({"reward": lambda q, *_: np.where(q[:, 0] == q[4, 0], np.nan, 0.0)}, "reward: nan for environment 4 at q ="),
+        ({"terminated": lambda q, *_: q[:, 0]}, r"terminated must return \(7,\) booleans, got float64"),
     ]
     for options, message in cases:
         env = made(stepper, **options)
@@ -414,4 +415,3 @@ def test_it_is_an_environment_of_gymnasium(stepper, mode):
     assert (infos["episode"]["l"] == 5).all()
     np.testing.assert_allclose(infos["episode"]["r"], returns)
     wrapped.close()
-

@@ -1,4 +1,4 @@
-"""exp, expm1, artanh, and in registers sin and cos, of the C runtime are series of its own: here beside the C library's, alone and in registers."""
+"""exp, expm1, artanh and, in registers, sin and cos of the C runtime are series: here beside the C library's."""
 
 import ctypes
 import shutil
