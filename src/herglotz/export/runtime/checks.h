@@ -9,7 +9,7 @@ static inline int hz_outside_box(const hz_state *state) {
     hz_real q = state->q[i];
     if (hz_is_angle[i]) {
       const hz_real turn = hz_R(6.28318530717958647693), middle = (hz_q_low[i] + hz_q_high[i]) / hz_R(2.0);
-      q -= turn * hz_floor_of((q - middle) / turn + hz_R(0.5));
+      q -= turn * hz_floor_of((q - middle) * hz_R(0.15915494309189533577) + hz_R(0.5));
     }
     if (!(q >= hz_q_low[i] && q <= hz_q_high[i])) return hz_OUTSIDE_BOX;
     if (!(state->p[i] >= hz_p_low[i] && state->p[i] <= hz_p_high[i])) return hz_OUTSIDE_BOX;

@@ -126,7 +126,7 @@ void herglotz_holds(long batch, long steps, hz_state *states, const hz_real *h, 
     for (i = 0; i < hz_N; i++) {
       const hz_real turn = (hz_real)6.28318530717958647693, middle = (low[i] + high[i]) / (hz_real)2.0;
       hz_real q = states[b].q[i];
-      if (hz_is_angle[i]) q -= turn * hz_floor_of((q - middle) / turn + (hz_real)0.5);
+      if (hz_is_angle[i]) q -= turn * hz_floor_of((q - middle) * (hz_real)0.15915494309189533577 + (hz_real)0.5);
       observed[i] = q < low[i] ? low[i] : q > high[i] ? high[i] : q;
     }
   }
