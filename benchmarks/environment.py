@@ -30,7 +30,7 @@ from benchmarks.harness import seconds
 H = 0.02  # of an environment step, in s
 FINE = 0.001  # step of the recorded motion, in s
 NOISE = 5e-3  # of recorded positions, in m and rad
-BATCHES = (1, 64, 4096)
+BATCHES = {1: 1000, 64: 200, 4096: 16}  # number of environments: steps of a repeat, of some 10 to 100 ms
 OPTION = (
     '<mujoco><option timestep="{h}" integrator="{integrator}"><flag contact="disable" constraint="disable"/></option>'
 )
@@ -141,7 +141,7 @@ def compared(mujoco: Any, system: str, run: hz.Run, count: int, quick: bool) -> 
     """Nanoseconds an environment step, ours and MuJoCo's, and their ratios within each repeat."""
     env, draw = environment(run, count), np.random.default_rng(2)
     inputs = FORCE[system] * draw.uniform(-1, 1, (16, count, 1))
-    steps = max(16, (2_000 if quick else 20_000) // count)
+    steps = BATCHES[count] // (4 if quick else 1)
     found = []
     for integrator in ("Euler", "RK4"):
         calls = {"ours": env.step} | mujoco_ways(mujoco, system, integrator, run.h, count)
@@ -151,7 +151,7 @@ def compared(mujoco: Any, system: str, run: hz.Run, count: int, quick: bool) -> 
                 call(inputs[k % 16])
 
         repeats = [{name: seconds(lambda c=call: many(c)) / steps / count for name, call in calls.items()}
-                   for _ in range(4 if quick else 12)][1:]  # fmt: skip
+                   for _ in range(4 if quick else 10)][1:]  # fmt: skip
         way = min((x for x in calls if x != "ours"), key=lambda x: statistics.median(one[x] for one in repeats))
         ratios = [one[way] / one["ours"] for one in repeats]
         found.append({

@@ -1,9 +1,10 @@
 # %% [markdown]
 # # Train a policy on a learned motion
 #
-# A motor drives a trolley from which a load hangs. Its motion is recorded and learned, and the learned step becomes 4096
-# environments of gymnasium, which one thread steps at once. A policy that brings the trolley to its place and the load to
-# rest is trained there in seconds, by the cross-entropy method, and then moves the real crane, which it never saw.
+# A motor drives a trolley from which a load hangs. Its motion is recorded and learned, and the learned step becomes
+# 4096 environments of gymnasium, which one thread steps at once. A policy that brings the trolley to its place and the
+# load to rest is trained there in seconds, by the cross-entropy method, and then moves the real crane, on which it was
+# not trained.
 # gymnasium comes with the extra `gymnasium`: `pip install 'herglotz[gymnasium]'`; a C compiler is needed, too.
 #
 # The crane: trolley 1 kg, load 0.3 kg on 0.5 m, viscous friction of both; positions x of the trolley and θ of the load.
@@ -64,7 +65,7 @@ print(run.summary())
 # The reward and the starts are functions of arrays, one row an environment: q and v are (B, 2), u is (B, 1). An action
 # is a force that is held for 0.05 s, and saturates at the largest recorded one. An episode has 100 actions, and ends
 # where a state leaves the range of the recordings: the model is not asked for what it has not seen, and `exit_reward`
-# makes that dear.
+# makes leaving expensive.
 
 # %%
 POLICIES, STARTS, ACTIONS = 256, 16, 100
@@ -96,8 +97,8 @@ print(env.single_action_space)
 # %% [markdown]
 # ## The cross-entropy method
 #
-# A policy is four numbers K, u = K (x, θ, x′, θ′). In each round, 256 of them are drawn from a normal distribution, each
-# acts from 16 starts, and the distribution moves to the best 25.
+# A policy is four numbers K, u = K (x, θ, x′, θ′). In each round, 256 of them are drawn from a normal distribution,
+# each acts from 16 starts, and the distribution moves to the best 25.
 
 
 # %%
@@ -126,8 +127,7 @@ print("K =", mean.round(2))
 # %% [markdown]
 # ## The crane itself
 #
-# The policy moves the crane from 0.25 m, beside the same with no policy that minds the load: a spring and a damper on
-# the trolley alone, as strong.
+# The policy moves the crane from 0.25 m. Beside it, the same gains of the trolley act alone, without those of the load.
 
 # %%
 import matplotlib.pyplot as plt
