@@ -188,7 +188,8 @@ def main(argv: list[str] | None = None) -> None:
     found: Row = harness.conditions("mujoco", "gymnasium", "numpy") | {"h": H, "errors": {}, "rows": []}
     for system in SYSTEMS:
         run = hz.fit(recordings(mujoco, system), progress=False)
-        found["errors"][system] = errors(mujoco, system, run) | {"h": run.h, "verdict": run.metrics["verdict"].split(":")[0]}
+        verdict = run.metrics["verdict"].split(":")[0]
+        found["errors"][system] = errors(mujoco, system, run) | {"h": run.h, "verdict": verdict}
         for count in BATCHES:
             found["rows"] += compared(mujoco, system, run, count, arguments.quick)
             harness.store(path, found, table(found))
