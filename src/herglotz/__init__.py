@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from herglotz.data import Trajectories, load, save, simulate
+    from herglotz.environment import VectorEnv as VectorEnv
     from herglotz.errors import InputError
     from herglotz.export import compile, export_pt2, filter, load_pt2
     from herglotz.mechanics import partials
@@ -40,7 +41,7 @@ _ROOMS = {
     "training": ("FitConfig", "Run", "fit", "load_run", "save_run"),
 }
 _MODULES = {"losses": "herglotz.training.losses", "theory": "herglotz.theory"}
-_HOME = {name: room for room, names in _ROOMS.items() for name in names}
+_HOME = {name: room for room, names in _ROOMS.items() for name in names} | {"VectorEnv": "environment"}
 __all__ = [
     "ContactLagrangian",
     "FitConfig",

@@ -14,12 +14,14 @@ LEVEL = {room: i for i, rooms in enumerate(ORDER.split("|")) for room in rooms.s
 RUNTIME = {"torch", "numpy", "matplotlib", "PIL", "tqdm", "herglotz"} | set(
     sys.stdlib_module_names
 )  # PIL comes with matplotlib
-# Extras that only some users install, with the files that may import them: inside functions, but for the regressor.
+# Extras that only some users install, with the files that may import them: inside functions, but for those of `ABOVE`.
 EXTRAS = {
     "onnx": ("export/lower/onnx*.py", "export/load.py"),
     "onnxruntime": ("export/lower/onnx*.py", "export/load.py"),
     "sklearn": ("regressor.py",),
+    "gymnasium": ("environment.py",),
 }
+ABOVE = ("environment.py", "regressor.py")  # they stand above the rooms, and are loaded where they are asked for
 FILES = sorted(SOURCE.rglob("*.py"))
 
 
@@ -52,7 +54,7 @@ def test_imports_point_one_way(path):
     room, outside = path.relative_to(SOURCE).parts[0], top_level(path)
     for name in imports(path):
         parts = name.split(".")
-        inside = path.name == "regressor.py" or name not in outside
+        inside = path.name in ABOVE or name not in outside
         if inside and any(path.match(pattern) for pattern in EXTRAS.get(parts[0], ())):
             continue
         assert parts[0] in RUNTIME, f"{path} imports {name}, which is no runtime dependency"

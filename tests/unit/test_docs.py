@@ -88,8 +88,9 @@ def test_links_lead_somewhere(path):
 def resolve(name):
     """The object that a dotted name means; raises where there is none. A module may share its name with a function."""
     parts = re.sub(r"^hz\b", "herglotz", name).split(".")
-    if parts[1:2] == ["regressor"]:  # which scikit-learn is needed to import
-        assert len(parts) < 3 or f"class {parts[2]}(" in CODE[ROOT / "src" / "herglotz" / "regressor.py"]
+    parts = ["herglotz", "environment", *parts[1:]] if parts[1:2] == ["VectorEnv"] else parts
+    if parts[1] in ("regressor", "environment"):  # which need an extra to be imported
+        assert len(parts) < 3 or f"class {parts[2]}(" in CODE[ROOT / "src" / "herglotz" / f"{parts[1]}.py"]
         return
     for i in range(len(parts), 0, -1):
         try:

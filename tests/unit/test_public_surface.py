@@ -33,8 +33,9 @@ def _named(path: str) -> Any:
 
 
 PAGE = (GOLDEN.parents[2] / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
-# The regressor can be imported where scikit-learn is; its own tests look at it (`check_estimator`).
-REFERENCE = {path: _named(path) for path in re.findall(r"^::: (\S+)$", PAGE, re.M) if "regressor" not in path}
+# The regressor and the environment can be imported where their extras are; their own tests look at them.
+EXTRAS = re.compile(r"herglotz\.(regressor|environment)\.")
+REFERENCE = {path: _named(path) for path in re.findall(r"^::: (\S+)$", PAGE, re.M) if not EXTRAS.match(path)}
 PUBLIC = {f"hz.{name}": getattr(hz, name) for name in hz.__all__}
 PUBLIC |= {path: value for path, value in REFERENCE.items() if value not in PUBLIC.values()}
 OWNERS = (hz.Run, hz.Stepper, hz.Trajectories, hz.State, hz.FitConfig, hz.ModelConfig, Motion, Selection, Bands)

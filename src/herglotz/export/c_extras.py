@@ -8,7 +8,6 @@ from typing import Any
 from herglotz.errors import InputError
 from herglotz.export.c_numbers import numbers
 from herglotz.export.metadata import EXTRAS
-from herglotz.models import ContactLagrangian
 
 FILES = {"adjoint": ("adjoint",), "filter": ("filter", "smoother")}  # of `export/runtime`
 
@@ -22,12 +21,10 @@ def check_extras(extras: object, dof: int, most: int) -> None:
         raise InputError(f"a filter in C needs the derivative of a step, up to {most} coordinates; this has {dof}")
 
 
-def extras_source(model: ContactLagrangian, entries: Mapping[str, Any], file: Callable[[str], str]) -> list[str]:
+def extras_source(entries: Mapping[str, Any], file: Callable[[str], str]) -> list[str]:
     """The texts of the extras that a header's metadata names; `file` reads one of the runtime."""
     found = []
     for name in entries.get("extras", ()):
-        if name == "filter":
-            found.append(f"#define hz_CARRIES_S {int(model.s_enters_motion)} /* the motion depends on s */\n")
         found += [file(f"{x}.h") for x in FILES[name]]
         if name == "filter" and (noise := entries.get("noise")):
             rows = [noise["position"], noise["momentum"]]

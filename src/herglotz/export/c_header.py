@@ -83,6 +83,7 @@ TOP = """\
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
 #define hz_STICKING {sticking} /* dry friction can hold a coordinate still */
 #define hz_BOXED {boxed} /* a box of the fitted data is recorded */
+#define hz_CARRIES_S {carries_s} /* the motion depends on s */
 #define hz_DERIVATIVES {derivatives} /* hz_step_jacobian is there */
 #define hz_WIDE {wide} /* batches go by registers of samples */
 
@@ -207,16 +208,14 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     emitted = model_source(step, equations, derivatives, velocities, "adjoint" in entries.get("extras", ()))
     shown = (lambda text: text) if chosen else without_parameters
     types, number_tests, functions, products, checks, one_step, run, api = (shown(runtime(x)) for x in RUNTIME)
-    dtype = entries["dtype"]
-    parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests + parameters]
+    parts = [_top(model, entries, step, derivatives), types, _constants(model, entries), number_tests + parameters]
     parts += [functions, products, emitted.tables, inputs, checks, as_scalars(emitted.step + one_step + run)]
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
     parts += [as_scalars(emitted.slopes), api]
     parts += [as_scalars(emitted.momentum), shown(runtime("velocity.h"))] if velocities else []
-    parts += extras_source(model, entries, lambda name: shown(runtime(name)))
-    parts += ["#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
-    text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
+    parts += [*extras_source(entries, lambda x: shown(runtime(x))), "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+    text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), entries["dtype"]))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     last = {
         "METADATA": comment,
@@ -283,7 +282,7 @@ def _arrival(entries: Mapping[str, Any]) -> str:
     return f"   Inputs u act late: give each step the mean over it of u_f,\n   {formula}.\n\n"
 
 
-def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
+def _top(model: ContactLagrangian, entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
     """The comment, the guard, and what the preprocessor decides by."""
     inputs = entries["inputs"]
     return TOP.format(
@@ -301,6 +300,7 @@ def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
         explicit=int(step.explicit),
         sticking=int(step.sticks),
         boxed=int(entries["box"] is not None),
+        carries_s=int(model.s_enters_motion),
         derivatives=int(derivatives),
         wide=int(entries["dof"] <= MAX_WIDE),
         real="float" if entries["dtype"] == "float32" else "double",

@@ -114,6 +114,18 @@ class CLibrary:
         function = self.library.herglotz_rollouts
         return lambda keep=keep: function(*arguments), outputs  # noqa: ARG005  the tensors live as long as the call
 
+    def holds(
+        self, states: Tensor, h: Tensor, u: Tensor, steps: int, low: Tensor, high: Tensor, out: tuple[Tensor, Tensor]
+    ) -> Callable[[], None]:
+        """The call that steps `states` in place, each under its input, and observes them (`herglotz_holds`).
+
+        States are rows (q, p, s, σ), (B, 2n+2); u is (B, m). `out` is what it writes: (q, v), (B, 2n), with q between
+        low and high (n,), and statuses (B,) int32 with their flags.
+        """
+        keep = (states, h, u, *self._theta, low, high, *out)
+        arguments, function = _arguments(len(states), steps, *keep), self.differentiates().herglotz_holds
+        return lambda keep=keep: function(*arguments)  # noqa: ARG005  the tensors live as long as the call
+
     def _empty(self, *shape: int) -> Tensor:
         return torch.full(shape, torch.nan, dtype=self.dtype)
 

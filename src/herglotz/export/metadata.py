@@ -74,6 +74,8 @@ class Metadata(_Needed, total=False):
     """What the command line adds, and C."""
 
     input_zero: list[float]
+    input_low: list[float]  # the range of the inputs that the model was fitted to
+    input_high: list[float]
     h_range: list[float] | None
     names: list[str]
     time_unit: str

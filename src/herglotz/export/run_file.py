@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from herglotz.errors import InputError
 from herglotz.export.c_header import export_c
 from herglotz.export.c_wrappers import export_acados, export_casadi
@@ -92,6 +94,7 @@ def export_run(
         "card": model_card(run, (span[0], span[-1])),
         "h_range": span,
         **({"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]} if run.model.inputs else {}),
+        **_input_range(run),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and kind in IN_C and dtype in (None, run.setting["dtype"]):
@@ -109,6 +112,15 @@ def export_run(
         metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}
     WRITERS[kind](run.model, path, **described)
     return path
+
+
+def _input_range(run: Run) -> dict[str, list[float]]:
+    """Lowest and highest inputs of the training part; nothing where none were recorded."""
+    if run.data.u is None or not run.model.inputs:
+        return {}
+    parts = zip(run.data.u.split(run.data.lengths), run.train_lengths, strict=True)
+    fitted = torch.cat([u[:count] for u, count in parts])
+    return {"input_low": fitted.amin(0).tolist(), "input_high": fitted.amax(0).tolist()}
 
 
 def _steps(run: Run) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""exp, expm1 and artanh of the C runtime are series of its own: here beside the C library's, alone and in registers."""
+"""exp, expm1, artanh and, in registers, sin and cos of the C runtime are series: here beside the C library's."""
 
 import ctypes
 import shutil
@@ -12,7 +12,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 
 COMPILERS = [c for c in ("gcc", "clang") if shutil.which(c)]
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="neither gcc nor clang in the PATH")
-FUNCTIONS = ("exp", "expm1", "atanh", "tanh", "sigmoid", "softplus")
+FUNCTIONS = ("exp", "expm1", "atanh", "tanh", "sigmoid", "softplus", "sin", "cos")
 TYPES = {"float64": np.float64, "float32": np.float32}
 # Largest errors in eps of the value, of 2 million points a function with gcc, from -O0 to -O3 -march=native, one by one
 # and in registers: exp 0.70, expm1 1.12, artanh 1.45 (float64); 0.73, 0.99, 1.09 (float32). Twice that is left for
@@ -71,12 +71,20 @@ def points(most, dtype):
         ("expm1", 708.0),
         ("atanh", 1 / 3),
         ("atanh", 1.0),
+        ("sin", 2.0),
+        ("sin", 2e5),
+        ("cos", 2.0),
+        ("cos", 2e5),
     ],
 )
 def test_series_and_the_library_agree(functions, way, name, most):
     # fails if a series is cut short, holds too far, or what is beyond it does not reach the C library
     dtype, function = functions
-    x, y = function(f"{way}_{name}", points(most if dtype == "float64" else min(most, 85.0), dtype))
+    circular = name in ("sin", "cos")
+    x = points(most if dtype == "float64" or circular else min(most, 85.0), dtype)
+    if circular:  # next to zeros, where what is left of x is smallest
+        x = np.concatenate([x, (np.pi / 2 * np.arange(most)).astype(dtype)])
+    x, y = function(f"{way}_{name}", x)
     inner = np.abs(x) < 1 if name == "atanh" else np.full(len(x), True)
     true = getattr(np, {"atanh": "arctanh"}.get(name, name))(x[inner].astype(np.longdouble))
     eps = np.finfo(dtype).eps
@@ -95,6 +103,8 @@ def test_what_is_special(functions, way):
         "atanh": [np.nan, np.nan, np.nan, np.nan, np.nan, np.arctanh(0.25), -0.0],
         "tanh": [np.nan, 1.0, -1.0, 1.0, -1.0, np.tanh(0.25), 0.0],
         "sigmoid": [np.nan, 1.0, 0.0, 1.0, 0.0, 1 / (1 + np.exp(-0.25)), 0.5],
+        "sin": [np.nan, np.nan, np.nan, np.sin(1e4), -np.sin(1e4), np.sin(0.25), -0.0],
+        "cos": [np.nan, np.nan, np.nan, np.cos(1e4), np.cos(1e4), np.cos(0.25), 1.0],
         "softplus": [np.nan, np.inf, 0.0, 1e4, 0.0, np.log1p(np.exp(0.25)), np.log(2.0)],
     }
     for name, values in expected.items():

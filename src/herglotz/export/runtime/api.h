@@ -170,26 +170,21 @@ static inline int hz_run_some(hz_state *states, long b, long count, const hz_job
   return 1;
 }
 
-/* hz_rollout of `count` samples, each as it would go by itself up to rounding: registers of them are stepped at once.
-   Inputs u are (count, steps, hz_M). The outputs hold one sample after the other; statuses[b] receives what hz_rollout
-   would return. Any but `states` may be null. Returns the status of the first sample that failed, or 0, with the flags
-   of any. */
-static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_TAKES_U hz_TAKES_THETA long steps, long every,
-    hz_real *q_out, hz_real *p_out, hz_real *s_out, int *statuses) {
-  const hz_job job = {steps, every, &h, 0, 0, hz_WITH_U(u) hz_WITH_U(steps * hz_M) hz_WITH_THETA(theta) q_out, p_out, s_out, 0, 0, 0};
+/* A job of `count` samples, all with the step *job->h; statuses and what is returned are those of hz_rollout_batch. */
+static inline int hz_run_batch(long count, hz_state *states, const hz_job *job, int *statuses) {
 #if hz_P
-  const int possible = steps >= 0 && every > 0 && (!theta || hz_in_bounds(theta));
+  const int possible = job->steps >= 0 && job->every > 0 && (!job->theta || hz_in_bounds(job->theta));
 #else
-  const int possible = steps >= 0 && every > 0;
+  const int possible = job->steps >= 0 && job->every > 0;
 #endif /* hz_P */
   int worst = 0, flagged = 0, status[hz_SIDE], flags[hz_SIDE], some, w;
   long b;
   for (b = 0; b < count; b += some) {
     for (w = 0; w < hz_SIDE && b + w < count; w++) {
-      status[w] = possible ? hz_before(states + b + w, h) : hz_BAD_INPUT;
-      flags[w] = status[w] ? 0 : hz_outside_box(states + b + w) | hz_outside_h(h);
+      status[w] = possible ? hz_before(states + b + w, *job->h) : hz_BAD_INPUT;
+      flags[w] = status[w] ? 0 : hz_outside_h(*job->h);
     }
-    some = possible ? hz_run_some(states + b, b, count, &job, status, flags) : 1;
+    some = possible ? hz_run_some(states + b, b, count, job, status, flags) : 1;
     for (w = 0; w < some; w++) {
       if (!worst) worst = status[w];
       flagged |= flags[w];
@@ -197,6 +192,17 @@ static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_T
     }
   }
   return worst | flagged;
+}
+
+/* hz_rollout of `count` samples, each as it would go by itself up to rounding: registers of them are stepped at once.
+   Inputs u are (count, steps, hz_M). The outputs hold one sample after the other; statuses[b] receives what hz_rollout
+   would return. Any but `states` may be null. Returns the status of the first sample that failed, or 0, with the flags
+   of any. */
+static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_TAKES_U hz_TAKES_THETA long steps, long every,
+    hz_real *q_out, hz_real *p_out, hz_real *s_out, int *statuses) {
+  const hz_job job = {steps, every, &h, 0, 0, hz_WITH_U(u) hz_WITH_U(steps * hz_M) hz_WITH_U(hz_M)
+                      hz_WITH_THETA(theta) q_out, p_out, s_out, 0, 0, 0};
+  return hz_run_batch(count, states, &job, statuses);
 }
 
 /* `steps` equal steps. Inputs u are (steps, hz_M), where the model takes some; none act where u is null.

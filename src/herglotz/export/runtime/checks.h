@@ -1,6 +1,7 @@
 /* What is checked of states, steps and inputs, and the forces of inputs. */
 
-/* hz_OUTSIDE_BOX where a state lies outside the box the model was fitted in (angles count modulo a turn), or 0. */
+/* hz_OUTSIDE_BOX where a state lies outside the box the model was fitted in, or 0. Angles count modulo a turn, and s only
+   where the motion depends on it: it grows without bound. */
 static inline int hz_outside_box(const hz_state *state) {
 #if hz_BOXED
   int i;
@@ -8,12 +9,12 @@ static inline int hz_outside_box(const hz_state *state) {
     hz_real q = state->q[i];
     if (hz_is_angle[i]) {
       const hz_real turn = hz_R(6.28318530717958647693), middle = (hz_q_low[i] + hz_q_high[i]) / hz_R(2.0);
-      q -= turn * hz_floor_of((q - middle) / turn + hz_R(0.5));
+      q -= turn * hz_floor_of((q - middle) * hz_R(0.15915494309189533577) + hz_R(0.5));
     }
     if (!(q >= hz_q_low[i] && q <= hz_q_high[i])) return hz_OUTSIDE_BOX;
     if (!(state->p[i] >= hz_p_low[i] && state->p[i] <= hz_p_high[i])) return hz_OUTSIDE_BOX;
   }
-  return state->s >= hz_s_low && state->s <= hz_s_high ? 0 : hz_OUTSIDE_BOX;
+  return !hz_CARRIES_S || (state->s >= hz_s_low && state->s <= hz_s_high) ? 0 : hz_OUTSIDE_BOX;
 #else
   (void)state;
   return 0;
@@ -76,15 +77,15 @@ enum { hz_SIDE = 1 };
 /* One step of a state by itself, with its checks done. */
 static inline int hz_alone(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual);
 
-/* A run of steps: h of sample b and step k is h[b * h_sample + k * h_step]. What is stored after every so many steps,
-   and status and residual after each; any may be null. */
+/* A run of steps: h of sample b and step k is h[b * h_sample + k * h_step], and u likewise. What is stored after every
+   so many steps, and status and residual after each; any may be null. */
 typedef struct {
   long steps, every;
   const hz_real *h;
   long h_sample, h_step;
 #if hz_INPUTS
   const hz_real *u; /* null: none act */
-  long u_sample;
+  long u_sample, u_step;
 #endif
 #if hz_P
   const hz_parameters *theta;

@@ -1,7 +1,8 @@
 /* Functions that compilers vectorise, and rows of them. */
 
-/* The exponential series (e^r - 1 - r) / r^2 and the series of artanh(r) / r in z = r^2; in double precision even and
-   odd powers apart, which are computed side by side. */
+/* The exponential series (e^r - 1 - r) / r^2 and the series of artanh(r) / r, (sin r - r) / r^3 and (cos r - 1 + r^2 / 2)
+   / r^4 in z = r^2; in double precision even and odd powers of the first two apart, which are computed side by side. pi / 2
+   is a sum of four numbers; the first three are so short that products with whole numbers up to hz_TURNED are exact. */
 #if hz_SINGLE
 #define hz_LIMIT 20.0
 #define hz_FAR 80.0
@@ -15,6 +16,13 @@
 #define hz_ARTANH_TERMS(z)                                                                                            \
   (((((((hz_R(1.0 / 15) * z + hz_R(1.0 / 13)) * z + hz_R(1.0 / 11)) * z + hz_R(1.0 / 9)) * z + hz_R(1.0 / 7)) * z +    \
      hz_R(1.0 / 5)) * z + hz_R(1.0 / 3)) * z + hz_R(1.0))
+#define hz_TURNED 1e3
+#define hz_QUARTER_1 1.570678710938e+00
+#define hz_QUARTER_2 1.176148653030e-04
+#define hz_QUARTER_3 9.920313459588e-10
+#define hz_QUARTER_4 6.223372172e-14
+#define hz_SIN_TERMS(z) (((hz_R(1.0 / 362880) * z - hz_R(1.0 / 5040)) * z + hz_R(1.0 / 120)) * z - hz_R(1.0 / 6))
+#define hz_COS_TERMS(z) (((hz_R(-1.0 / 3628800) * z + hz_R(1.0 / 40320)) * z - hz_R(1.0 / 720)) * z + hz_R(1.0 / 24))
 #else
 #define hz_LIMIT 40.0
 #define hz_FAR 700.0
@@ -36,6 +44,18 @@
   ((((((((hz_R(1.0 / 35) * z + hz_R(1.0 / 31)) * z + hz_R(1.0 / 27)) * z + hz_R(1.0 / 23)) * z + hz_R(1.0 / 19)) * z + \
       hz_R(1.0 / 15)) * z + hz_R(1.0 / 11)) * z + hz_R(1.0 / 7)) * z + hz_R(1.0 / 3))
 #define hz_ARTANH_TERMS(z) (hz_ARTANH_EVEN((z * z)) + z * hz_ARTANH_ODD((z * z)))
+#define hz_TURNED 1e5
+#define hz_QUARTER_1 1.57079632673412561417e+00
+#define hz_QUARTER_2 6.07710050630396597660e-11
+#define hz_QUARTER_3 2.02226624871116645580e-21
+#define hz_QUARTER_4 8.47842766036889956997e-32
+#define hz_SIN_TERMS(z)                                                                                                \
+  (((((((hz_R(1.0 / 355687428096000.0) * z - hz_R(1.0 / 1307674368000.0)) * z + hz_R(1.0 / 6227020800.0)) * z -        \
+       hz_R(1.0 / 39916800)) * z + hz_R(1.0 / 362880)) * z - hz_R(1.0 / 5040)) * z + hz_R(1.0 / 120)) * z -            \
+   hz_R(1.0 / 6))
+#define hz_COS_TERMS(z)                                                                                                \
+  ((((((hz_R(1.0 / 20922789888000.0) * z - hz_R(1.0 / 87178291200.0)) * z + hz_R(1.0 / 479001600)) * z -               \
+      hz_R(1.0 / 3628800)) * z + hz_R(1.0 / 40320)) * z - hz_R(1.0 / 720)) * z + hz_R(1.0 / 24))
 #endif
 
 /* exp(r) - 1 and 2^k where y = k ln 2 + r with |r| <= ln(2)/2, for |y| <= hz_FAR: a few units in the last place, without
@@ -197,19 +217,44 @@ static inline hz_lanes hz_wide_exp(hz_lanes x) {
   hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_FAR), hz_exp_of);
   return y;
 }
+
+/* sin(x + quarters pi / 2) where |x| <= hz_TURNED: x = k pi / 2 + r with |r| <= pi / 4, about a unit in the last place. */
+static inline hz_lanes hz_wide_wave(hz_lanes x, int quarters) {
+  const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
+  hz_lanes r = hz_wide_cut(x, hz_R(hz_TURNED)) * hz_R(0.63661977236758134308), whole, z, y;
+  hz_masks turns;
+  hz_counts k;
+  r = hz_select((hz_masks)(r == r), r, zero);
+  r += hz_select((hz_masks)(r < zero), -half, half);
+  k = __builtin_convertvector(r, hz_counts);
+  whole = __builtin_convertvector(k, hz_lanes);
+  r = (x - whole * hz_R(hz_QUARTER_1)) - whole * hz_R(hz_QUARTER_2);
+  r = (r - whole * hz_R(hz_QUARTER_3)) - whole * hz_R(hz_QUARTER_4);
+  z = r * r;
+  turns = __builtin_convertvector(k + quarters, hz_masks);
+  y = hz_select((hz_masks)((turns & 1) != 0), hz_R(1.0) - (hz_R(0.5) * z - z * z * hz_COS_TERMS(z)),
+      r + r * z * hz_SIN_TERMS(z));
+  return hz_select((hz_masks)((turns & 2) != 0), -y, y);
+}
+
+static inline hz_lanes hz_wide_sin(hz_lanes x) {
+  hz_lanes y = hz_wide_wave(x, 0);
+  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_TURNED), hz_sin);
+  return y;
+}
+
+static inline hz_lanes hz_wide_cos(hz_lanes x) {
+  hz_lanes y = hz_wide_wave(x, 1);
+  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_TURNED), hz_cos);
+  return y;
+}
 #undef hz_ELSE
 
-/* A function of <math.h>, lane by lane. */
-#define hz_LANE_BY_LANE(function)                           \
-  static inline hz_lanes hz_wide_##function(hz_lanes x) {   \
-    int w;                                                  \
-    for (w = 0; w < hz_LANES; w++) x[w] = hz_##function(x[w]); \
-    return x;                                               \
-  }
-hz_LANE_BY_LANE(sin)
-hz_LANE_BY_LANE(cos)
-hz_LANE_BY_LANE(sqrt)
-#undef hz_LANE_BY_LANE
+static inline hz_lanes hz_wide_sqrt(hz_lanes x) {
+  int w;
+  for (w = 0; w < hz_LANES; w++) x[w] = hz_sqrt(x[w]);
+  return x;
+}
 
 static inline hz_lanes hz_wide_pow(hz_lanes x, hz_real power) {
   int w;

@@ -27,7 +27,7 @@ static void store(const hz_state *x, long at, hz_real *q_out, hz_real *p_out, hz
 void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
     long h_sample, long h_step, const hz_real *u, long u_sample, hz_TAKES_THETA hz_real *q_out, hz_real *p_out, hz_real *s_out,
     hz_real *sigma_out, unsigned char *status_out, hz_real *residual_out) {
-  const hz_job job = {steps, 1, h, h_sample, h_step, hz_WITH_U(u) hz_WITH_U(u_sample)
+  const hz_job job = {steps, 1, h, h_sample, h_step, hz_WITH_U(u) hz_WITH_U(u_sample) hz_WITH_U(hz_M)
                       hz_WITH_THETA(theta) q_out, p_out, s_out, sigma_out, residual_out, status_out};
   hz_state x[hz_SIDE];
   int status[hz_SIDE], w;
@@ -103,6 +103,32 @@ void herglotz_velocities(long batch, const hz_real *q, const hz_real *p, const h
     hz_state x;
     load(q, p, s, b, &x);
     status_out[b] = (unsigned char)(15 & hz_velocity(&x, h[b], hz_WITH_THETA(theta) v_out + b * hz_N));
+  }
+}
+
+/* `steps` equal steps of states that stay where they lie, each under one input, and then what is observed of each:
+   positions and velocities, (batch, 2 hz_N). An angle is taken within half a turn of the middle of low .. high, and
+   positions beyond low .. high are put on its end. A state whose step failed is the last good one, and where a state has
+   no velocity the observed one stays as it was. `statuses` are those of the steps, without hz_OUTSIDE_H. */
+void herglotz_holds(long batch, long steps, hz_state *states, const hz_real *h, const hz_real *u,
+    hz_TAKES_THETA const hz_real *low, const hz_real *high, hz_real *observed, int *statuses) {
+  const hz_job job = {steps, 1, h, 0, 0, hz_WITH_U(u) hz_WITH_U(hz_M) hz_WITH_U(0)
+                      hz_WITH_THETA(theta) 0, 0, 0, 0, 0, 0};
+  long b;
+  int i;
+  (void)u;
+  for (b = 0; b < batch; b++) states[b].sigma = (hz_real)1.0; /* nobody asks for the product of the factors */
+  hz_run_batch(batch, states, &job, statuses);
+  for (b = 0; b < batch; b++, observed += 2 * hz_N) {
+    const int status = hz_velocity(states + b, *h, observed + hz_N);
+    if (!(statuses[b] & 15)) statuses[b] |= status & 15;
+    statuses[b] &= 15 | hz_OUTSIDE_BOX;
+    for (i = 0; i < hz_N; i++) {
+      const hz_real turn = (hz_real)6.28318530717958647693, middle = (low[i] + high[i]) / (hz_real)2.0;
+      hz_real q = states[b].q[i];
+      if (hz_is_angle[i]) q -= turn * hz_floor_of((q - middle) * (hz_real)0.15915494309189533577 + (hz_real)0.5);
+      observed[i] = q < low[i] ? low[i] : q > high[i] ? high[i] : q;
+    }
   }
 }
 #endif

@@ -12,5 +12,9 @@ static inline void hz_unread(void) {
   (void)hz_top_speed;
   (void)hz_near;
   (void)hz_start;
+#if hz_BOXED && !hz_CARRIES_S
+  (void)hz_s_low;
+  (void)hz_s_high;
+#endif
 }
 
