@@ -27,16 +27,21 @@ static inline int hz_hold(hz_state *state, hz_real h, hz_TAKES_U double steps) {
 static inline int hz_hold_jacobian(hz_state *state, hz_real h, hz_TAKES_U double steps, hz_real *by_state,
     hz_WITH_U(hz_real *by_input) hz_real *by_time) {
   enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + hz_M * hz_INPUTS + 1 };
-  hz_state x = *state;
-  hz_real A[SIZE * SIZE], B[SIZE * (hz_M + 1)], by_h[SIZE], map[SIZE * WIDTH], old[SIZE * WIDTH];
+  hz_state x = *state, before;
+  hz_track track;
+  hz_real left, A[SIZE * SIZE], B[SIZE * (hz_M + 1)], by_h[SIZE], map[SIZE * WIDTH], old[SIZE * WIDTH];
   double k;
-  int i, j, l;
+  int i, j, l, status = hz_before(&x, h);
+  if (!status && hz_BAD_U(u)) status = hz_DIVERGED;
+  if (!status) hz_track_start(&x, &track);
   for (i = 0; i < SIZE; i++)
     for (j = 0; j < WIDTH; j++) map[i * WIDTH + j] = i == j ? hz_R(1.0) : hz_R(0.0);
   (void)B;
-  for (k = 0.0; k < steps; k += 1.0) {
-    const int status = 15 & hz_step_jacobian(&x, h, hz_WITH_U(u) 0, A, hz_WITH_U(B) by_h);
-    if (status) return status;
+  for (k = 0.0; !status && k < steps; k += 1.0) {
+    before = x;
+    status = hz_advance(&x, &track, h, hz_WITH_U(u) &left);
+    if (!status) status = hz_step_slopes(&before, &x, h, hz_WITH_U(u) A, hz_WITH_U(B) by_h);
+    if (status) break;
     for (i = 0; i < SIZE * WIDTH; i++) old[i] = map[i];
     for (i = 0; i < SIZE; i++) {
       for (j = 0; j < SIZE; j++) map[i * WIDTH + j] = hz_R(0.0);
@@ -48,6 +53,7 @@ static inline int hz_hold_jacobian(hz_state *state, hz_real h, hz_TAKES_U double
         for (j = 0; j < WIDTH; j++) map[i * WIDTH + j] += A[i * SIZE + l] * old[l * WIDTH + j];
     }
   }
+  if (status) return status;
   *state = x;
   for (i = 0; i < SIZE; i++) {
     for (j = 0; by_state && j < SIZE; j++) by_state[i * SIZE + j] = map[i * WIDTH + j];
