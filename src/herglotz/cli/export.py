@@ -54,6 +54,8 @@ FLAGS = (
          metavar="NAME[=LOW:HIGH]"),
     flag("--extras", "what else a C header holds: adjoint (vector-Jacobian products of steps and rollouts), filter "
          "(a Kalman filter with the noise of the fit)", nargs="+", choices=("adjoint", "filter")),
+    flag("--unroll", "ONNX of a single step without a loop: the number of Newton's iterations that it makes, 6 for most "
+         "models", type=int, metavar="N"),
     FORCE,
     flag("--json", "print what was written as JSON", action="store_true"),
 )  # fmt: skip
@@ -89,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         name=arguments.name,
         parameters=parsed(arguments.parameters or ()),
         extras=arguments.extras or (),
+        unroll=arguments.unroll,
     )
     in_c = form not in ("pt2", "aoti", "onnx")
     if in_c:  # the header is read, not compiled: no compiler is needed to write it
