@@ -1,9 +1,10 @@
 """The exported step in control: `python benchmarks/control.py [--quick] [--only PART ...] [--out FOLDER]`.
 
-`nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step as
-the file for CasADi and as CasADi's own expressions. `loop`: `examples/real_time_iteration/rti.c` in closed loop with the
-true plant from random starts. `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time; what is
-compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and control.md.
+`nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
+as the file for CasADi and as CasADi's own expressions. `loop`: `examples/real_time_iteration/rti.c` in closed loop with
+the true plant from random starts. `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time;
+what is compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and
+control.md.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +170,7 @@ def closed(library: ctypes.CDLL, stepper: Any, true: Callable[..., np.ndarray], 
         state = measured(before[:2], z[:2], force.value)
         angles.append(z[1])
         widest = max(widest, abs(z[0]))
-        ms.append([1e3 * (b - a) for a, b in zip(times, times[1:], strict=False)])
+        ms.append([1e3 * (b - a) for a, b in pairwise(times)])
     return {"angles": np.array(angles), "widest": widest, "ms": np.array(ms)}
 
 
@@ -226,8 +228,9 @@ def jacobian(quick: bool, folder: Path) -> list[Row]:
         run, single, both = (statistics.median(x) for x in zip(*taken, strict=True))
         what = "a 16x2 network" if width else "no network"
         ratio = statistics.median(c / a for a, _, c in taken)
-        rows.append({"what": f"step with Jacobian / step of a run, two coordinates, {what}", "value": ratio,
-                     "target": f"<= {target:g}", "note": f"{both:.0f}, {run:.0f} ns; a single step {single:.0f} ns"})  # fmt: skip
+        row = {"what": f"step with Jacobian / step of a run, two coordinates, {what}", "value": ratio}
+        note = f"{both:.0f}, {run:.0f} ns; a single step {single:.0f} ns"
+        rows.append(row | {"target": f"<= {target:g}", "note": note})
     return rows
 
 

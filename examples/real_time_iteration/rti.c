@@ -3,8 +3,8 @@
 
      minimise  sum_k |x_k - X|^2_Q + |u_k|^2_R  +  |x_N - X|^2_E   over  x_{k+1} = model_hold(x_k, u_k, H),  |u_k| <= U
 
-   `rti_prepare` runs before the sample is there: Jacobians of all intervals, and a Riccati recursion whose problem at each
-   interval keeps the bounds by an active set (differential dynamic programming with control limits: Tassa, Mansard and
+   `rti_prepare` runs before the sample is there: Jacobians of all intervals, and a Riccati recursion whose problem at
+   each interval keeps the bounds by an active set (differential dynamic programming with control limits: Tassa, Mansard and
    Todorov, ICRA 2014; Gauss-Newton, as a step has first derivatives). `rti_feedback` takes the measured state, runs the
    law through the model, and gives the input. Compile with: cc -O3 -march=native rti.c -lm (or -shared -fPIC). */
 
@@ -83,8 +83,8 @@ static void divide(double L[NU][NU], double b[NU]) {
   }
 }
 
-/* du = k + K dx of least M du du / 2 + (f + F dx) du, with |u + du| <= U at dx = 0: inputs that the solution takes beyond
-   a bound stay there, one more at a time. */
+/* du = k + K dx of least M du du / 2 + (f + F dx) du, with |u + du| <= U at dx = 0: inputs that the solution takes
+   beyond a bound stay there, one more at a time. */
 static int law(double M[NU][NU], double F[NU][NX], double f[NU], const double u[NU], const double U[NU], double k[NU],
     double K[NU][NX]) {
   int fixed[NU] = {0}, again = 1, i, j;
@@ -163,8 +163,8 @@ int rti_prepare(rti *o) {
   return 0;
 }
 
-/* The input for the measured state; the motion becomes that of the law from there. The whole law is taken where it costs
-   less than its feedback alone, else a half of k, and so on. Returns 1 where the model has no motion from there. */
+/* The input for the measured state; the motion becomes that of the law from there. The whole law is taken where it
+   costs less than its feedback alone, else a half of k, and so on. Returns 1 where the model has no motion from there. */
 int rti_feedback(rti *o, const double measured[NX], double input[NU]) {
   double x[N + 1][NX], u[N][NU], part = 1.0;
   const double without = follow(o, measured, 0.0, x, u);

@@ -54,8 +54,8 @@ FLAGS = (
          metavar="NAME[=LOW:HIGH]"),
     flag("--extras", "what else a C header holds: adjoint (vector-Jacobian products of steps and rollouts), filter "
          "(a Kalman filter with the noise of the fit)", nargs="+", choices=("adjoint", "filter")),
-    flag("--unroll", "ONNX of a single step without a loop: the number of Newton's iterations that it makes, 6 for most "
-         "models", type=int, metavar="N"),
+    flag("--unroll", "ONNX of a single step without a loop: how many of Newton's iterations it makes (6 suits most "
+         "models)", type=int, metavar="N"),
     FORCE,
     flag("--json", "print what was written as JSON", action="store_true"),
 )  # fmt: skip

@@ -20,8 +20,8 @@ INNER = "_c"  # what the prefix of the header ends in: its NAME_step is another 
 def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None = None, **settings: Any) -> Path:
     """Write the step as one C file that `casadi.external` loads once it is compiled.
 
-    The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`; NAME_hold(x, u, h),
-    the same over a time h of as few equal steps as are no longer than the typical one; and up to 8 coordinates their
+    The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`; NAME_hold, the
+    same over a time h of as few equal steps as are no longer than the typical one; and up to 8 coordinates their
     Jacobians. Without inputs there is no u. A step that does not exist is an error of CasADi. docs/control.md has an
     example.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -109,6 +110,10 @@ def writes(content: Callable[..., bytes]):
         remember(made)
         return Path(path)
 
+    _, _, *own = inspect.signature(content).parameters.values()
+    signature: Any = inspect.signature(export)
+    known = [x for x in signature.parameters.values() if x.kind is not x.VAR_KEYWORD]
+    setattr(export, "__signature__", signature.replace(parameters=[*known, *own]))  # noqa: B010  pyright knows no such
     for name in ("__module__", "__name__", "__qualname__", "__doc__"):
         setattr(export, name, getattr(content, name))
     return export

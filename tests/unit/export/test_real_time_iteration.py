@@ -3,6 +3,7 @@
 import ctypes
 import shutil
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,7 @@ def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, tmp_path):
     # bound takes part in the law, or two inputs are solved as if one did not act on the other
     model = damped("forced", torch.float64, inputs=2)
     with torch.no_grad():
-        model.friction.input_map.copy_(torch.tensor([[1.0, 0.6]]))
+        model.get_parameter("friction.input_map").copy_(torch.tensor([[1.0, 0.6]]))
     export_casadi(model, tmp_path / "model.c", h=0.1, name="model")
     library = tmp_path / "rti.so"
     command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{tmp_path}", str(RTI), "-o", str(library), "-lm"]
@@ -73,7 +74,7 @@ def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, tmp_path):
         assert own.rti_prepare(ctypes.byref(it)) == 0
         assert own.rti_feedback(ctypes.byref(it), given, first) == 0
         costs.append(it.cost)
-    assert all(b <= a * (1 + 1e-12) for a, b in zip(costs, costs[1:], strict=False))
+    assert all(b <= a * (1 + 1e-12) for a, b in pairwise(costs))
     u, limit = np.array(it.u).reshape(N, NU), np.array(bounds)
     assert list(first) == u[0].tolist()
     assert (abs(u) <= limit).all()

@@ -1,7 +1,7 @@
 
 /* CasADi's external functions with x = (q, p, s): x1 = NAME_step(x, u, h) is one step, x1 = NAME_hold(x, u, h) a time h
-   of as few equal steps as are no longer than the typical one; jac_NAME_step and jac_NAME_hold are their Jacobians by the
-   implicit-function theorem. Matrices are dense and column by column. All return 0, or 1 where there is no step: CasADi
+   of as few equal steps as are no longer than the typical one; jac_NAME_step and jac_NAME_hold are their Jacobians by
+   the implicit-function theorem. Matrices are dense and column by column. All return 0, or 1 where there is no step: CasADi
    raises an error then, and a line search of an optimiser steps back. */
 
 #ifndef casadi_real
