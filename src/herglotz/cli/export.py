@@ -58,6 +58,8 @@ FLAGS = (
          "is this run and 1 is that one, a fit of the same terms", metavar="NAME=RUN"),
     flag("--extras", "what else a C header holds: adjoint (vector-Jacobian products of steps and rollouts), filter "
          "(a Kalman filter with the noise of the fit)", nargs="+", choices=("adjoint", "filter")),
+    flag("--unroll", "ONNX of a single step without a loop: how many of Newton's iterations it makes (6 suits most "
+         "models)", type=int, metavar="N"),
     FORCE,
     flag("--json", "print what was written as JSON", action="store_true"),
 )  # fmt: skip
@@ -102,6 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
         dtype=arguments.dtype,
         parameters=parsed(arguments.parameters or ()),
         extras=arguments.extras or (),
+        unroll=arguments.unroll,
     )
     in_c = form not in ("pt2", "aoti", "onnx")
     if in_c:  # the header is read, not compiled: no compiler is needed to write it

@@ -20,9 +20,10 @@ INNER = "_c"  # what the prefix of the header ends in: its NAME_step is another 
 def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None = None, **settings: Any) -> Path:
     """Write the step as one C file that `casadi.external` loads once it is compiled.
 
-    The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`, and up to 8
-    coordinates its Jacobian; without inputs there is no u. A step that does not exist is an error of CasADi.
-    docs/control.md has an example.
+    The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`; NAME_hold, the
+    same over a time h of as few equal steps as are no longer than the typical one; and up to 8 coordinates their
+    Jacobians. Without inputs there is no u. A step that does not exist is an error of CasADi. docs/control.md has an
+    example.
 
     Parameters
     ----------
@@ -45,7 +46,11 @@ def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None 
     InputError
         As `export_c`.
     """
-    return _wrapped(model, Path(path), name, "casadi.c", settings)
+    functions = [
+        runtime("casadi_function.c").replace("NAME_FN", f"NAME_{function}").replace("FN_STEPS(h)", steps)
+        for function, steps in (("step", "1.0"), ("hold", "hz_steps_of(h, (double)hz_h)"))
+    ]
+    return _wrapped(model, Path(path), name, "".join((runtime("hold.h"), runtime("casadi.c"), *functions)), settings)
 
 
 def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None = None, **settings: Any) -> Path:
@@ -72,7 +77,7 @@ def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None 
         raise InputError(
             f"acados needs the Jacobian of a step, which C has up to {MAX_DERIVATIVES} coordinates, not {n}"
         )
-    return _wrapped(model, Path(path), name, "acados.c", settings)
+    return _wrapped(model, Path(path), name, runtime("acados.c"), settings)
 
 
 def header_of(model: ContactLagrangian, name: str, settings: dict[str, Any]) -> str:
@@ -90,10 +95,10 @@ def prefix(path: Path, name: str | None) -> str:
     return name
 
 
-def _wrapped(model: ContactLagrangian, path: Path, name: str | None, file: str, settings: dict[str, Any]) -> Path:
+def _wrapped(model: ContactLagrangian, path: Path, name: str | None, text: str, settings: dict[str, Any]) -> Path:
     name = prefix(path, name)
     inner = name + INNER
-    around = (runtime("unread.h") + runtime(file)).replace("NAME_", f"{name}_")
+    around = (runtime("unread.h") + text).replace("NAME_", f"{name}_")
     around = re.sub(r"\bhz_", f"{inner}_", around)
     content = sealed_text(header_of(model, inner, settings) + around).encode()
     write_atomically(path, content)

@@ -27,6 +27,11 @@ SYSTEM = {"Linux": "linux", "Darwin": "darwin", "Windows": "windows"}
 MACHINE = {"AMD64": "x86_64", "arm64": "aarch64"}  # as the standard spells it
 FMI2_FOLDER = {"x86_64-linux": "linux64", "x86_64-darwin": "darwin64", "x86_64-windows": "win64"}
 ENDING = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
+# What the two versions of the standard write in other letters.
+SPELLED = {
+    "2.0": {"STATE": "FMUstate", "DESERIALIZE": "DeSerializeFMUstate"},
+    "3.0": {"STATE": "FMUState", "DESERIALIZE": "DeserializeFMUState"},
+}
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of every entry: the same model gives the same bytes
 
 
@@ -107,7 +112,9 @@ def _source(entries: Mapping[str, Any], version: str, token: str) -> str:
     """The functions of the standard around the header."""
     zero = [*entries["input_zero"], 0.0]
     given = {"HEADER": f"{entries['name']}.h", "TOKEN": token, "INPUTS": numbers(zero, entries["dtype"])}
-    text = runtime("fmu.c") + runtime(f"fmi{version[0]}.c")
+    given |= {"V": version[0]} | SPELLED[version]
+    given["HOLD"] = runtime("hold.h")
+    text = "".join(map(runtime, ("fmu.c", f"fmi{version[0]}.c", "fmi.c")))
     text = re.sub(r"@(\w+)@", lambda m: given[m[1]], text)
     return re.sub(r"\bhz_", f"{entries['name']}_", text)
 

@@ -110,7 +110,8 @@ def load_onnx(path: PathLike) -> ExportedStepper:
         first = session(content)
         entries = first.get_modelmeta().custom_metadata_map
         metadata = from_json(entries.get(KEY), path)
-        programs = {"rollout": _session_program(first)}
+        steps = _session_program(first)
+        programs = {"rollout": _row_by_row(steps) if metadata.get("unrolled") else steps}
         for name in (x for x in entries if x.startswith(f"{KEY}_")):  # further models, in base 64
             programs[name.removeprefix(f"{KEY}_")] = _session_program(session(base64.b64decode(entries[name])))
     return ExportedStepper(programs, metadata, str(path), "onnx")
@@ -229,6 +230,19 @@ def _load_aoti(path: PathLike) -> ExportedStepper:
     programs = {name: load_package(str(path), key) for name, key in AOTI.items()}
     loader: Any = programs["rollout"].loader
     return ExportedStepper(programs, from_json(loader.get_metadata().get(KEY), path), str(path), "aoti")
+
+
+def _row_by_row(step: Program) -> Program:
+    """K steps (q, p, s, h (K, B)[, u (K, B, m)]) of a program of one step."""
+
+    def run(q: Tensor, p: Tensor, s: Tensor, *rows: Tensor) -> tuple[Tensor, ...]:
+        out, state = [], (q, p, s)
+        for row in zip(*rows, strict=True):
+            out.append(step(*state, *(x.contiguous() for x in row)))
+            state = out[-1][:3]
+        return tuple(torch.stack(x) for x in zip(*out, strict=True))
+
+    return run
 
 
 def _session_program(session: Any) -> Program:

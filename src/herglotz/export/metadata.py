@@ -84,6 +84,7 @@ class Metadata(_Needed, total=False):
     metrics: dict[str, Any]
     card: str
     arrival: _Arrival
+    unrolled: bool  # a single step whose iterations stand one after the other
     columns: list[tuple[str, str, str]]  # name, role, unit
     name: str
     extras: list[str]  # of `EXTRAS`

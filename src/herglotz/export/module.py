@@ -22,9 +22,12 @@ Call = Callable[..., Any]
 
 def solved(
     begin: Call, iterate: Call, more: Values,
-    layout: Layout, iterations: int, h: Tensor, u: Values, carry: Sequence[Tensor],
+    layout: Layout, iterations: int, h: Tensor, u: Values, carry: Sequence[Tensor], unrolled: bool = False,
 ) -> Values:  # fmt: skip
-    """Newton's last carry: begin, then iterate to the end; `more` is what `iterate` takes last."""
+    """Newton's last carry: begin, then iterate to the end; `more` is what `iterate` takes last.
+
+    Where it is `unrolled`, the iterations stand one after the other, and those behind the end change nothing.
+    """
     state, here, trail, _ = layout.split(carry)
     begun = tuple(dense(x) for x in begin(*((*state, h, *u) if layout.sticks else (h, *trail))))
     first, held = begun[:CARRIED], begun[CARRIED:]
@@ -34,10 +37,19 @@ def solved(
     def turn(*x: Tensor) -> Values:
         return iterate(*x[ends[0] : ends[1]], *x[: ends[0]], *x[ends[1] :])
 
+    if unrolled:
+        found = first
+        for _ in range(iterations + 1):  # the first one evaluates the guess
+            found = turn(*found, *fixed)
+        return _moved(found, held)
     # The operator itself: its wrapper would have dynamo trace the loop, which takes longer than all else.
     carried: Any = first
     found = while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, carried, fixed)
-    # What is carried as Δ is z where friction can hold a coordinate.
+    return _moved(found, held)
+
+
+def _moved(found: Values, held: Values) -> Values:
+    """Newton's carry with Δ in its place: where friction can hold a coordinate, what is carried is z."""
     return (*found[:2], soft_threshold(found[2], held[1]), *found[3:]) if held else found
 
 
@@ -120,14 +132,23 @@ class StepModule(nn.Module):
 
     The solve is outside autograd; its derivative is that of the implicit-function theorem, dΔ = −J⁻¹ dF, with J at the
     solution. A step in closed form is differentiated as it stands. With `linearised`, d(q, p, s)′ / d(q, p, s, h, u),
-    (B, 2n+1, 2n+2+m), is one more output instead.
+    (B, 2n+1, 2n+2+m), is one more output instead. With `unrolled` there is no loop, and no derivative either.
     """
 
-    def __init__(self, equations: Equations, graphs: StepGraphs, iterations: int, *, linearised: bool = False):
+    def __init__(
+        self,
+        equations: Equations,
+        graphs: StepGraphs,
+        iterations: int,
+        *,
+        linearised: bool = False,
+        unrolled: bool = False,
+    ):
         super().__init__()
-        self.graphs, self.iterations = graphs, iterations
+        self.graphs, self.iterations, self.unrolled = graphs, iterations, unrolled
         self.jacobian = equations.jacobian if linearised else None
-        if graphs.layout.iterates and not linearised:
+        self.attaches = graphs.layout.iterates and not linearised and not unrolled
+        if self.attaches:
             self.slopes, self.first_order = equations.slopes, equations.first_order
 
     def forward(
@@ -150,8 +171,9 @@ class StepModule(nn.Module):
             fixed = [x.detach() for x in (h, *u, *carry)]
             split = 1 + len(u)
             steps = graphs.begin, graphs.iterate.call, graphs.iterate.constants
-            found = solved(*steps, graphs.layout, self.iterations, fixed[0], tuple(fixed[1:split]), fixed[split:])
-            if self.jacobian is None:
+            given = fixed[0], tuple(fixed[1:split]), fixed[split:]
+            found = solved(*steps, graphs.layout, self.iterations, *given, unrolled=self.unrolled)
+            if self.attaches:
                 found = self._attached((q, p, s, h), (*graphs.layout.split(carry)[1], *u), found)
         new = graphs.finish(h, *u, *carry, *found)
         said = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +38,11 @@ def programs_of(
     graphs = StepGraphs(equations.model, entries["box"], entries.get("h_range"))
     q, p, s, *more = example(equations.model, entries["h"])
     stacked = [x.expand(EXAMPLE_STEPS, *x.shape).clone() for x in more]
-    iterations = entries["newton_iterations"]
+    iterations, unrolled = entries["newton_iterations"], entries.get("unrolled", False)
+    one_step = partial(StepModule, equations, graphs, iterations, unrolled=unrolled)
     make = {
-        "model": lambda: _program(StepModule(equations, graphs, iterations), (q, p, s, *more)),
-        "linearise": lambda: _program(StepModule(equations, graphs, iterations, linearised=True), (q, p, s, *more)),
+        "model": lambda: _program(one_step(), (q, p, s, *more)),
+        "linearise": lambda: _program(one_step(linearised=True), (q, p, s, *more)),
         "rollout": lambda: _program(RolloutModule(graphs, iterations, hoists), (q, p, s, *stacked), stacked=True),
         "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
         "legendre": lambda: _program(LegendreModule(equations), (q, p, s, more[0])),
@@ -88,8 +91,8 @@ def quiet() -> Iterator[None]:
             log.setLevel(level)
 
 
-def writes(content: Callable[[ContactLagrangian, dict[str, Any]], bytes]):
-    """Make of a function (model, metadata) → content of a file, sealed, the function that writes the file."""
+def writes(content: Callable[..., bytes]):
+    """Make of a function (model, metadata, **form) → content of a file, sealed, the function that writes the file."""
 
     def export(
         model: ContactLagrangian,
@@ -100,12 +103,17 @@ def writes(content: Callable[[ContactLagrangian, dict[str, Any]], bytes]):
         units: Sequence[str] = (),
         metadata: Mapping[str, Any] | None = None,
         newton_iterations: int = ITERATIONS,
+        **form: Any,
     ) -> Path:
-        made = content(model, describe(model, h, box, units, newton_iterations, metadata or {}))
+        made = content(model, describe(model, h, box, units, newton_iterations, metadata or {}), **form)
         write_atomically(path, made)
         remember(made)
         return Path(path)
 
+    _, _, *own = inspect.signature(content).parameters.values()
+    signature: Any = inspect.signature(export)
+    known = [x for x in signature.parameters.values() if x.kind is not x.VAR_KEYWORD]
+    setattr(export, "__signature__", signature.replace(parameters=[*known, *own]))  # noqa: B010  pyright knows no such
     for name in ("__module__", "__name__", "__qualname__", "__doc__"):
         setattr(export, name, getattr(content, name))
     return export

@@ -43,6 +43,7 @@ def export_run(
     dtype: str | None = None,
     parameters: Chosen = (),
     extras: Sequence[str] = (),
+    unroll: int | None = None,
 ) -> Path:
     """Write the model of a run as one file that steps without this package.
 
@@ -66,12 +67,14 @@ def export_run(
         Numbers that a C header takes at run time, as of `export_c`.
     extras
         What else a C header holds, as of `export_c`; a filter has the noise of the fit as `NAME_noise_of_fit`.
+    unroll
+        Of an ONNX file: a single step with so many of Newton's iterations and no loop, as of `export_onnx`.
 
     Raises
     ------
     InputError
         If the name has another end, the format cannot hold the model, a prefix or a dtype is given for a format
-        without C, or parameters for another one than a C header.
+        without C, parameters for another one than a C header, or unroll for another one than ONNX.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
@@ -83,6 +86,8 @@ def export_run(
         raise InputError(f"{path}: dtype {dtype} is of C headers only, not of {kind}; leave it out")
     if (parameters or extras) and kind != "c":
         raise InputError(f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out")
+    if unroll is not None and kind != "onnx":
+        raise InputError(f"{path}: unroll is of ONNX only, not of {kind}; leave it out")
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or _steps(run)]
     metadata = {
@@ -107,6 +112,8 @@ def export_run(
         described["parameters"] = parameters
     if extras:
         described["extras"] = list(extras)
+    if unroll is not None:
+        described["unroll"] = unroll
     if "filter" in extras:
         still = (0.0,) * len(described_parameters(run.model, parameters))
         metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}

@@ -157,3 +157,31 @@ def test_names_that_cannot_be(tmp_path):
         with pytest.raises(InputError, match="name must be a C identifier of at most 39"):
             export_casadi(MODELS["inputs"](), tmp_path / "a.c", h=0.1, name=bad)
     assert "model_2_arms_step(" in export_casadi(MODELS["inputs"](), tmp_path / "2 arms.c", h=0.1).read_text()
+
+
+@pytest.mark.parametrize("name", ["inputs", "mass m(q)"])
+def test_a_hold_is_the_fewest_steps_that_are_no_longer_than_the_typical_one(name, tmp_path):
+    # fails if a step is lost or too long, rounding of the time adds one, a step's Jacobian is multiplied from the wrong
+    # side or its own derivative by u is left out, or the derivative by the time is that of one step
+    model = MODELS[name]()
+    step, path = function(model, tmp_path)
+    hold = ca.external("arm_hold", str(path.with_suffix(".so")))
+    x, *u, _ = given = arguments(model, near(model.config.dof, 1))
+    for time, count in ((0.04, 1), (0.3, 3), (0.3 * (1 + 1e-9), 3), (0.31, 4)):
+        end = x
+        for _ in range(count):
+            end = step(end, *u, time / count)
+        assert abs(np.array(hold(x, *u, time) - end)).max() <= 1e-13
+    symbols = [ca.MX.sym("x", len(x)), *(ca.MX.sym("u", len(y)) for y in u), ca.MX.sym("h")]
+    end = symbols[0]
+    for _ in range(4):
+        end = step(end, *symbols[1:-1], symbols[-1] / 4)
+    slopes = ca.Function("slopes", symbols, [ca.jacobian(end, y) for y in symbols])
+    theirs, ours = slopes(*given[:-1], 0.31), hold.jacobian()(*given[:-1], 0.31, 0)
+    for a, b in zip(ours, theirs, strict=True):
+        assert abs(np.array(a - b)).max() <= 1e-12 * max(1.0, abs(np.array(b)).max())
+    for bad in (0.0, -0.3, float("nan"), float("inf")):
+        with pytest.raises(RuntimeError):
+            hold(x, *u, bad)
+        with pytest.raises(RuntimeError):
+            hold.jacobian()(x, *u, bad, 0)

@@ -11,7 +11,7 @@ from torch.export import ExportedProgram
 from torch.export.graph_signature import InputKind
 
 from herglotz.data.seal import sealed_onnx
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.export.lower.onnx_table import write
 from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of, needed, reads
 from herglotz.export.metadata import KEY, to_json
@@ -23,7 +23,7 @@ OUTPUTS = ("q_out", "p_out", "s_out", "c", "residual", "status", "outside")
 
 
 @writes
-def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
+def export_onnx(model: ContactLagrangian, entries: dict[str, Any], *, unroll: int | None = None) -> bytes:
     """Write K steps (q, p, s, h) → (q, p, s, c, residual, status[, outside]) of the model's flow as an ONNX graph.
 
     Inputs q, p (B, n), s (B,) and h (K, B), a row a step; K = 1 is one step. Outputs q, p (K, B, n), the others (K, B):
@@ -32,6 +32,9 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     a second, small ONNX model in base 64: the state from two positions, q0, q1 (B, n), s0, h (B,)[, u] → p, s at q1;
     `herglotz_legendre` has p = L_v and L_vv at q, v (B, n), s, h (B,).
 
+    With `unroll`, a number of Newton's iterations, the file is one step without a loop, for importers that take none:
+    h (B,), u (B, m), and outputs (B, n) and (B,). A step that needs more iterations has the status MAX_ITERATIONS.
+
     The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`. Raise
     InputError if onnx is not installed, an argument is not usable, or the file cannot be written.
     """
@@ -39,9 +42,12 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
         import onnx  # noqa: F401
     except ImportError as error:
         raise InputError(f"ONNX export needs {error.name}; install it with: pip install 'herglotz[export]'") from None
-    text = to_json(entries)
+    if unroll is not None:
+        refuse({f"unroll must be a number of iterations of at least 2, got {unroll}; 6 suits most models": unroll < 2})
+        entries = entries | {"newton_iterations": unroll, "unrolled": True}
+    text, main = to_json(entries), "rollout" if unroll is None else "model"
     with quiet():
-        programs = programs_of(model, entries, ("rollout", "linearise", "init", "legendre"))
+        programs = programs_of(model, entries, (main, "linearise", "init", "legendre"))
     u = ("u",) if entries["inputs"] else ()
     said = OUTPUTS if entries["box"] is not None else OUTPUTS[:-1]
     further = {"init": (("q0", "q1", "s0", "h"), ("p", "s")), "linearise": (("q", "p", "s", "h"), (*said, "jacobian"))}
@@ -52,7 +58,7 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     for name, (inputs, outputs) in further.items():
         second = graph_of(programs[name], inputs, outputs, {})
         properties[f"{KEY}_{name}"] = base64.b64encode(second).decode()
-    content = graph_of(programs["rollout"], ("q", "p", "s", "h", *u), said, properties)
+    content = graph_of(programs[main], ("q", "p", "s", "h", *u), said, properties)
     return sealed_onnx(content)
 
 

@@ -83,32 +83,23 @@ static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA 
 }
 
 #if hz_DERIVATIVES
-/* hz_step with its derivatives, by the implicit-function theorem: rows are (q, p, s) after the step.
-
-   by_state   (2 hz_N + 1, 2 hz_N + 1)  along (q, p, s) before it
-   by_h       (2 hz_N + 1)
-   by_input   (2 hz_N + 1, hz_M), where the model takes inputs
-
-   Any of them and `residual` may be null; they are written on success only. A derivative that is not finite is
-   hz_DIVERGED, and the state stays. */
-static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual, hz_real *by_state,
+/* The derivatives of a step from `before` to `after`, as of hz_step_jacobian. Returns 0, or hz_DIVERGED where one is not
+   finite: then none is written. */
+static inline int hz_step_slopes(const hz_state *before, const hz_state *after, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *by_state,
     hz_WITH_U(hz_real *by_input) hz_WITH_THETA(hz_real *by_theta) hz_real *by_h) {
   enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS + hz_P };
-  const hz_state before = *state;
   hz_problem P;
   hz_real slopes[SIZE * WIDTH], move[hz_N];
   int i, j;
-  const int status = hz_step(state, h, hz_WITH_U(u) hz_WITH_THETA(theta) residual);
 #if hz_P && hz_INPUTS
   hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS], push_by_theta[hz_INPUTS * hz_P];
 #endif /* hz_P */
-  if (status & 15) return status;
   for (i = 0; i < hz_N; i++) {
-    P.q0[i] = before.q[i];
-    P.p0[i] = before.p[i];
-    move[i] = state->q[i] - before.q[i];
+    P.q0[i] = before->q[i];
+    P.p0[i] = before->p[i];
+    move[i] = after->q[i] - before->q[i];
   }
-  P.s0 = before.s;
+  P.s0 = before->s;
   P.h = h;
 #if hz_P
   if (!theta) theta = &hz_defaults;
@@ -123,10 +114,7 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAK
 #endif /* hz_P */
   hz_slopes(&P, move, slopes);
   for (i = 0; i < SIZE * WIDTH; i++)
-    if (!hz_finite(slopes[i])) { /* the step exists, but a derivative is beyond the largest number */
-      *state = before;
-      return hz_DIVERGED;
-    }
+    if (!hz_finite(slopes[i])) return hz_DIVERGED; /* the step exists, but a derivative is beyond the largest number */
   for (i = 0; i < SIZE; i++) {
     for (j = 0; by_state && j < SIZE; j++) by_state[i * SIZE + j] = slopes[i * WIDTH + j];
     if (by_h) by_h[i] = slopes[i * WIDTH + SIZE];
@@ -151,7 +139,26 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAK
     }
 #endif
   }
-  return status;
+  return 0;
+}
+
+/* hz_step with its derivatives, by the implicit-function theorem: rows are (q, p, s) after the step.
+
+   by_state   (2 hz_N + 1, 2 hz_N + 1)  along (q, p, s) before it
+   by_h       (2 hz_N + 1)
+   by_input   (2 hz_N + 1, hz_M), where the model takes inputs
+
+   Any of them and `residual` may be null; they are written on success only. A derivative that is not finite is
+   hz_DIVERGED, and the state stays. */
+static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual, hz_real *by_state,
+    hz_WITH_U(hz_real *by_input) hz_WITH_THETA(hz_real *by_theta) hz_real *by_h) {
+  const hz_state before = *state;
+  const int status = hz_step(state, h, hz_WITH_U(u) hz_WITH_THETA(theta) residual);
+  if (status & 15) return status;
+  if (!hz_step_slopes(&before, state, h, hz_WITH_U(u) hz_WITH_THETA(theta) by_state, hz_WITH_U(by_input) hz_WITH_THETA(by_theta) by_h))
+    return status;
+  *state = before;
+  return hz_DIVERGED;
 }
 #endif
 

@@ -32,13 +32,6 @@ static void fmu_log(const fmu_instance *it, int status, const char *message) {
 fmu_API fmi2String fmi2GetTypesPlatform(void) { return "default"; }
 fmu_API fmi2String fmi2GetVersion(void) { return "2.0"; }
 
-fmu_API fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t count, const fmi2String categories[]) {
-  (void)on;
-  (void)count;
-  (void)categories;
-  return c ? fmu_OK : fmu_ERROR;
-}
-
 fmu_API fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
     const fmi2CallbackFunctions *calls, fmi2Boolean visible, fmi2Boolean logging) {
   const size_t length = name ? strlen(name) : 0;
@@ -80,14 +73,6 @@ fmu_API fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean with_toleran
 fmu_API fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
   return c ? fmu_initialize((fmu_instance *)c, ((fmu_component *)c)->start) : fmu_ERROR;
 }
-fmu_API fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return fmu_initialized((fmu_instance *)c); }
-fmu_API fmi2Status fmi2Terminate(fmi2Component c) { return fmu_terminate((fmu_instance *)c); }
-fmu_API fmi2Status fmi2Reset(fmi2Component c) {
-  if (!c) return fmu_ERROR;
-  fmu_restart((fmu_instance *)c);
-  return fmu_OK;
-}
-
 fmu_API fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t count, fmi2Real values[]) {
   return fmu_get((fmu_instance *)c, vr, count, values);
 }
@@ -95,11 +80,6 @@ fmu_API fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], s
   return fmu_set((fmu_instance *)c, vr, count, values);
 }
 
-/* What there is none of: variables that are not real, derivatives by time. */
-static fmi2Status fmu_none(fmi2Component c, size_t count) {
-  if (!c) return fmu_ERROR;
-  return count ? fmu_said((fmu_instance *)c, fmu_ERROR, fmu_NOTHING_SUCH) : fmu_OK;
-}
 #define fmu_NO_VARIABLES(name, type) \
   fmu_API fmi2Status fmi2Get##name(fmi2Component c, const fmi2ValueReference vr[], size_t count, type values[]) { \
     (void)vr; \
@@ -115,21 +95,6 @@ static fmi2Status fmu_none(fmi2Component c, size_t count) {
 fmu_NO_VARIABLES(Integer, fmi2Integer)
 fmu_NO_VARIABLES(Boolean, fmi2Boolean)
 fmu_NO_VARIABLES(String, fmi2String)
-
-fmu_API fmi2Status fmi2GetFMUstate(fmi2Component c, void **state) { return fmu_save((fmu_instance *)c, state); }
-fmu_API fmi2Status fmi2SetFMUstate(fmi2Component c, void *state) { return fmu_restore((fmu_instance *)c, state); }
-fmu_API fmi2Status fmi2FreeFMUstate(fmi2Component c, void **state) { return fmu_drop((fmu_instance *)c, state); }
-fmu_API fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, void *state, size_t *size) {
-  if (!c || !state || !size) return fmu_ERROR;
-  *size = fmu_BYTES;
-  return fmu_OK;
-}
-fmu_API fmi2Status fmi2SerializeFMUstate(fmi2Component c, void *state, fmi2Byte bytes[], size_t size) {
-  return fmu_to_bytes((fmu_instance *)c, state, bytes, size);
-}
-fmu_API fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, void **state) {
-  return fmu_from_bytes((fmu_instance *)c, bytes, size, state);
-}
 
 fmu_API fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[], size_t rows,
     const fmi2ValueReference knowns[], size_t columns, const fmi2Real seed[], fmi2Real result[]) {

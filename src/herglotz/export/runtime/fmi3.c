@@ -7,6 +7,7 @@ typedef void *fmi3Instance;
 typedef uint32_t fmi3ValueReference;
 typedef double fmi3Float64;
 typedef bool fmi3Boolean;
+typedef uint8_t fmi3Byte;
 typedef const char *fmi3String;
 typedef int fmi3Status, fmi3DependencyKind, fmi3IntervalQualifier;
 typedef void (*fmi3LogMessageCallback)(void *environment, fmi3Status status, fmi3String category, fmi3String message);
@@ -25,13 +26,6 @@ static void fmu_log(const fmu_instance *it, int status, const char *message) {
 }
 
 fmu_API fmi3String fmi3GetVersion(void) { return "3.0"; }
-
-fmu_API fmi3Status fmi3SetDebugLogging(fmi3Instance it, fmi3Boolean on, size_t count, const fmi3String categories[]) {
-  (void)on;
-  (void)count;
-  (void)categories;
-  return it ? fmu_OK : fmu_ERROR;
-}
 
 fmu_API fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources,
     fmi3Boolean visible, fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early_return,
@@ -86,14 +80,6 @@ fmu_API fmi3Status fmi3EnterInitializationMode(fmi3Instance it, fmi3Boolean with
   (void)stop;
   return fmu_initialize((fmu_instance *)it, start);
 }
-fmu_API fmi3Status fmi3ExitInitializationMode(fmi3Instance it) { return fmu_initialized((fmu_instance *)it); }
-fmu_API fmi3Status fmi3Terminate(fmi3Instance it) { return fmu_terminate((fmu_instance *)it); }
-fmu_API fmi3Status fmi3Reset(fmi3Instance it) {
-  if (!it) return fmu_ERROR;
-  fmu_restart((fmu_instance *)it);
-  return fmu_OK;
-}
-
 fmu_API fmi3Status fmi3GetFloat64(fmi3Instance it, const fmi3ValueReference vr[], size_t count, fmi3Float64 values[],
     size_t size) {
   return size == count ? fmu_get((fmu_instance *)it, vr, count, values) : fmu_ERROR;
@@ -103,11 +89,6 @@ fmu_API fmi3Status fmi3SetFloat64(fmi3Instance it, const fmi3ValueReference vr[]
   return size == count ? fmu_set((fmu_instance *)it, vr, count, values) : fmu_ERROR;
 }
 
-/* What there is none of: other types of variables, clocks, events, continuous states, derivatives by time. */
-static fmi3Status fmu_none(fmi3Instance it, size_t count) {
-  if (!it) return fmu_ERROR;
-  return count ? fmu_said((fmu_instance *)it, fmu_ERROR, fmu_NOTHING_SUCH) : fmu_OK;
-}
 #define fmu_NO_VARIABLES(name, type) \
   fmu_API fmi3Status fmi3Get##name(fmi3Instance it, const fmi3ValueReference vr[], size_t count, type values[], \
       size_t size) { \
@@ -238,21 +219,6 @@ fmu_API fmi3Status fmi3ActivateModelPartition(fmi3Instance it, fmi3ValueReferenc
   (void)clock;
   (void)time;
   return fmu_none(it, 1);
-}
-
-fmu_API fmi3Status fmi3GetFMUState(fmi3Instance it, void **state) { return fmu_save((fmu_instance *)it, state); }
-fmu_API fmi3Status fmi3SetFMUState(fmi3Instance it, void *state) { return fmu_restore((fmu_instance *)it, state); }
-fmu_API fmi3Status fmi3FreeFMUState(fmi3Instance it, void **state) { return fmu_drop((fmu_instance *)it, state); }
-fmu_API fmi3Status fmi3SerializedFMUStateSize(fmi3Instance it, void *state, size_t *size) {
-  if (!it || !state || !size) return fmu_ERROR;
-  *size = fmu_BYTES;
-  return fmu_OK;
-}
-fmu_API fmi3Status fmi3SerializeFMUState(fmi3Instance it, void *state, uint8_t bytes[], size_t size) {
-  return fmu_to_bytes((fmu_instance *)it, state, bytes, size);
-}
-fmu_API fmi3Status fmi3DeserializeFMUState(fmi3Instance it, const uint8_t bytes[], size_t size, void **state) {
-  return fmu_from_bytes((fmu_instance *)it, bytes, size, state);
 }
 
 fmu_API fmi3Status fmi3GetDirectionalDerivative(fmi3Instance it, const fmi3ValueReference unknowns[], size_t rows,

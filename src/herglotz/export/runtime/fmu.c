@@ -6,7 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-
+@HOLD@
 #define fmu_TOKEN "@TOKEN@"
 
 enum { fmu_STATE = 2 * hz_N + 1, fmu_FIRST_STATE = 1 + hz_M, fmu_VARIABLES = 1 + hz_M + fmu_STATE };
@@ -30,8 +30,6 @@ struct fmu_instance {
   fmu_values now;
   fmu_reporter report;
 };
-
-#define fmu_NOTHING_SUCH "This FMU has real variables alone, without derivatives by time, clocks or events."
 
 static const char *fmu_category(int status) { return status == fmu_WARNING ? "logStatusWarning" : "logStatusError"; }
 
@@ -113,7 +111,7 @@ static int fmu_terminate(fmu_instance *it) {
 
 /* A communication step H is one step, or as few equal ones as the steps that the model was fitted for allow. */
 static int fmu_communicate(fmu_instance *it, double time, double H) {
-  const double slack = 1e-6; /* recorded times carry rounding */
+  const double slack = 1e-6; /* as of hz_steps_of */
   fmu_values *now, then;
   double steps, k;
   hz_real h;
@@ -121,8 +119,7 @@ static int fmu_communicate(fmu_instance *it, double time, double H) {
   if (!fmu_allowed(it, fmu_RUNNING, fmu_RUNNING)) return fmu_ERROR;
   if (!(time - time == 0.0 && H - H == 0.0 && H > 0.0))
     return fmu_said(it, fmu_ERROR, "The communication step is not a finite number above 0.");
-  steps = ceil(H / (double)hz_h_high * (1.0 - slack));
-  if (steps < 1.0) steps = 1.0;
+  steps = hz_steps_of(H, (double)hz_h_high);
   h = (hz_real)(H / steps);
   if (fabs((double)h - (double)hz_h) <= slack * (double)hz_h) h = hz_h;
   if ((double)h < (double)hz_h_low * (1.0 - slack)) {
@@ -154,44 +151,13 @@ static int fmu_communicate(fmu_instance *it, double time, double H) {
   return now->outside ? fmu_WARNING : fmu_OK;
 }
 
-/* The map of the last communication step, (q, p, s; u) before it to (q, p, s) after it: rows of fmu_STATE + hz_M. */
-static int fmu_linearise(const fmu_instance *it, double *map) {
-#if hz_DERIVATIVES
-  enum { WIDTH = fmu_STATE + hz_M };
-  hz_state x = it->now.before;
-  hz_real by_x[fmu_STATE * fmu_STATE], by_u[fmu_STATE * (hz_M + 1)];
-  double column[fmu_STATE], k;
-  int i, j, l;
-  for (i = 0; i < fmu_STATE; i++)
-    for (j = 0; j < WIDTH; j++) map[i * WIDTH + j] = i == j;
-  (void)by_u;
-  for (k = 0.0; k < it->now.steps; k += 1.0) {
-    if (hz_step_jacobian(&x, it->now.h, hz_WITH_U(it->now.acted) 0, by_x, hz_WITH_U(by_u) 0) & 15)
-      return fmu_said(it, fmu_ERROR, "The last step has no derivative.");
-    for (j = 0; j < WIDTH; j++) {
-      for (i = 0; i < fmu_STATE; i++) {
-        column[i] = 0.0;
-        for (l = 0; l < fmu_STATE; l++) column[i] += by_x[i * fmu_STATE + l] * map[l * WIDTH + j];
-#if hz_INPUTS
-        if (j >= fmu_STATE) column[i] += by_u[i * hz_M + j - fmu_STATE];
-#endif
-      }
-      for (i = 0; i < fmu_STATE; i++) map[i * WIDTH + j] = column[i];
-    }
-  }
-  return fmu_OK;
-#else
-  (void)map;
-  return fmu_said(it, fmu_ERROR, "The model has too many coordinates for derivatives.");
-#endif
-}
-
 /* Derivatives of q, p, s after the last communication step by q, p, s before it and by the inputs during it:
    result = J seed, or Jᵀ seed where `adjoint` is true. */
 static int fmu_differentiate(fmu_instance *it, const unsigned int *unknowns, size_t rows, const unsigned int *knowns,
     size_t columns, const double *seed, double *result, int adjoint) {
-  enum { WIDTH = fmu_STATE + hz_M };
-  double map[fmu_STATE * WIDTH];
+#if hz_DERIVATIVES
+  hz_state x;
+  hz_real by_x[fmu_STATE * fmu_STATE], by_u[fmu_STATE * (hz_M + 1)];
   size_t i, j;
   if (!fmu_allowed(it, fmu_RUNNING, fmu_RUNNING)) return fmu_ERROR;
   if (it->now.steps < 1.0) return fmu_said(it, fmu_ERROR, "There is no derivative before the first step.");
@@ -200,17 +166,29 @@ static int fmu_differentiate(fmu_instance *it, const unsigned int *unknowns, siz
       return fmu_said(it, fmu_ERROR, "An unknown is no output.");
   for (j = 0; j < columns; j++)
     if (!fmu_place(&it->now, knowns[j])) return fmu_said(it, fmu_ERROR, "A known is no input or output.");
-  if (fmu_linearise(it, map)) return fmu_ERROR;
+  x = it->now.before;
+  if (hz_hold_jacobian(&x, it->now.h, hz_WITH_U(it->now.acted) it->now.steps, by_x, hz_WITH_U(by_u) 0))
+    return fmu_said(it, fmu_ERROR, "The last step has no derivative.");
   for (i = 0; i < (adjoint ? columns : rows); i++) result[i] = 0.0;
   for (i = 0; i < rows; i++)
     for (j = 0; j < columns; j++) {
-      const unsigned int known = knowns[j];
-      const unsigned int column = known >= fmu_FIRST_STATE ? known - fmu_FIRST_STATE : fmu_STATE + known - 1;
-      const double slope = map[(unknowns[i] - fmu_FIRST_STATE) * WIDTH + column];
+      const unsigned int row = unknowns[i] - fmu_FIRST_STATE, known = knowns[j];
+      const double slope = (double)(known >= fmu_FIRST_STATE ? by_x[row * fmu_STATE + known - fmu_FIRST_STATE]
+                                                             : by_u[row * hz_M + known - 1]);
       if (adjoint) result[j] += slope * seed[i];
       else result[i] += slope * seed[j];
     }
   return fmu_OK;
+#else
+  (void)unknowns;
+  (void)rows;
+  (void)knowns;
+  (void)columns;
+  (void)seed;
+  (void)result;
+  (void)adjoint;
+  return fmu_said(it, fmu_ERROR, "The model has too many coordinates for derivatives.");
+#endif
 }
 
 /* Saved states are values in memory of their own; as bytes they follow the token. */
@@ -257,9 +235,15 @@ static int fmu_from_bytes(fmu_instance *it, const void *bytes, size_t size, void
   return fmu_OK;
 }
 
+/* What this FMU has nothing of: other types of variables, clocks, events, continuous states, derivatives by time. */
+static int fmu_none(void *it, size_t count) {
+  if (!it) return fmu_ERROR;
+  return count ? fmu_said((fmu_instance *)it, fmu_ERROR, "This FMU has real variables alone, without derivatives by "
+                          "time, clocks or events.") : fmu_OK;
+}
+
 #if defined(_WIN32)
 #define fmu_API __declspec(dllexport)
 #else
 #define fmu_API
 #endif
-

@@ -1,0 +1,270 @@
+"""The exported step in control: `python benchmarks/control.py [--quick] [--only PART ...] [--out FOLDER]`.
+
+`nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
+as the file for CasADi and as CasADi's own expressions. `loop`: `examples/real_time_iteration/rti.c` in closed loop with
+the true plant from random starts. `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time;
+what is compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and
+control.md.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
+from benchmarks.control_model import H, model, sx_steps
+from herglotz.codegen.c_compiler import compiler
+from herglotz.export import compile_c, export_c, export_casadi
+from herglotz.models import ContactLagrangian, ModelConfig
+
+N, STEPS = 50, 8  # intervals, and steps in one
+INTERVAL = STEPS * H  # s
+UPRIGHT, WEIGHT = np.array([0.0, np.pi, 0.0, 0.0, 0.0]), np.array([1.0, 2.0, 0.05, 0.5, 0.0])
+FORCE, FORCE_WEIGHT, LAST = 12.0, 0.003, 20.0
+NEAR = 0.1  # rad from upright
+FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
+Row = dict[str, Any]
+
+
+def built(source: Path, *more: str) -> Path:
+    """A C file as a library beside it."""
+    library = source.with_suffix(".so")
+    subprocess.run([*compiler(), *FLAGS, *more, str(source), "-o", str(library), "-lm"], check=True)
+    return library
+
+
+def repeated(step: ca.Function) -> ca.Function:
+    """(x, u) → x after an interval, by single steps."""
+    x, u = ca.MX.sym("x", 5), ca.MX.sym("u")
+    end = x
+    for _ in range(STEPS):
+        end = step(end, u, H)
+    return ca.Function("ahead", [x, u], [end])
+
+
+def problem(ahead: ca.Function, **options: Any) -> tuple[dict[str, ca.MX], dict[str, Any]]:
+    """The problem of optimal control, and the solver's options: the Hessian is that of the cost."""
+    X, U, start = ca.MX.sym("X", 5, N + 1), ca.MX.sym("U", 1, N), ca.MX.sym("start", 5)
+    distance = ca.DM(WEIGHT).T @ (X - UPRIGHT) ** 2
+    cost = ca.sum2(distance) + LAST * distance[-1] + FORCE_WEIGHT * ca.sumsqr(U)
+    unknowns = ca.veccat(X, U)
+    gaps = ca.veccat(X[:, 0] - start, ahead.map(N)(X[:, :-1], U) - X[:, 1:])
+    scale, multipliers = ca.MX.sym("scale"), ca.MX.sym("multipliers", gaps.shape[0])
+    hessian = ca.triu(scale * ca.hessian(cost, unknowns)[0])
+    options["hess_lag"] = ca.Function("hess_lag", [unknowns, start, scale, multipliers], [hessian])
+    options |= {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-4}, "print_time": False}
+    return {"x": unknowns, "f": cost, "g": gaps, "p": start}, options
+
+
+def solver(ahead: ca.Function) -> ca.Function:
+    """IPOPT on the problem with this interval."""
+    nlp, options = problem(ahead)
+    return ca.nlpsol("solver", "ipopt", nlp, options)
+
+
+def generated(ahead: ca.Function, path: Path) -> ca.Function:
+    """The same with cost, gaps and their derivatives in C that CasADi generates."""
+    source = Path(solver(ahead).generate_dependencies(path.name))
+    source = source.rename(path) if source.resolve() != path.resolve() else path
+    own = {name: ca.external(f"nlp{name}", str(built(source))) for name in ("", "_grad_f", "_jac_g")}
+    _, options = problem(ahead, grad_f=own["_grad_f"], jac_g=own["_jac_g"])
+    return ca.nlpsol("solver", "ipopt", own[""], options)
+
+
+def solve(solver: ca.Function) -> tuple[float, float, float]:
+    """Seconds of processor time, those in the problem's functions, and the least cost."""
+    bound = np.full((5, N + 1), np.inf)
+    bound[0] = 0.9
+    bound = np.concatenate([bound.ravel("F"), np.full(N, FORCE)])
+    guess = np.concatenate([np.linspace(np.zeros(5), UPRIGHT, N + 1).ravel(), np.full(N, 0.1)])
+    began = time.process_time()
+    found = solver(x0=guess, p=np.zeros(5), lbx=-bound, ubx=bound, lbg=0, ubg=0)
+    took, stats = time.process_time() - began, solver.stats()
+    assert stats["success"], stats["return_status"]
+    return took, sum(x for key, x in stats.items() if key.startswith("t_proc_nlp")), float(found["f"])
+
+
+def nlp(quick: bool, folder: Path) -> list[Row]:
+    """The whole solution and its functions, ours and others in turn."""
+    library = str(built(export_casadi(model(), folder / "cart.c", h=H)))
+    hold, x, u = ca.external("cart_hold", library), ca.MX.sym("x", 5), ca.MX.sym("u")
+    own = sx_steps()
+    forms = {
+        "ours": solver(ca.Function("ahead", [x, u], [hold(x, u, INTERVAL)])),
+        "ours, 8 calls of a step": solver(repeated(ca.external("cart_step", library))),
+        "SX, fast_newton": solver(repeated(own["rootfinder"])),
+        "SX, Newton unrolled": solver(repeated(own["unrolled"])),
+        "C of SX, fast_newton": generated(repeated(own["rootfinder"]), folder / "found.c"),
+        "C of SX, Newton unrolled": generated(repeated(own["unrolled"]), folder / "unrolled.c"),
+    }
+    taken = [{name: solve(form) for name, form in forms.items()} for _ in range(1 if quick else 5)]
+    costs = [cost for once in taken for _, _, cost in once.values()]
+    assert max(costs) - min(costs) < 1e-6 * max(costs), costs  # the same problem
+    rows = []
+    for name in forms:
+        whole, inside = ([once[name][k] / once["ours"][k] for once in taken] for k in (0, 1))
+        row = {"what": f"swing-up, {name}", "ms": 1e3 * statistics.median(once[name][0] for once in taken)}
+        target = None if name.startswith("ours") else 1.5 if name.startswith("C of") else 5.0
+        rows.append(row | {"whole": whole, "functions": inside, "target": target})
+    return rows
+
+
+class Controller(ctypes.Structure):
+    """`rti` of rti.c."""
+
+    _fields_ = [
+        ("H", ctypes.c_double), ("X", ctypes.c_double * 5), ("Q", ctypes.c_double * 5), ("E", ctypes.c_double * 5),
+        ("R", ctypes.c_double), ("U", ctypes.c_double), ("x", ctypes.c_double * (5 * (N + 1))),
+        ("u", ctypes.c_double * N), ("K", ctypes.c_double * (5 * N)), ("k", ctypes.c_double * N),
+        ("damping", ctypes.c_double), ("cost", ctypes.c_double),
+    ]  # fmt: skip
+
+
+def plant() -> Callable[..., np.ndarray]:
+    """The true plant: the first cells of the example."""
+    text = (harness.ROOT / "examples" / "mpc_swing_up.py").read_text(encoding="utf-8")
+    known: dict[str, Any] = {}
+    exec(text[: text.index("# Four recordings")], known)
+    return known["plant"]
+
+
+def closed(library: ctypes.CDLL, stepper: Any, true: Callable[..., np.ndarray], z: np.ndarray, count: int) -> Row:
+    """`count` samples from z = (x, θ, x′, θ′): the angle after each, the largest |x|, and ms of both phases."""
+    tensor = lambda x: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1)  # noqa: E731
+
+    def measured(q0: np.ndarray, q1: np.ndarray, force: float) -> Any:
+        """The state of two positions, one step of the model apart."""
+        at = stepper.init(tensor(q0), tensor(q1), torch.zeros(1, dtype=torch.float64), H, u=tensor(force))
+        return (ctypes.c_double * 5)(*q1, *at.p[0].tolist(), 0.0)
+
+    it, force = Controller(H=INTERVAL, R=FORCE_WEIGHT, U=FORCE), ctypes.c_double()
+    it.X[:], it.Q[:], it.E[:] = UPRIGHT, WEIGHT, LAST * WEIGHT
+    it.u[:] = [0.1] * N
+    state = measured(z[:2] - H * z[2:], z[:2], 0.0)
+    failed = library.rti_feedback(ctypes.byref(it), state, ctypes.byref(force))  # the first motion: no law yet
+    angles, widest, ms = [], 0.0, []
+    for _ in range(count):
+        times = [time.perf_counter()]
+        failed |= library.rti_prepare(ctypes.byref(it))
+        times.append(time.perf_counter())
+        failed |= library.rti_feedback(ctypes.byref(it), state, ctypes.byref(force))
+        times.append(time.perf_counter())
+        failed |= library.rti_shift(ctypes.byref(it))
+        assert not failed
+        before = true(z, force.value, INTERVAL - H, 5)
+        z = true(before, force.value, H, 1)
+        state = measured(before[:2], z[:2], force.value)
+        angles.append(z[1])
+        widest = max(widest, abs(z[0]))
+        ms.append([1e3 * (b - a) for a, b in pairwise(times)])
+    return {"angles": np.array(angles), "widest": widest, "ms": np.array(ms)}
+
+
+def loop(quick: bool, folder: Path) -> list[Row]:
+    """From random starts: up for 10 s after at most 5 s, and the time of an iteration."""
+    export_casadi(model(), folder / "model.c", h=H, name="model")
+    source = folder / "rti.c"
+    source.write_text((harness.ROOT / "examples" / "real_time_iteration" / "rti.c").read_text(encoding="utf-8"))
+    library, stepper, true = ctypes.CDLL(str(built(source))), compile_c(model(), h=H), plant()
+    draw, found = np.random.default_rng(0), []
+    for _ in range(1 if quick else 20):
+        start = np.array([draw.uniform(-0.5, 0.5), draw.uniform(-np.pi, np.pi), *draw.normal(size=2) * [0.5, 2.0]])
+        found.append(closed(library, stepper, true, start, round(15.0 / INTERVAL)))
+    off = [abs((one["angles"] % (2 * np.pi)) - np.pi) for one in found]
+    last = [np.flatnonzero(x >= NEAR)[-1] + 1 if (x >= NEAR).any() else 0 for x in off]  # samples until it stays up
+    up = sum(int(INTERVAL * k <= 5.0) for k in last)
+    ms = np.concatenate([one["ms"] for one in found])
+    return [
+        {"what": f"up for 10 s, of {len(found)} random starts", "value": up, "target": f"{len(found)}"},
+        {"what": "last time not within 0.1 rad of upright, s", "value": INTERVAL * max(last)},
+        {"what": "farthest from upright in the last 10 s, rad", "value": float(max(x[-200:].max() for x in off))},
+        {"what": "widest way of the cart, m", "value": max(one["widest"] for one in found)},
+        {"what": "an iteration, ms (median; clock)", "value": float(np.median(ms.sum(1))), "target": "<= 1"},
+        {"what": "of it the feedback, ms (median; clock)", "value": float(np.median(ms[:, 1]))},
+        {"what": "an iteration, ms (99 of 100; clock)", "value": float(np.quantile(ms.sum(1), 0.99))},
+    ]
+
+
+def pendulums(width: int) -> ContactLagrangian:
+    """Two coupled pendulums with a random network in the correction, or without any network."""
+    one = (1.0, 1.0)
+    config = ModelConfig(
+        (True, True), "linear", one, one, one, (0.0, 0.0), 0.05, potential_width=0, correction_width=width
+    )
+    made, draw = ContactLagrangian(config), torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=draw, dtype=torch.float64)
+    return made
+
+
+def jacobian(quick: bool, folder: Path) -> list[Row]:
+    """A step with its Jacobian over a step of a run, and over a single step, in one program."""
+    rows = []
+    for width, target in ((16, 2.5), (0, 4.0)):
+        header = export_c(pendulums(width), folder / f"model{width}.h", h=0.1, name="model")
+        source = folder / f"measure{width}.c"
+        source.write_text((harness.ROOT / "benchmarks" / "control.c").read_text(encoding="utf-8"))
+        library = ctypes.CDLL(str(built(source, f'-DMODEL="{header}"')))
+        ns = (ctypes.c_double * 3)()
+        taken = []
+        for _ in range(3 if quick else 200):
+            library.measure(ctypes.c_long(1000), ctypes.c_double(0.1), ns)
+            taken.append(list(ns))
+        run, single, both = (statistics.median(x) for x in zip(*taken, strict=True))
+        what = "a 16x2 network" if width else "no network"
+        ratio = statistics.median(c / a for a, _, c in taken)
+        row = {"what": f"step with Jacobian / step of a run, two coordinates, {what}", "value": ratio}
+        note = f"{both:.0f}, {run:.0f} ns; a single step {single:.0f} ns"
+        rows.append(row | {"target": f"<= {target:g}", "note": note})
+    return rows
+
+
+PARTS = {"nlp": nlp, "loop": loop, "jacobian": jacobian}
+
+
+def table(rows: list[Row]) -> str:
+    """Markdown: the solutions, then single numbers."""
+    solved, other = [r for r in rows if "whole" in r], [r for r in rows if "whole" not in r]
+    text = []
+    if solved:
+        span = lambda x: f"{statistics.median(x):.2f}× ({min(x):.2f} … {max(x):.2f})"  # noqa: E731
+        cells = [(r["what"], f"{r['ms']:.0f}", span(r["whole"]), span(r["functions"]),
+                  "" if r["target"] is None else f">= {r['target']:g}") for r in solved]  # fmt: skip
+        head = ("what", "ms a solution", "over ours", "functions alone, over ours", "target")
+        text += [*harness.table(head, cells), ""]
+    cells = [(r["what"], f"{r['value']:.3g}", r.get("target", ""), r.get("note", "")) for r in other]
+    return "\n".join([*text, *(harness.table(("what", "measured", "target", ""), cells) if cells else [])])
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure the parts, and write both files."""
+    parser = harness.parser(__doc__, quick=True)
+    parser.add_argument("--only", nargs="*", choices=list(PARTS), help="parts to run")
+    arguments = parser.parse_args(argv)
+    path = harness.json_file(arguments, "control")
+    parts = harness.load(path, {"parts": {}})["parts"]
+    for name in arguments.only or PARTS:
+        with tempfile.TemporaryDirectory(prefix="herglotz-bench-") as folder:
+            parts[name] = PARTS[name](arguments.quick, Path(folder))
+        rows = [row for part in PARTS for row in parts.get(part, [])]
+        harness.store(path, {**harness.conditions("casadi"), "parts": parts}, table(rows))
+    print(path.with_suffix(".md").read_text(encoding="utf-8"))
+
+
+if __name__ == "__main__":
+    main()

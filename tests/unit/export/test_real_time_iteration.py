@@ -1,0 +1,108 @@
+"""The controller of `examples/real_time_iteration` around a file for CasADi: what it converges to, and its bounds."""
+
+import ctypes
+import shutil
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from export_models import damped
+
+from herglotz.export import export_casadi
+from herglotz.stepping import State, Stepper
+
+CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
+pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
+RTI = Path(__file__).parents[3] / "examples" / "real_time_iteration" / "rti.c"
+FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Werror", "-fPIC", "-shared")
+N, NX, NU, H = 6, 3, 2, 0.2
+double = ctypes.c_double
+
+
+class Controller(ctypes.Structure):
+    _fields_ = [
+        ("H", double), ("X", double * NX), ("Q", double * NX), ("E", double * NX), ("R", double * NU),
+        ("U", double * NU), ("x", double * (NX * (N + 1))), ("u", double * (NU * N)), ("K", double * (NU * NX * N)),
+        ("k", double * (NU * N)), ("damping", double), ("cost", double),
+    ]  # fmt: skip
+
+
+def controller(bounds):
+    it = Controller(H=H)
+    it.X[:], it.Q[:], it.E[:] = (1.0, 0.0, 0.0), (1.0, 0.1, 0.0), (20.0, 1.0, 0.0)
+    it.R[:], it.U[:] = (0.05, 0.02), bounds
+    return it
+
+
+def cost_of(model, x, u, it):
+    """What the inputs u (N, 2) cost from x: two eager steps of 0.1 an interval."""
+    total = 0.0
+    state = State(*(torch.tensor(part, dtype=torch.float64) for part in (x[None, :1], x[None, 1:2], x[2:])))
+    stepper = Stepper(model, tol=1e-15)
+    for k in range(N + 1):
+        now = torch.cat([state.q[0], state.p[0], state.s]).numpy()
+        total += np.sum((it.Q if k < N else it.E) * (now - it.X) ** 2)
+        if k < N:
+            total += np.sum(np.array(it.R) * u[k] ** 2)
+            for _ in range(2):
+                with torch.no_grad():
+                    state = stepper.step(state, 0.1, u=torch.tensor(u[k])[None]).state
+    return total
+
+
+@pytest.mark.parametrize("bounds", [(50.0, 50.0), (0.7, 0.5)], ids=["free", "bounded"])
+def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, tmp_path):
+    # fails if a block is transposed, the recursion forgets the cross term, a bound is left, an input that rests on a
+    # bound takes part in the law, or two inputs are solved as if one did not act on the other
+    model = damped("forced", torch.float64, inputs=2)
+    with torch.no_grad():
+        model.get_parameter("friction.input_map").copy_(torch.tensor([[1.0, 0.6]]))
+    export_casadi(model, tmp_path / "model.c", h=0.1, name="model")
+    library = tmp_path / "rti.so"
+    command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{tmp_path}", str(RTI), "-o", str(library), "-lm"]
+    built = subprocess.run(command, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr[:2000]
+    own, it = ctypes.CDLL(str(library)), controller(bounds)
+    x, first = np.array([-0.4, 0.3, 0.1]), (double * NU)()
+    given = (double * NX)(*x)
+    assert own.rti_feedback(ctypes.byref(it), given, first) == 0  # the first motion
+    costs = [it.cost]
+    for _ in range(25):
+        assert own.rti_prepare(ctypes.byref(it)) == 0
+        assert own.rti_feedback(ctypes.byref(it), given, first) == 0
+        costs.append(it.cost)
+    assert all(b <= a * (1 + 1e-12) for a, b in pairwise(costs))
+    u, limit = np.array(it.u).reshape(N, NU), np.array(bounds)
+    assert list(first) == u[0].tolist()
+    assert (abs(u) <= limit).all()
+    assert it.cost == pytest.approx(cost_of(model, x, u, it), rel=1e-10)
+    resting = abs(u) == limit
+    assert resting.any() == (bounds[0] < 1)
+    for k, j in np.ndindex(N, NU):  # the slope of the cost is 0 inside, and points outward at a bound
+        ends = []
+        for sign in (1, -1):
+            moved = u.copy()
+            moved[k, j] += sign * 1e-5
+            ends.append(cost_of(model, x, moved, it))
+        slope = (ends[0] - ends[1]) / 2e-5
+        if resting[k, j]:
+            assert slope * np.sign(u[k, j]) < 1e-6
+        else:
+            assert abs(slope) < 1e-4 * it.cost, (k, j)
+    own.rti_shift(ctypes.byref(it))
+    assert np.array(it.u).reshape(N, NU)[:-1].tolist() == u[1:].tolist()
+
+
+def test_a_state_without_a_motion_is_an_error(tmp_path):
+    # fails if a measurement that is no number gives an input without a word
+    export_casadi(damped("forced", torch.float64, inputs=2), tmp_path / "model.c", h=0.1, name="model")
+    library = tmp_path / "rti.so"
+    command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{tmp_path}", str(RTI), "-o", str(library), "-lm"]
+    subprocess.run(command, check=True)
+    own, it, first = ctypes.CDLL(str(library)), controller((1.0, 1.0)), (double * NU)()
+    assert own.rti_feedback(ctypes.byref(it), (double * NX)(float("nan"), 0.0, 0.0), first) == 1
+    it.H = -1.0
+    assert own.rti_feedback(ctypes.byref(it), (double * NX)(), first) == 1
