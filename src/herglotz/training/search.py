@@ -246,8 +246,8 @@ class Search:
         base = estimate_baseline(data, outliers=self.freedom is not None)
         line = Search(data, base, self.config, outliers=self.freedom is not None)
         first = line.first()
-        if trial is not None and (first is None or trial.replaces(first)):  # no worse model is worth a search
-            return False
+        if trial is not None and trial.whole and (first is None or trial.replaces(first)):
+            return False  # the motion is followed as it is, and no worse model is worth a search
         other = line.run(first)
         if other is None or trial is None or not other.replaces(trial):
             return other is not None and trial is None
