@@ -303,7 +303,7 @@ def _library_of(stepper: ExportedStepper) -> CLibrary:
         f"{path}: the model takes no inputs, so there is no action; fit a recording of a driven motion":
             not stepper.inputs,
         f"{path}: the inputs {', '.join(terms)} follow from others and are no actions; fit without them": bool(terms),
-        f"{path}: the header holds no velocities; export it again, without parameters":
+        f"{path}: the header holds no velocities; export it again":
             "velocity" not in stepper.programs,
     })  # fmt: skip
     arrival = metadata.get("arrival", {})

@@ -310,5 +310,5 @@ def test_a_warm_up_is_believed_alike_at_every_step(monkeypatch):
 
     monkeypatch.setattr(predict_module, "SmoothingProblem", noted)
     for step in (0.1, 0.025):
-        predict_module._smoothed(model, Trajectories.of(t, t.sin()[:, None], (9,)), 0.01, step)
+        predict_module._smoothed(model, Trajectories.of(t, t.sin()[:, None], (9,)), 0.01, step, None)
     assert found[0] == pytest.approx(2 * found[1])

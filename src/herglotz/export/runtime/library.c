@@ -120,7 +120,7 @@ void herglotz_holds(long batch, long steps, hz_state *states, const hz_real *h, 
   for (b = 0; b < batch; b++) states[b].sigma = (hz_real)1.0; /* nobody asks for the product of the factors */
   hz_run_batch(batch, states, &job, statuses);
   for (b = 0; b < batch; b++, observed += 2 * hz_N) {
-    const int status = hz_velocity(states + b, *h, observed + hz_N);
+    const int status = hz_velocity(states + b, *h, hz_WITH_THETA(theta) observed + hz_N);
     if (!(statuses[b] & 15)) statuses[b] |= status & 15;
     statuses[b] &= 15 | hz_OUTSIDE_BOX;
     for (i = 0; i < hz_N; i++) {
