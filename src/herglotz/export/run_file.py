@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.export.c_header import export_c
 from herglotz.export.c_wrappers import export_acados, export_casadi
 from herglotz.export.filtering import noise_of
@@ -80,14 +80,15 @@ def export_run(
     kind = kind or KINDS.get(path.suffix.lower())
     if kind not in WRITERS:
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
-    if name is not None and kind not in IN_C:
-        raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
-    if dtype is not None and kind not in IN_C:
-        raise InputError(f"{path}: dtype {dtype} is of C headers only, not of {kind}; leave it out")
-    if (parameters or extras) and kind != "c":
-        raise InputError(f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out")
-    if unroll is not None and kind != "onnx":
-        raise InputError(f"{path}: unroll is of ONNX only, not of {kind}; leave it out")
+    refuse({
+        f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out":
+            name is not None and kind not in IN_C,
+        f"{path}: dtype {dtype} is of C headers only, not of {kind}; leave it out":
+            dtype is not None and kind not in IN_C,
+        f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out":
+            (parameters or extras) and kind != "c",
+        f"{path}: unroll is of ONNX only, not of {kind}; leave it out": unroll is not None and kind != "onnx",
+    })  # fmt: skip
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or _steps(run)]
     metadata = {
@@ -106,14 +107,8 @@ def export_run(
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
     elif dtype is not None:  # a tolerance of tune is one of its own dtype
         described["dtype"] = dtype
-    if name is not None:
-        described["name"] = name
-    if parameters:
-        described["parameters"] = parameters
-    if extras:
-        described["extras"] = list(extras)
-    if unroll is not None:
-        described["unroll"] = unroll
+    asked = {"name": name, "parameters": parameters, "extras": list(extras), "unroll": unroll}
+    described |= {key: value for key, value in asked.items() if value not in (None, (), [], {})}
     if "filter" in extras:
         still = (0.0,) * len(described_parameters(run.model, parameters))
         metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}

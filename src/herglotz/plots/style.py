@@ -85,7 +85,7 @@ def save_figure(figure: Figure, path: PathLike) -> None:
 def _image(figure: Figure, form: str) -> bytes:
     buffer = io.BytesIO()
     with styled():
-        quick = {"pil_kwargs": {"compress_level": 1}} if form == "png" else {}  # half the time of an image of text
+        quick: dict[str, Any] = {"pil_kwargs": {"compress_level": 1}} if form == "png" else {}
         figure.savefig(buffer, format=form, dpi=DPI, **quick)
     return buffer.getvalue()
 

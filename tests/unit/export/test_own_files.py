@@ -85,7 +85,8 @@ def test_c_derivatives_by_inputs_of_a_module_are_those_of_eager():
     if not any(map(shutil.which, ("cc", "gcc", "clang"))):
         pytest.skip("no C compiler in the PATH")
     model, make = OwnLagrangian(DrivenArm(), 2, inputs=3), torch.Generator().manual_seed(0)
-    state = hz.State(*torch.randn(2, 5, 2, generator=make).double(), torch.linspace(-1, 1, 5).double())
+    q, p = torch.randn(2, 5, 2, generator=make).double()
+    state = hz.State(q, p, torch.linspace(-1, 1, 5).double())
     u = torch.randn(5, 3, generator=make).double()
     ours, eager = (x.linearise(state, H, u) for x in (compile_c(model, h=H), hz.Stepper(model)))
     for name in ("by_state", "by_h", "by_input"):
