@@ -24,9 +24,7 @@ from herglotz.mechanics.partials import value
 from herglotz.stepping import Stepper, solve, state_of
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import check_h
-from herglotz.training.solvers.lifted_newton import attached, solve_path
-
-TOL = 1e3  # machine epsilons of a state: what sweeps over all steps at once leave of rounding
+from herglotz.training.solvers.lifted_newton import SWEPT, attached, solve_path
 
 
 def herglotz_residual(
@@ -231,7 +229,7 @@ def _motions(L_d: DiscreteLagrangian, start: Tensor, h: Tensor, u: Tensor | None
         P = partials(L, q[:, :-1], q[:, 1:], first[:, -1:].expand(steps.shape), steps)
         along = torch.cat([q[:, 1:], momentum_plus(P), (first[:, -1:] + P.L.cumsum(-1))[..., None]], -1)
         guess = torch.cat([first[:, None], along], 1)
-        path = solve_path(L, first.detach(), steps, guess, TOL * torch.finfo(q.dtype).eps)
+        path = solve_path(L, first.detach(), steps, guess, SWEPT * torch.finfo(q.dtype).eps)
     if path is None:
         return Stepper(L_d, throw=True).rollout(*state_of(start), h=h, inputs=u).states.joined
     return attached(L, path, first, steps).reshape(*h.shape[:-1], K + 1, d)

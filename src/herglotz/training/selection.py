@@ -149,7 +149,8 @@ def select(
         Which levels, of `herglotz.models.LEVELS` and "auto", which is `fit` left to itself; tried in this order.
         None: those of `levels_for`.
     seeds
-        Fits a level, with seeds config.seed, config.seed + 1, …; one where a model without networks draws nothing.
+        Fits a level, with seeds config.seed, config.seed + 1, …; one where neither a network nor a
+        batch is drawn.
     config
         Everything else about the fits; `train_fraction` must be below 1.
     out
@@ -193,8 +194,9 @@ def select(
 
     for level in ladder:
         runs = [one(level, config.seed)]
-        # Without a network nothing is drawn: fits from all seeds are one fit.
-        runs += [one(level, config.seed + k) if runs[0].model.config.networks else runs[0] for k in range(1, seeds)]
+        # Without a network or batches nothing is drawn: fits from all seeds are one fit.
+        drawn = runs[0].model.config.networks or config.batch
+        runs += [one(level, config.seed + k) if drawn else runs[0] for k in range(1, seeds)]
         errors = torch.stack([block_errors(run) for run in runs])
         candidates.append(Candidate(level, tuple(runs), errors, step_cost(runs[0])))
     return Selection(tuple(candidates), _simplest(candidates))

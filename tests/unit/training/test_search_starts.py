@@ -17,6 +17,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.linear_terms import SINGULAR, LinearStart, LinearTerms, start_of
 from herglotz.training.named_terms import MOVING, NamedTerms, candidates
+from herglotz.training.search import Search
 from herglotz.training.structure import search
 from herglotz.training.trajectory_fit import TrajectoryFit
 
@@ -235,3 +236,24 @@ def test_a_hold_that_functions_ask_for_keeps_the_terms_of_inputs(asked):
     # fails if the recording is taken anew with that hold, without the columns that the model is driven by
     found, _ = asked(**{"terms": ("u^2",), "functions": True, "hold of f1": "first"})
     assert (found.input_terms, found.hold) == (("u^2",), "first")
+
+
+@pytest.mark.parametrize(
+    ("whole", "worse", "searched"), [(True, True, False), (True, False, True), (False, True, True)]
+)
+def test_a_line_is_searched_where_its_first_model_may_be_better(whole, worse, searched, monkeypatch):
+    # fails if a model that follows no whole trajectory ends the question (two magnets under a pendulum are powers),
+    # or if a search is made where its first model is worse than one that follows them
+    seen = []
+
+    def made(*_, **__):
+        first = SimpleNamespace(length=20)
+        other = SimpleNamespace(replaces=lambda _: False)
+        return SimpleNamespace(first=lambda: first, run=lambda given: seen.append(given is first) or other)
+
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=2)
+    own = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    monkeypatch.setattr(sys.modules[Search.__module__], "Search", made)
+    trial: Any = SimpleNamespace(whole=whole, at_the_noise=False, replaces=lambda _: worse)
+    assert not own.better_on_a_line(trial)
+    assert seen == ([True] if searched else [])

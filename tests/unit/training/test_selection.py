@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,11 +12,15 @@ import torch
 
 from herglotz.data import simulate
 from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.plots import plot_selection, save_figure
 from herglotz.scenes import scene
+from herglotz.stepping import State
 from herglotz.training import FitConfig, select
 from herglotz.training.run import Run
 from herglotz.training.selection import Candidate, Selection, _simplest, block_errors, levels_for
+
+module = sys.modules[Candidate.__module__]
 
 
 def candidate(level, *seeds, parameters=7):
@@ -123,6 +128,28 @@ def test_settings_are_checked(change, message):
     data = simulate(scene("damped_pendulum"), trajectories=1, steps=30, h=0.2, seed=0)
     with pytest.raises(InputError, match=message):
         select(data, **change)
+
+
+@pytest.mark.parametrize(("change", "fits"), [({}, 1), ({"potential_width": 2}, 3), ({"batch": 8}, 3)])
+def test_seeds_are_tried_where_something_is_drawn(change, fits, monkeypatch):
+    # fails if a fit that draws nothing is made again, or the seeds of networks or of batches are not tried
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=20, h=0.2, seed=0)
+    drawn = ModelConfig(level="linear", potential_width=change.get("potential_width", 0))
+    settings = FitConfig(**({"optimiser": "adam", "objective": "residual", **change} if "batch" in change else {}))
+    seen = []
+
+    def fitted(data, config, **_):
+        seen.append(config.seed)
+        run: Any = Run(ContactLagrangian(drawn), config, {"seconds": 1.0, "parameters": 1}, data, (14, 14),
+                       State(data.q, data.q, data.q[:, 0]), 0.2, {}, [])  # fmt: skip
+        return run
+
+    monkeypatch.setattr(module, "fit", fitted)
+    monkeypatch.setattr(module, "block_errors", lambda _: torch.ones(5))
+    monkeypatch.setattr(module, "step_cost", lambda _: 1.0)
+    found = select(data, ("linear",), 3, settings, progress=False)
+    assert (len(seen), len(found.chosen.runs)) == (fits, 3)
+    assert seen == [0, 1, 2][:fits]
 
 
 def test_one_level_end_to_end(tmp_path):

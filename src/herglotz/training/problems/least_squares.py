@@ -11,6 +11,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.mechanics import mixed_hessian, partials
 from herglotz.models import ContactLagrangian
+from herglotz.training.kernel import states_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid, step_inputs
 from herglotz.training.problems.prior import Prior
@@ -68,7 +69,7 @@ class StatesProblem(LeastSquares, ABC):
     def __init__(self, model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, **settings: Any):
         super().__init__(model, data, **settings)
         self.grid = grid
-        self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
+        self.d = states_of(model)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())  # natural size of s
         self.mass = self._masses(model)  # (n,) in the units of p over those of v; it reads the inputs at the samples

@@ -34,6 +34,7 @@ from herglotz.training.problems.joint_masses import JointMasses
 from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.problems.prior import Gaussian
 from herglotz.training.solvers.lifted_newton import (
+    SWEPT,
     Path,
     linear_recurrence,
     parameter_derivatives,
@@ -148,7 +149,7 @@ class ShootingProblem(StatesProblem):
             self._solved = x.clone(), None if nodes is None else Path(nodes, None)
             return self._solved[1]
         start, L_d = self.with_s(states), self.parameters.at(theta, self.u)
-        tol = 1e3 * torch.finfo(x.dtype).eps
+        tol = SWEPT * torch.finfo(x.dtype).eps
         with torch.no_grad():
             path = None
             if self.path is not None:

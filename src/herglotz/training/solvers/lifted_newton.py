@@ -38,6 +38,7 @@ from herglotz.training.problems.grid import SegmentGrid
 
 NEAR = 1e-7  # defects whose next ones need not be looked at where quadratic convergence makes them rounding
 CURVED = 1e4  # taken for the next defect over the square of the first, which no earlier one tells
+SWEPT = 1e3  # machine epsilons of a state: what sweeps over all steps at once leave of rounding
 STILL = 64.0  # times rounding: sums of corrections move a coordinate by so little that friction holds
 PIECES = 4  # iterations of an equation that is linear in pieces
 CHUNK = 4096  # steps whose parameter Jacobian is held in memory at once
