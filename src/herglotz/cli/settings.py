@@ -128,6 +128,8 @@ MODEL = (
             "v2)' of a damper between two, '|v| v' of air, a constant one, 'load 1', or dry friction by position, "
             "'q1^2 sgn(v1)', 'cos(q1) sgn(v1)' (forced); may be given again",
             action="append", metavar="TEXT"),
+    setting("--dissipation", "a power of s in L beside -gamma s, its coefficient learned: 's^2' or 's^3' (full, "
+            "forced); may be given again", action="append", metavar="POWER"),
     setting("--diagonal", "a mass for each coordinate, none between two: bodies", action="store_true"),
     setting("--absent", "a number of the model that is 0 and not learned, 'potential.tilt[0]'; may be given again",
             action="append", metavar="NUMBER"),

@@ -77,6 +77,17 @@ class Forces:
     held: Tensor | None = None
     grip: Tensor | None = None  # (..., n) the same where it slides too: the size of dry friction's part of F⁻
 
+    def weighted(self, P: Partials) -> Forces:
+        """Return the same with (1 + D3) F⁻ in the place of F⁻, as a step of order 2 has it where c depends on s."""
+        minus, c = self.minus, P.c[..., None]
+        if P.D11 is ABSENT:
+            return replace(self, minus=c * minus)
+        by = lambda own, more: c[..., None] * own + minus[..., :, None] * more[..., None, :]  # noqa: E731
+        return replace(
+            self, minus=c * minus, minus_1=by(self.minus_1, P.D13), minus_2=by(self.minus_2, P.D23),
+            minus_3=c * self.minus_3 + minus * P.D33[..., None],
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Partials:

@@ -1,11 +1,11 @@
-"""Damping that depends on s: the full level's map of the action, increasing for every weight."""
+"""Damping that depends on s: the full level's map of the action, which increases."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
-from herglotz.models.config import ModelConfig
+from herglotz.models.config import POWERS, ModelConfig
 from herglotz.models.jet import Jet
 from herglotz.models.network import feature_count
 
@@ -60,3 +60,42 @@ def unit_increment(x: Jet, a: Tensor) -> Jet:
     sech = 1 - t * t
     f2 = -e * E * t * sech / (D * D * D) if x.order == 2 else None
     return x.map(torch.atanh(t * E / (1 + e * D)), E * sech / (D * (e + D)), f2)
+
+
+class ActionPowers(nn.Module):
+    """Maps s ↦ s + δ by the exact flow over half a step of ṡ = −β sᵖ, power after power: L has −Σ β sᵖ.
+
+    With y = (p − 1) β (h/2) sᵖ⁻¹ the flow is s (1 + y)^(−1/(p − 1)), whose slope (1 + y)^(−p/(p − 1)) is positive. The
+    flow of y ≤ −1 leaves the reals within the step: NaN, with which no step is solved.
+
+    Damping of the motion is γ + Σ p β sᵖ⁻¹. A shift of s is a gauge: it moves β of one power to the powers below, γ
+    and a constant in V, which is 0 here.
+    """
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        self.powers = [POWERS[name] for name in config.dissipation]
+        self.coefficient = nn.Parameter(torch.zeros(len(self.powers), dtype=torch.float64))
+
+    def forward(self, s0: Jet, gained: Jet, offsets: Jet | None, h: Tensor, *, backward: bool = False) -> Jet:  # noqa: ARG002
+        """Return the gain of s after half a step of every power, from the gain before; increments do not cancel."""
+        order = sorted(
+            range(len(self.powers)), key=lambda j: self.powers[j], reverse=backward
+        )  # however they are named
+        for j in order:
+            gained = gained + power_increment(s0 + gained, self.powers[j], self.coefficient[j] * h / 2)
+        return gained
+
+
+def power_increment(s: Jet, power: int, a: Tensor) -> Jet:
+    """Return s (1 + y)^(−1/(p − 1)) − s with y = (p − 1) a sᵖ⁻¹ as a jet, of p = 2 or 3; a is (...)."""
+    x = s.value
+    if power == 2:
+        root = (1 + a * x).sqrt()  # NaN beyond the flow's end
+        one = root * root
+        return s.map(-a * x * x / one, -a * x * (1 + one) / (one * one), -2 * a / (one * one * one))
+    y = 2 * a * x * x
+    root = (1 + y).sqrt()
+    cube = root * root * root
+    f1 = -y * (root * root + root + 1) / ((1 + root) * cube)
+    return s.map(-x * y / (root * (1 + root)), f1, -6 * a * x / (cube * root * root))

@@ -14,6 +14,7 @@ from herglotz.models.translations import check_translations
 from herglotz.schema import from_plain
 
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
+POWERS = {"s^2": 2, "s^3": 3}  # that L may have beside −γ s, by name
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,9 @@ class ModelConfig:
         Units and layers of the network in a mass that depends on position; 0: a constant mass.
     action_width
         Units of the network in s, at the level full.
+    dissipation
+        The powers of s that L has beside −γ s, "s^2" and "s^3", at the forced level and, in the place of networks, at
+        the level full.
     coulomb, sticking
         Dry friction of each joint beside the viscous one (forced); set-valued: a joint can stand still.
     inputs, input_map, input_zero
@@ -93,6 +97,7 @@ class ModelConfig:
     mass_width: int = 0
     mass_depth: int = 1
     action_width: int = 4
+    dissipation: tuple[str, ...] = ()
     coulomb: bool = False
     sticking: bool = False
     inputs: int = 0
@@ -130,6 +135,12 @@ class ModelConfig:
                for name in ("scale", "speed", "stiffness", "tilt")},
             f"the full level needs action_width >= 1, got {self.action_width}; or take level='affine'":
                 self.level == "full" and self.action_width < 1,
+            f"dissipation names the powers of s in L, {', '.join(POWERS)}; got {', '.join(self.dissipation)}":
+                not set(self.dissipation) <= set(POWERS),
+            f"dissipation is of L in s; set level='full' or 'forced', not '{self.level}'":
+                self.dissipation and self.level not in ("full", "forced"),
+            "set-valued friction stands in no model with powers of s; leave sticking or dissipation out":
+                self.dissipation and self.sticking,
         })  # fmt: skip
 
     def _check_forces(self) -> None:
@@ -153,7 +164,7 @@ class ModelConfig:
         refuse({
             f"order must be 2 or 4, got {self.order}": self.order not in (2, 4),
             "order 4 is for features, without networks, at the levels conservative, linear and forced":
-                self.order == 4 and self.networks,
+                self.order == 4 and (self.networks or self.dissipation),
             "a model without a baseline has no features; leave features, known, alike, diagonal out":
                 not self.baseline and (self.features or self.known or self.alike or self.diagonal),
             "a mass that depends on position is not diagonal; set mass_width=0 or diagonal=False":
@@ -183,7 +194,8 @@ class ModelConfig:
     def networks(self) -> bool:
         """Whether any part is a network, whose starting values are drawn."""
         widths = self.potential_width or self.mass_width or self.correction_width
-        return bool(widths) or not self.baseline or self.level in ("affine", "full")
+        in_s = self.level == "affine" or (self.level == "full" and not self.dissipation)
+        return bool(widths) or not self.baseline or in_s
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""

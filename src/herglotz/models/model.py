@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Forces, Partials
-from herglotz.models.action import ActionFlow
+from herglotz.models.action import ActionFlow, ActionPowers
 from herglotz.models.blocks import action_partials, affine_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
@@ -19,7 +19,7 @@ from herglotz.models.driven import DrivenLagrangian
 from herglotz.models.feature_kinetic import kinetic_term
 from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.friction import CoupledFriction, Friction
-from herglotz.models.jet import Jet, affine
+from herglotz.models.jet import Jet, affine, coordinates
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
@@ -69,6 +69,8 @@ class ContactLagrangian(nn.Module):
     * linear: g = −γh. forced: the same, with friction and inputs as discrete forces (`Friction`).
     * affine: g depends on position and velocity.
     * full: the map of s over a step is half a step of `ActionFlow`, e^{g/2}, + K, e^{g/2}, and the flow's other half.
+    * full and forced with `dissipation`: the same with `ActionPowers`, g = −γh and the work of inputs in L. Other
+      forces then have the weight 1 + D3 where they have c.
 
     A discrete Lagrangian for `herglotz.mechanics`: call it for the value, `partials` for closed-form derivatives.
     Every step h is allowed, and may differ from sample to sample.
@@ -91,7 +93,7 @@ class ContactLagrangian(nn.Module):
         correction = Correction(c, make) if c.correction_width else None
         self.kinetic = kinetic_term(c, make)  # drawn after the others, but first of the parameters
         self.potential, self.damping, self.correction = potential, damping, correction
-        self.action = ActionFlow(c, make) if c.level == "full" else None
+        self.action = _action(c, make)
         self.friction = Friction(c) if c.level == "forced" else None
         self.coupling = CoupledFriction(c) if c.coupled and c.dof > 1 else None
         self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
@@ -147,7 +149,7 @@ class ContactLagrangian(nn.Module):
             order=self.config.order,
             baseline=self.config.baseline,
             constant_mass=type(self.kinetic) is Kinetic,
-            constant_c=self.damping is None or self.damping.constant,
+            constant_c=self.action is None and (self.damping is None or self.damping.constant),
             known_damping=type(self.damping) in (LinearDamping, AffineDamping, type(None)),
             correction=self.correction is not None,
             action_flow=self.action is not None,
@@ -163,7 +165,7 @@ class ContactLagrangian(nn.Module):
         order, n = phase.order, phase.q0.shape[-1]
         g = None if self.damping is None else self.damping(phase)
         N = None if self.correction is None else self.correction(phase)
-        b = None if self.action is None else self.action.offsets(phase.features)
+        b = self.action.offsets(phase.features) if isinstance(self.action, ActionFlow) else None
         if not self.config.baseline:
             return Terms(g, None, None, None, N, b)
         K = self.kinetic(phase)
@@ -216,7 +218,7 @@ class ContactLagrangian(nn.Module):
         """F⁻ and F⁺, each (..., n), in units of momentum; None at every level but the forced one."""
         if self.friction is None:
             return None
-        force = self._forces(self._phase(q0, q1, s0, h, 1), u)
+        force = self._evaluate(self._phase(q0, q1, s0, h, 1), s0, u).force
         assert force is not None
         return force.minus, force.plus
 
@@ -250,12 +252,24 @@ class ContactLagrangian(nn.Module):
         return Phase(q0, q1, h, order, self.config, delta)
 
     def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
-        return self._assembled(self.terms(phase), phase, s0, self._forces(phase, u))
+        terms, by_work = self.terms(phase), self.action is not None
+        terms = self._driven(terms, phase, u) if by_work and u is not None else terms
+        return self._assembled(terms, phase, s0, self._forces(phase, None if by_work else u))
+
+    def _driven(self, t: Terms, phase: Phase, u: Tensor) -> Terms:
+        """The terms with the potential −f·q of the force f of inputs: s gathers their work."""
+        assert self.friction is not None
+        assert t.V0 is not None
+        assert t.V1 is not None
+        f, n, order = self.friction.applied(u), self.dof, phase.order
+        before, after = ((coordinates(q, order) * f).sum() for q in (phase.q0, phase.q1))
+        return replace(t, V0=t.V0 - before.embed(2 * n, 0), V1=t.V1 - after.embed(2 * n, n))
 
     def _assembled(self, t: Terms, phase: Phase, s0: Tensor, force: Forces | None) -> Partials:
         h = phase.h
         if self.action is not None:
-            return action_partials(self._through_action(self.action, t, s0, h, phase.order))
+            P = action_partials(self._through_action(self.action, t, s0, h, phase.order))
+            return P if force is None else replace(P, force=force.weighted(P))
         c = None if t.g is None else t.g.exp()
         if t.K is None or t.V0 is None or t.V1 is None:
             assert t.N is not None  # checked by ModelConfig
@@ -266,15 +280,15 @@ class ContactLagrangian(nn.Module):
             L = L if t.N is None else L + t.N
         return affine_partials(L, t.g, c, s0, force)
 
-    def _through_action(self, action: ActionFlow, t: Terms, s0: Tensor, h: Tensor, order: int) -> Jet:
+    def _through_action(self, action: ActionFlow | ActionPowers, t: Terms, s0: Tensor, h: Tensor, order: int) -> Jet:
         """L = s1 − s0 at the full level, over the 2n + 1 variables (q0, q1, s0), as a sum of increments."""
         size = 2 * self.dof + 1
         wide = lambda jet: None if jet is None else jet.embed(size, 0)  # noqa: E731
         s = affine(s0, torch.eye(size, dtype=s0.dtype, device=s0.device)[-1], order)  # the last variable
         K, V0, V1, N, b = map(wide, (t.K, t.V0, t.V1, t.N, t.b))
-        assert isinstance(t.g, Jet)
-        assert b is not None
-        half_c = (t.g / 2).expm1().embed(size, 0)  # √c − 1
+        assert t.g is not None
+        half_c = (t.g / 2).expm1()  # √c − 1
+        half_c = half_c.embed(size, 0) if isinstance(half_c, Jet) else half_c
         gained = s * 0.0 if V0 is None else -h / 2 * V0
         gained = action(s, gained, b, h)
         gained = gained + half_c * (s + gained)
@@ -298,7 +312,8 @@ class ContactLagrangian(nn.Module):
         if self.friction is None:
             return None
         assert isinstance(self.damping, LinearDamping)
-        h, v, c = phase.h, phase.move / phase.h[..., None], self.damping(phase).exp()
+        h, v = phase.h, phase.move / phase.h[..., None]
+        c = torch.ones_like(h) if self.action is not None else self.damping(phase).exp()
         smooth = self.friction.dry and not self.friction.sticking
         more = None if smooth or self.drag is None else self.drag.held(phase.q0)
         forces = self.friction(v, c, h, phase.order, u, more)
@@ -314,5 +329,12 @@ def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping |
     """The exponent g of c = e^g that a level has; None where c = 1."""
     if config.level == "conservative":
         return None
-    linear = config.level in ("linear", "forced")
+    linear = config.level in ("linear", "forced") or config.dissipation
     return LinearDamping(config.rate) if linear else AffineDamping(config, generator)
+
+
+def _action(config: ModelConfig, generator: torch.Generator) -> ActionFlow | ActionPowers | None:
+    """The map of s beside e^g: powers by name, or the full level's network."""
+    if config.dissipation:
+        return ActionPowers(config)
+    return ActionFlow(config, generator) if config.level == "full" else None

@@ -18,7 +18,7 @@ RESTARTS = 4  # random initialisations of a single layer: some stall at a hundre
 AS_SET = "as set, or by default"
 HALVED = "the fit needed shorter steps: halved ones change the motion"
 KEPT_STEPS = "halved steps change the motion too little to be worth their time, or other terms stand in for them"
-AS_FOUND = ("order", "features", "drag", "absent")  # what the search for terms sets, where the user does not
+AS_FOUND = ("order", "features", "drag", "absent", "dissipation")  # what the search for terms sets
 
 
 class Rule(NamedTuple):
@@ -111,7 +111,8 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         absent=c.absent, turning=seen.turning, spreads=dict(base.spreads),
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
-        departures=c.departures, input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros,
+        departures=c.departures, dissipation=c.dissipation,
+        input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros,
         reasons=_reasons(seen, user_settings, named=named, one_step=one_step) | {
             "objective": why,
             "network": why_network,

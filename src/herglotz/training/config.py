@@ -75,6 +75,9 @@ class FitConfig:
         Hidden units of a mass that depends on position; 0 for a constant one.
     action_width
         Units of the full level's map of s.
+    dissipation
+        Powers of s that L has beside −γ s, "s^2" and "s^3", each with a learned coefficient: damping that depends on s.
+        At the forced level, and at the level full in the place of its networks.
     coulomb
         Dry friction beside the viscous one at the forced level.
     sticking
@@ -159,6 +162,7 @@ class FitConfig:
     activation: str = "tanh"
     mass_width: int = 0
     action_width: int = 4
+    dissipation: tuple[str, ...] = ()
     coulomb: bool = False
     sticking: bool | None = None
     robust: str = "auto"
@@ -214,6 +218,8 @@ class FitConfig:
                 self.sticking and objective not in ("auto", "trajectory"),
             f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'":
                 forces and self.level not in ("forced", "auto"),
+            f"dissipation is of L in s; set level='full' or 'forced', not '{self.level}'":
+                self.dissipation and self.level not in ("full", "forced", "auto"),
             "input_map is given but use_inputs is False; leave one of them out":
                 self.input_map and not self.use_inputs,
         })  # fmt: skip
@@ -248,14 +254,18 @@ class FitConfig:
         where, driven = data.source or "data", self.use_inputs and data.u is not None
         config = self
         if self.level == "auto":
-            level = "forced" if driven or self.has_forces() else "linear"
+            level = "forced" if driven or self.has_forces() else "full" if self.dissipation else "linear"
             config = replace(self, level=level, coulomb=self.coulomb or driven)
         if self.sticking or any("sgn(" in text for text in self.drag):
             config = replace(config, coulomb=True)
+        if driven and self.dissipation and self.objective == "auto":
+            config = replace(config, objective="trajectory")
         inputs, count = data.u.shape[1] if driven and data.u is not None else 0, len(self.input_map)
         refuse({
             f"{where}: holds inputs u, which the level '{config.level}' cannot take; set level='forced' or 'auto', "
             "or use_inputs=False to leave them out": driven and config.level != "forced",
+            f"{where}: one-step errors know nothing of the work of inputs in s; set objective='trajectory', or leave "
+            "dissipation out": driven and self.dissipation and config.objective == "residual",
             f"{where}: input_map needs n · m = {data.dof} · {inputs} numbers, row by row; got {count}":
                 count not in (0, data.dof * inputs),
         })  # fmt: skip

@@ -11,12 +11,13 @@ from dataclasses import replace
 from itertools import combinations
 
 from herglotz.models import ModelConfig
+from herglotz.models.config import POWERS
 from herglotz.models.drag import AIR
 from herglotz.models.features import expand, lengths, revolute
 
 HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
 WAVES = 3  # highest harmonic of one angle
-COEFFICIENTS = re.compile(r"(potential\.features\.sum|kinetic\.sum|drag)\.coefficient(?:\[(\d+)\])?")
+COEFFICIENTS = re.compile(r"(potential\.features\.sum|kinetic\.sum|drag|action)\.coefficient(?:\[(\d+)\])?")
 
 
 def dictionary(config: ModelConfig) -> ModelConfig | None:
@@ -31,7 +32,7 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
     whole = replace(
         c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
         input_zero=c.inputs > 0, damping_width=0, rate=0.1, scale=(1.0,) * n, speed=(1.0,) * n, tilt=(0.0,) * n,
-        stiffness=(0.0 if n == 1 else 1.0,) * n, seed=0, absent=(),
+        stiffness=(0.0 if n == 1 else 1.0,) * n, seed=0, absent=(), dissipation=tuple(POWERS) if c.dissipation else (),
     )  # fmt: skip
     known = set(expand(config.features, c.angles)) <= set(whole.features) and set(config.drag) <= set(drag)
     return whole if known else None
@@ -74,6 +75,7 @@ def keys_of(numbers: list[str], config: ModelConfig) -> list[str]:
         "potential.features.sum": [x for x in features if "v" not in x],
         "kinetic.sum": [x for x in features if "v" in x],
         "drag": list(config.drag),
+        "action": list(config.dissipation),
     }
     found = []
     for name in numbers:

@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 
+from herglotz.models.action import ActionFlow
 from herglotz.models.jet import coordinates
 from herglotz.training.equation_numbers import Joint, Numbers
 from herglotz.training.equation_terms import Line, Reader
@@ -149,7 +150,7 @@ def network_of(run: FittedRun) -> str | None:
         parts.append("a network that corrects the rule at this step")
     if config.mass_width:
         parts.append("a network in the mass")
-    if config.level == "full" or getattr(model.damping, "network", None) is not None:
+    if isinstance(model.action, ActionFlow) or getattr(model.damping, "network", None) is not None:
         parts.append(f"damping of the level '{config.level}', which depends on the state")
     parts += [f"the term '{name}'" for name in config.terms]
     return ", ".join(parts) or None

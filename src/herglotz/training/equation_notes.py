@@ -36,6 +36,12 @@ OF_ORDER = {
     4: "(c − 1) s + √c (h K + (h³/24)(K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e)) − (h/6)(c V(q) + 4 √c V(q̄) + V(q₊)), "
     "e = K_q − V_q − K_qv v − γ K_v, M = K_vv",
 }
+# The same with powers of s in L.
+BY_POWERS = (
+    "step it as the model does: c p + ∂L_d/∂q + c (h/2) f = 0, p₊ = ∂L_d/∂q₊ + (h/2) f, c = 1 + ∂L_d/∂s, f the forces; "
+    "L_d is what s gains from − (h/2) V(q), half a step of s′ = −β sᵖ of each power of s, half a step of s′ = −γ s, "
+    "h K, and the same backwards with V(q₊); K and f are taken at q̄ = (q + q₊)/2 and v = (q₊ − q)/h"
+)
 DRY = ", but dry friction, of q and v, acts by h in place of h/2 in the first of them, and not in the second"
 
 
@@ -82,6 +88,8 @@ def _steps(run: FittedRun) -> str:
     told = f"{what}; integrated exactly, the equation departs from it by {by}{ratio}"
     if found.moved <= found.missed:
         return told
+    if model.config.dissipation:
+        return f"{told}: {BY_POWERS}"
     parts = "L = K − V + s ∂L/∂s, f the forces"
     if newtonian(model):
         rate = 0.0 if model.damping is None else float(model.damping.rate.detach())  # type: ignore[operator]

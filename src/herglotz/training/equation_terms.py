@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from herglotz.models import ContactLagrangian
+from herglotz.models.action import ActionFlow, ActionPowers
+from herglotz.models.config import POWERS
 from herglotz.models.drag import DragFeature, parse_drag
 from herglotz.models.feature_grammar import Feature
 from herglotz.models.feature_kinetic import FeatureKinetic
@@ -48,7 +50,8 @@ class Line:
 
 def is_formula(model: ContactLagrangian) -> bool:
     """Whether the lines are the whole model: no network, and no term by name, which may be anything."""
-    networks = (model.potential.network, model.correction, model.action, getattr(model.damping, "network", None))
+    in_s = model.action if isinstance(model.action, ActionFlow) else None
+    networks = (model.potential.network, model.correction, in_s, getattr(model.damping, "network", None))
     named = model.config.baseline and not model.config.mass_width and not model.config.terms
     return named and all(network is None for network in networks)
 
@@ -112,6 +115,9 @@ class Reader:
         if not isinstance(damping, (LinearDamping, AffineDamping)) or self.newton:
             return
         yield Line("L", "s", unit_of("1", 0, self.time, 1), -damping.rate)
+        if isinstance(self.model.action, ActionPowers):
+            for name, value in zip(self.config.dissipation, self.model.action.coefficient, strict=True):
+                yield Line("L", raised("s", POWERS[name]), "", -value)
         if isinstance(damping, AffineDamping):
             for i, name in enumerate(self.names):
                 yield Line("L", f"{name}′ s", "", damping.drag[i])
@@ -186,7 +192,10 @@ class Reader:
             if zero is not None and float(zero.detach()):
                 text = self.shown(zero, f"the zero of {what}")
                 what = f"({what} {f'+ {text[1:]}' if text.startswith('−') else f'− {text}'})"
-            yield from (Line(left, what, "", friction.input_map[i, j]) for i, left in enumerate(self.own))
+            for i, left in enumerate(self.own):
+                in_L = self.model.action is not None  # the work of inputs
+                at, text = ("L", f"{what} {self.names[i]}") if in_L else (left, what)
+                yield Line(at, text, "", friction.input_map[i, j])
 
     def _springs(self) -> Iterator[Line]:
         """The baseline's k (1 − cos x) + b sin x or k x²/2 + b x, x a coordinate or what translations leave of it."""
@@ -252,7 +261,7 @@ class Reader:
         if not self.newton:
             x, by_s = names[0], model.damping is not None
             more = f" + (∂L/∂s) ∂L/∂{x}′" if by_s else ""
-            forces = f" + the force on {x}" if model.friction is not None else ""
+            forces = f" + the force on {x}" if any(line.left != "L" for line in self.lines()) else ""
             found.append(
                 f"motion: d/dt ∂L/∂{x}′ = ∂L/∂{x}{more}{forces}{', so for every coordinate' * (len(names) > 1)}"
                 + ("; s′ = L" if by_s else "")

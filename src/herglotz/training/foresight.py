@@ -21,6 +21,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.models import ContactLagrangian
+from herglotz.models.config import POWERS
 from herglotz.progress import beat
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
@@ -200,7 +201,7 @@ def _with_absent_terms(
 ) -> tuple[ContactLagrangian, Baseline, dict[str, list[int]]]:
     """A model of named terms with all other candidates at 0, and where these stand; other models as they are."""
     c, data, parameters = task.config, task.data, ParameterVector(model)
-    own = NamedTerms(c.features, c.drag, c.coulomb)
+    own = NamedTerms(c.features, c.drag, c.dissipation, c.coulomb)
     every = _searched(task, own, parameters)
     if every is None or not set(own.names) <= set(every.names):
         return model, task.base, {}
@@ -219,12 +220,14 @@ def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> Named
     c, data = task.config, task.data
     told = any((c.known, c.terms, c.input_map, c.translations and not c.features))
     network = any(name.startswith(NETWORKS) for name in parameters.names)
-    if network or told or c.objective != "trajectory" or c.level not in ("linear", "forced") or data.dof > MOST:
+    by_name = c.level in ("linear", "forced") or bool(c.dissipation)
+    if network or told or c.objective != "trajectory" or not by_name or data.dof > MOST:
         return None
     every, rare = candidates(data, c.translations), set(special(data))
+    every = replace(every, dissipation=tuple(POWERS) if c.dissipation else ())
     if not rare & set(own.features):
         every = every.only(set(every.names) - rare)
-    return replace(every, one_rate=every.one_rate and c.level == "linear")
+    return replace(every, one_rate=every.one_rate and c.level != "forced")
 
 
 def _summary(

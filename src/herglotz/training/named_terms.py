@@ -22,6 +22,7 @@ SIDE = 0.1  # of the way to the farther side of 0: motion that goes less far on 
 BACK = 50  # a turn back that is shorter than this part of a recording says next to nothing of dry friction
 NEAR = 0.02  # of the RMS distance: powers of r are candidates where the data stay farther from 0
 STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
+IN_S = "action.coefficient"
 DRY = "friction.coulomb"
 CONSTANT = "q1"  # the potential of a constant force on a length
 
@@ -32,6 +33,7 @@ class NamedTerms:
 
     features: tuple[str, ...] = ()
     drag: tuple[str, ...] = ()
+    dissipation: tuple[str, ...] = ()  # powers of s in L
     dry: bool = False
     one_rate: bool = False  # of several coordinates: damped alike, by the contact form alone, and no forces
     springs: bool = True  # the baseline's own of every coordinate; translations leave them out
@@ -41,17 +43,19 @@ class NamedTerms:
     @property
     def names(self) -> tuple[str, ...]:
         """All of them, each once."""
-        return (*self.features, *self.drag, *((DRY,) if self.dry else ()))
+        return (*self.features, *self.drag, *self.dissipation, *((DRY,) if self.dry else ()))
 
     def joined(self, other: NamedTerms) -> NamedTerms:
         """These and the other ones, each once."""
-        features = tuple(dict.fromkeys(self.features + other.features))
-        return replace(self, features=features, drag=tuple(dict.fromkeys(self.drag + other.drag)))
+        own = ("features", "drag", "dissipation")
+        every = {name: tuple(dict.fromkeys(getattr(self, name) + getattr(other, name))) for name in own}
+        return replace(self, **every)
 
     def only(self, names: Collection[str]) -> NamedTerms:
         """Those of them that are among `names`."""
-        features, drag = (tuple(x for x in own if x in names) for own in (self.features, self.drag))
-        return replace(self, features=features, drag=drag, dry=self.dry and DRY in names)
+        every = {name: getattr(self, name) for name in ("features", "drag", "dissipation")}
+        kept = {name: tuple(x for x in own if x in names) for name, own in every.items()}
+        return replace(self, **kept, dry=self.dry and DRY in names)
 
 
 def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTerms:
@@ -62,7 +66,7 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
     features = tuple(_of_one(data)) if len(angles) == 1 else features_of(angles)
     one_unit = len(set(data.units)) == 1  # else there is no length of a velocity
     drag = tuple(text for text in drag_of(angles) if one_unit or text != AIR)
-    return NamedTerms((*features, *special(data)), drag, True)
+    return NamedTerms((*features, *special(data)), drag, dry=True)
 
 
 def special(data: Trajectories) -> tuple[str, ...]:
@@ -140,10 +144,10 @@ def chains(data: Trajectories) -> list[NamedTerms]:
     across, every = _by_slides(data.angles)
     absolute = _where(lambda f: _form(f) == _difference(f), every) + _where(_of_own, across)
     if across and len(joints) == 1:
-        return [NamedTerms(absolute, (), True, apart=True)]
+        return [NamedTerms(absolute, dry=True, apart=True)]
     between = _where(lambda f: _of_neighbours(f, joints), every) + _where(lambda f: _row(f, joints), across)
-    turning = [NamedTerms(between, (), True), NamedTerms(absolute, (), True, apart=bool(across))]
-    return turning if across else [*turning, NamedTerms(_where(_of_springs, every), (), True, apart=True)]
+    turning = [NamedTerms(between, dry=True), NamedTerms(absolute, dry=True, apart=bool(across))]
+    return turning if across else [*turning, NamedTerms(_where(_of_springs, every), dry=True, apart=True)]
 
 
 def _where(rule: Callable[[Product], bool], terms: Sequence[tuple[str, Product]]) -> tuple[str, ...]:
@@ -206,10 +210,12 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     own = data.dof > 1 and not config.translations  # the baseline's potential
     order = order if still or own else 2  # of a potential: without one it would add a spring
     several, apart = data.dof > 1, lengths or terms.apart
+    level = "forced" if forced else "full" if terms.dissipation else "linear"
     return replace(
-        config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
-        diagonal=several and apart, coupled=forced and several and not apart, order=order, substeps=substeps,
-        objective="trajectory", absent=terms.absent, alike=data.dof == 1,  # the potential holds features alone
+        config, level=level, features=terms.features, drag=terms.drag, coulomb=terms.dry,
+        diagonal=several and apart, coupled=forced and several and not apart, order=2 if terms.dissipation else order,
+        substeps=substeps, objective="trajectory", absent=terms.absent, dissipation=terms.dissipation,
+        alike=data.dof == 1,  # the potential holds features alone
     )  # fmt: skip
 
 
@@ -219,7 +225,7 @@ def started(base: Baseline, data: Trajectories, values: dict, of: FitConfig) -> 
     rate = rest.pop("damping.rate", (0.0,))[0]
     if data.dof == 1 or of.level == "linear":  # viscous friction of the first mass, 1, is the rate
         rate += rest.pop("friction.viscous", (0.0,))[0]
-    for parameter, names in holders(of.features, of.drag).items():
+    for parameter, names in holders(of.features, of.drag, of.dissipation).items():
         rest[parameter] = tuple(values.get(name, 0.0) for name in names)
     zero, rest = (0.0,) * data.dof, {own: x for name, x in rest.items() if x and (own := _name_in(of, name))}
     stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
@@ -227,10 +233,10 @@ def started(base: Baseline, data: Trajectories, values: dict, of: FitConfig) -> 
     return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, model_step=step)
 
 
-def holders(features: Sequence[str], drag: Sequence[str] = ()) -> dict[str, list[str]]:
-    """The terms whose coefficients each of three parameters holds, in its order."""
+def holders(features: Sequence[str], drag: Sequence[str] = (), dissipation: Sequence[str] = ()) -> dict[str, list[str]]:
+    """The terms whose coefficients each of four parameters holds, in its order."""
     still, moving = ([x for x in features if ("v" in x) == moves] for moves in (False, True))
-    return {STILL: still, MOVING: moving, DRAG: list(drag)}
+    return {STILL: still, MOVING: moving, DRAG: list(drag), IN_S: list(dissipation)}
 
 
 def by_term(start: Mapping[str, Tensor], held: Mapping[str, Sequence[str]]) -> dict:
@@ -262,13 +268,13 @@ def values_of(parameters: ParameterVector, theta: Tensor) -> dict:
         own, named[STILL] = named[STILL][: 2 * of.dof], named[STILL][2 * of.dof :]
         turn = own.new_tensor([-1.0 if angle else 2.0 for angle in of.angles])
         named |= {"potential.stiffness": own[::2] * turn, "potential.tilt": own[1::2]}
-    return by_term(named, holders(of.features, of.drag))
+    return by_term(named, holders(of.features, of.drag, of.dissipation))
 
 
 def places(parameters: ParameterVector) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
     of, at = parameters.model.config, {}
-    for parameter, names in holders(of.features, of.drag).items():
+    for parameter, names in holders(of.features, of.drag, of.dissipation).items():
         at |= zip(names, ([i] for i in parameters.index(parameter).tolist()), strict=True)
     if of.coulomb:
         at[DRY] = parameters.index(DRY).tolist()

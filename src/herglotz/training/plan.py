@@ -44,6 +44,7 @@ class Plan:
     turning: bool = True  # angles turn; False: they are positions on a line, as of a free spring
     absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
     spreads: dict[str, float] = field(default_factory=dict)  # prior deviations of the waves that make functions
+    dissipation: tuple[str, ...] = ()  # powers of s in L beside −γ s
     input_terms: tuple[str, ...] = ()  # of recorded inputs, which act beside them
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
     reasons: dict[str, str] = field(default_factory=dict)
@@ -53,7 +54,7 @@ class Plan:
         return replace(
             settings, level=self.level, objective=self.objective, order=self.order, features=self.features,
             departures=self.departures, drag=self.drag, substeps=self.substeps, absent=self.absent,
-            **self.forces,
+            dissipation=self.dissipation, **self.forces,
         )  # fmt: skip
 
     def started(self, base: Baseline) -> Baseline:
@@ -120,6 +121,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "zeros": "what the sensors read at 0, recording after recording",
     "turning": "angles turn",
     "drag": "friction beside the viscous one",
+    "dissipation": "damping by s, beside −γ s in L",
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",
     "absent": "numbers that are 0",
@@ -131,8 +133,8 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "departures": "strengths of the prior that are compared",
 }
 DECISIONS = tuple(WORDS)
-IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drag", "absent", "continues_probe",
-          "fitted_before")  # fmt: skip  # told if not 0
+IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drag", "absent", "dissipation",
+          "continues_probe", "fitted_before")  # fmt: skip  # told if not 0
 MEANINGS = {
     "level": {
         "conservative": "no damping",

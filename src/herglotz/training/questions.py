@@ -1,7 +1,8 @@
 """What a search asks of data beside their terms: one question after the other, of the model that the last one left.
 
-Zeros of sensors come before everything that may stand for them. How inputs hold, by which terms they act, and whether
-functions say what named terms do not, follows. Of long recordings a part is asked, and all samples at the end.
+Damping by s belongs to the terms. Zeros of sensors come before everything else that may stand for them. How inputs
+hold, by which terms they act, and whether functions say what named terms do not, follows. Of long recordings a part is
+asked, and all samples at the end.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from herglotz.training.dissipation import with_dissipation
 from herglotz.training.search import Search
 from herglotz.training.trials import Trial
 
@@ -25,7 +27,7 @@ class Questions:
         self.read: Search
         self.best: Trial | None
         self.differ: tuple[Tensor, Tensor] | None
-        self.read, self.best, self.differ = wanted.part.with_zeros(wanted.part.run())
+        self.read, self.best, self.differ = wanted.part.with_zeros(_searched(wanted.part))
 
     def zeros(self) -> None:
         """Terms anew where zeros differ, then zeros with these terms.
@@ -34,7 +36,7 @@ class Questions:
         """
         if self.differ is None:
             return
-        best, part = self.read.run() or self.best, self.wanted.part
+        best, part = _searched(self.read) or self.best, self.wanted.part
         once_more = part.with_zeros(best and part.again(best), sure=True)
         self.read, self.best, self.differ = (self.read, best, self.differ) if once_more[1] is None else once_more
 
@@ -52,7 +54,7 @@ class Questions:
 
     def _anew(self, other: Callable[[Search], Search]) -> None:
         self.wanted, self.read = other(self.wanted), other(self.read)
-        self.best = self.read.run() or self.best
+        self.best = _searched(self.read) or self.best
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.
@@ -74,3 +76,9 @@ class Questions:
         """The model of a part fitted to all data, with what more these ask for."""
         if self.wanted.part is not self.wanted:
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
+
+
+def _searched(search: Search) -> Trial | None:
+    """The model of a search, whose damping depends on s where that is better."""
+    found = search.run()
+    return found and with_dissipation(search, found)

@@ -53,7 +53,7 @@ BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this sh
 EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
-         "coupled", "absent")  # fmt: skip
+         "coupled", "absent", "dissipation")  # fmt: skip
 
 VISCOUS = "friction.viscous"
 

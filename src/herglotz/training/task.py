@@ -18,8 +18,8 @@ LEAST_GRIP = 0.01  # of set-valued friction at the start of a fit, over the typi
 EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the motion's size; smaller errors are rounding
 
 # Settings of a fit that its model has under the same name.
-AS_SET = ("level", "seed", "activation", "mass_width", "action_width", "coulomb", "input_map", "known", "alike",
-          "diagonal", "coupled", "drag", "order", "terms", "translations", "absent")  # fmt: skip
+AS_SET = ("level", "seed", "activation", "mass_width", "action_width", "dissipation", "coulomb", "input_map", "known",
+          "alike", "diagonal", "coupled", "drag", "order", "terms", "translations", "absent")  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,7 @@ class Variant:
     substeps: int = 1
     sticking: bool = False
     functions: tuple[Band, ...] = ()  # of the coordinates, beside named terms
+    dissipation: tuple[str, ...] = ()  # powers of s in L
 
 
 class Compared(NamedTuple):
@@ -177,7 +178,8 @@ class Fitter:
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
         every_band, terms = variant.functions, candidates(data, config.translations)
-        self.terms = terms = terms_with(every_band, terms, data.angles) if every_band else terms
+        terms = terms_with(every_band, terms, data.angles) if every_band else terms
+        self.terms = terms = replace(terms, dissipation=variant.dissipation)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
         base = started(base, data, first, settings)
@@ -267,7 +269,7 @@ class Fitter:
                 problem.guess_from_states(states_of_pairs(self.model, self.smooth))
         else:
             if states is None:
-                states = before.problem.states_at(before.path, problem.grid.start_sample)
+                states = before.problem.states_at(before.path, problem.grid.start_sample, problem.d)
             if problem.compiled is None:
                 problem.guess_from(before.problem, before.path)
         x = problem.pack(theta, states)

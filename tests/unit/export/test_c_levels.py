@@ -29,6 +29,8 @@ CASES: dict[str, dict[str, Any]] = {
     "viscous, motors": {"level": "forced", "inputs": 2},
     "full": {"level": "full", "action_width": 3},
     "full, correction": {"level": "full", "correction_width": 4, "activation": "silu", "mass_width": 3},
+    "powers of s": {"level": "full", "dissipation": ("s^2", "s^3")},
+    "powers of s, motors": {"level": "forced", "dissipation": ("s^3",), "coupled": True, "coulomb": True, "inputs": 2},
     "mass": {"level": "linear", "mass_width": 4, "activation": "softplus"},
     "motors": {"level": "forced", "coulomb": True, "inputs": 3},
     "coupled": {"level": "forced", "coupled": True},
@@ -61,7 +63,7 @@ def damped(case):
         if model.drag is not None:  # so large that a missing force is seen
             model.drag.coefficient.abs_().add_(0.2)
         if model.action is not None:  # so large that a missing term is seen
-            model.action.rate.mul_(6)
+            (model.action.coefficient if config.dissipation else model.action.rate).mul_(6)
         if isinstance(model.kinetic, PositionKinetic):
             model.kinetic.network.weights[-1].mul_(6)
     return model

@@ -82,6 +82,10 @@ CASES: dict[str, tuple[str, Setting]] = {
     "full": ("a", {
         "level": "full", "action_width": 2, "correction_width": 3, "correction_depth": 1, "activation": "silu",
     }),
+    "powers of s": ("l", {"level": "full", "dissipation": ("s^2", "s^3"), "features": ("q1^4",)}),
+    "powers of s, forces": ("al", {
+        "level": "forced", "dissipation": ("s^3", "s^2"), "inputs": 1, "coulomb": True, "drag": ("q2^2 v2",),
+    }),
     "mass of one": ("l", {"mass_width": 2}),
     "mass": ("al", {"level": "forced", "mass_width": 3, "mass_depth": 2, "coupled": True, "coulomb": True}),
 }  # fmt: skip

@@ -79,11 +79,14 @@ def random_networks(config, size=0.5) -> Any:
             angles=(True, False), scale=(1.0, 1.0), speed=(1.0, 1.0), stiffness=(1.0, 2.0), tilt=(0.0, 0.1),
             level="forced", coulomb=True, mass_width=4, potential_width=0,
         ),
+        ModelConfig(level="full", dissipation=("s^2", "s^3"), rate=0.5),
+        ModelConfig(level="forced", dissipation=("s^3", "s^2"), coulomb=True, drag=("cos(q1) v1",), rate=0.5),
     ],
-    ids=["full", "one unit", "mass", "mass affine", "mass forced"],
+    ids=["full", "one unit", "mass", "mass affine", "mass forced", "powers of s", "powers of s, forces"],
 )  # fmt: skip
 def test_every_weight_gives_second_order(config):
-    # fails if the units of s are not composed in opposite orders, or m is taken at an end: order 1 then (trap 1)
+    # fails if the units or powers of s are not composed in opposite orders, m is taken at an end, or forces have the
+    # weight e^g where 1 + D3 is another number: order 1 then (trap 1)
     model = random_networks(config)
     x = [end(model, k, h_total=1.0) for k in (24, 48, 96)]
     exact = x[2] + (x[2] - x[1]) / 3  # Richardson: right to order 4, as the step is its own adjoint

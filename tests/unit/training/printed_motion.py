@@ -44,7 +44,8 @@ class Printed:
             symbols[distance] = f"np.sqrt({'+'.join(f'q[{i}]**2' for i in range(self.n))})"
         symbols |= {name: f"({Reader(right, symbols).sum()})" for name, right in functions.items()}
         self.mass, forces = np.ones(self.n), ["0.0"] * self.n
-        self.L: Any = None  # a function of q, v and s where one is printed
+        self.L: Any = None  # a function of q, v and s where one is printed, at the inputs u
+        self.u: Any = np.zeros(len(inputs))
         of_q = list(forces)
         for left, right in lines.items():
             code = Reader(right, symbols)
@@ -52,7 +53,8 @@ class Printed:
             found = "".join(terms)
             assert code.at == len(right), f"not read: {right[code.at :]!r}"
             if left == "L":
-                self.L = function(found, "q, v, s")
+                of_u = function(found, "q, v, s, u")
+                self.L = lambda q, v, s, of_u=of_u: of_u(q, v, s, self.u)
                 continue
             i = next(k for k, name in enumerate(names) if re.search(rf"(^| ){re.escape(name)}″?$", left))
             forces[i] = found
@@ -90,6 +92,7 @@ class Printed:
 
     def acceleration(self, q, v, s, u):
         """The second derivative of q, (n, ...), and s′, (...)."""
+        self.u = u  # which does work in L where damping depends on s
         force = self.force(q, v, u)
         if self.L is None:
             return force / self.masses(q), np.zeros_like(s)
@@ -98,12 +101,12 @@ class Printed:
         of_v, by_s, mass = self.slopes(
             near, spread(v, 5), s + np.array([0, 0, 0, 0.5, -0.5]).reshape(5, *(1,) * s.ndim)
         )
-        of_q, rate = differences(lambda x: self.L(x, v[:, None], s), q), self.L(q, v, s)
+        of_q, rate = differences(lambda x: self.L(x, v[:, None], s), q), self.L(q, v, s) + 0 * s
         by_time = (of_v[:, 1] - of_v[:, 2]) / (2 * tiny) + (of_v[:, 3] - of_v[:, 4]) * rate
         return solved(mass[:, :, 0], of_q + by_s[0] * of_v[:, 0] + force - by_time), rate
 
     def slopes(self, q, v, s):
-        """∂L/∂v, ∂L/∂s and ∂²L/∂v²: L is quadratic in v and linear in s, so that differences are exact."""
+        """∂L/∂v, ∂L/∂s and ∂²L/∂v²: L is quadratic in v and a cubic of s, so that differences are exact."""
         n, unit = self.n, np.eye(self.n)
         moves = [unit[i] * x + unit[j] * y for i in range(n) for j in range(n) for x in (1, -1) for y in (1, -1)]
         moves = np.array([*unit, *-unit, *moves]).T.reshape(n, -1, *(1,) * (q.ndim - 1))
@@ -111,7 +114,8 @@ class Printed:
         L = np.broadcast_to(L, (moves.shape[1], *np.broadcast_shapes(q.shape[1:], v.shape[1:])))
         of_v, four = (L[:n] - L[n : 2 * n]) / 2, L[2 * n :].reshape(n, n, 4, *L.shape[1:])
         mass = (four[:, :, 0] - four[:, :, 1] - four[:, :, 2] + four[:, :, 3]) / 4
-        return of_v, self.L(q, v, s + 0.5) - self.L(q, v, s - 0.5), mass
+        near, far = (self.L(q, v, s + x) - self.L(q, v, s - x) for x in (0.5, 1.0))
+        return of_v, (8 * near - far) / 6, mass
 
     def masses(self, q):
         """The masses of lines, shaped like q."""

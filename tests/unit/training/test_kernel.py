@@ -57,6 +57,8 @@ MODELS = {
     "affine": replace(NETWORK, level="affine", damping_width=3),
     "full": replace(NETWORK, level="full", damping_width=3, action_width=2),
     "correction": replace(NETWORK, level="linear", correction_width=3),
+    "powers of s": replace(PENDULUM, dissipation=("s^3", "s^2")),
+    "powers of s of joints": replace(JOINTS, dissipation=("s^2",)),
     "networks of joints": replace(
         JOINTS, features=(), scale=(0.7, 1.3), potential_width=4, mass_width=3, coupled=False, coulomb=False
     ),

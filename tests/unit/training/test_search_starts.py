@@ -134,7 +134,7 @@ class Asked:
 
     def run(self):
         self.seen.append((self.name, "run"))
-        return SimpleNamespace(names=["cos(q1)"], rms=0.1, whole=True, at=self.name)
+        return SimpleNamespace(names=["cos(q1)"], rms=0.1, whole=True, at=self.name, at_the_noise=True)
 
     def again(self, found):
         return None if self.told.get("lost") else found

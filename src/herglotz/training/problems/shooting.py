@@ -234,8 +234,8 @@ class ShootingProblem(StatesProblem):
         x = eliminate((diagonal, upper, lower), columns)
         return x if bool(torch.isfinite(x).all()) else None
 
-    def states_at(self, path: Path, samples: Tensor) -> Tensor:
-        """The fitted state (…, d) at recorded samples: where the segments of the next stage start.
+    def states_at(self, path: Path, samples: Tensor, d: int | None = None) -> Tensor:
+        """The fitted state (…, d) at recorded samples, where the segments of the next stage, of its own `d`, start.
 
         At a joint the end of the earlier segment is taken, unless the loss lets joints break: then the start of the
         later one, because the end of the earlier is somewhere else.
@@ -244,7 +244,7 @@ class ShootingProblem(StatesProblem):
         if self.freedom is not None:
             first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
             rows[self.grid.start_sample] = first
-        return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
+        return path.x[..., : d or self.d].flatten(0, 1)[rows[samples]]
 
     def guess_from(self, other: ShootingProblem, path: Path) -> Tensor:
         """Start the next solve from a path over other segments, samples or model steps, linear between its nodes.
