@@ -72,3 +72,15 @@ def coarse(data: Trajectories) -> bool:
 def precisions(data: Trajectories) -> Tensor:
     """`precision` of every coordinate, (n,)."""
     return torch.stack([_residuals(data, degree) for degree in DEGREES]).amin(0)
+
+
+def part_of(data: Trajectories, most: int) -> Trajectories:
+    """About `most` samples of more than twice as many: every second, fourth … one while these follow the motion.
+
+    What is left over is cut to the runs of samples that move most. The data themselves where they have no more.
+    """
+    few = data
+    while few.samples >= 2 * most and min(few.lengths) >= 2 * most / len(few) and not coarse(half := few.thinned(2)):
+        few = half
+    liveliest = few.liveliest(most)
+    return liveliest if liveliest.samples < few.samples / 2 else few

@@ -47,6 +47,10 @@ class Baseline:
         """Number of recorded inputs m."""
         return len(self.input_map) // len(self.angles)
 
+    def stepped(self, times: float) -> Baseline:
+        """The same of data whose steps are so many times as long."""
+        return replace(self, max_step=times * self.max_step, model_step=times * self.model_step)
+
 
 def _check_moved(data: Trajectories, speed: list[float]) -> None:
     still = [name for name, moved in zip(data.names, speed, strict=True) if moved == 0]

@@ -7,7 +7,7 @@ asked, and all samples at the end.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from torch import Tensor
@@ -30,31 +30,27 @@ class Questions:
         self.read, self.best, self.differ = wanted.part.with_zeros(_searched(wanted.part))
 
     def zeros(self) -> None:
-        """Terms anew where zeros differ, then zeros with these terms.
-
-        Terms that made up for zeros may stay where others stand already, and have bent the zeros.
-        """
+        """Terms anew where zeros differ, then zeros with the better terms: what made up for zeros has bent them."""
         if self.differ is None:
             return
-        best, part = _searched(self.read) or self.best, self.wanted.part
+        best, part = self.read.better(self.best, _searched(self.read)), self.wanted.part
         once_more = part.with_zeros(best and part.again(best), sure=True)
         self.read, self.best, self.differ = (self.read, best, self.differ) if once_more[1] is None else once_more
 
     def how_inputs_hold(self) -> None:
-        """Terms anew with another hold of the inputs, where the model asks for one."""
-        if self.best is not None and (hold := self.read.held(self.best, self.holds)):
-            self.hold = hold
-            self._anew(lambda search: search.of(replace(search.data, hold=hold)))
+        """Another hold of the inputs where the model asks for one, and terms anew."""
+        if self.best is None or self.wanted.part.longer > 1 or not (hold := self.read.held(self.best, self.holds)):
+            return
+        other, self.hold = lambda search: search.of(replace(search.data, hold=hold)), hold
+        self.wanted, self.read = other(self.wanted), other(self.read)
+        self.best = self.read.better(self.read.again(self.best), _searched(self.read))
 
     def how_inputs_act(self) -> None:
         """Terms anew with squares, sizes and rates of the inputs, where the model asks for some."""
         if self.best is not None and (terms := self.read.input_terms(self.best)):
             self.input_terms = terms
-            self._anew(lambda search: search.driven_by(terms))
-
-    def _anew(self, other: Callable[[Search], Search]) -> None:
-        self.wanted, self.read = other(self.wanted), other(self.read)
-        self.best = _searched(self.read) or self.best
+            self.wanted, self.read = self.wanted.driven_by(terms), self.read.driven_by(terms)
+            self.best = _searched(self.read) or self.best
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.
@@ -64,7 +60,8 @@ class Questions:
         if self.best is None or (found := self.read.with_functions(self.best)) is self.best:
             return
         self.best = found
-        later = self.read.held(found, [hold for hold in self.holds if hold != self.hold])
+        others = [] if self.wanted.part.longer > 1 else [hold for hold in self.holds if hold != self.hold]
+        later = self.read.held(found, others)
         wanted = self.wanted.of(replace(self.wanted.data, hold=later)) if later else self.wanted
         if (again := wanted.part.again(found)) is None:
             return
@@ -74,7 +71,12 @@ class Questions:
 
     def all_data(self) -> None:
         """The model of a part fitted to all data, with what more these ask for."""
-        if self.wanted.part is not self.wanted:
+        if self.wanted.part is self.wanted:
+            return
+        longer = self.wanted.part.longer > 1  # inputs are means over several samples, which say little of holds of one
+        self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
+        if longer and self.best is not None and (hold := self.read.held(self.best, self.holds)):
+            self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import all_input_terms, with_input_terms
+from herglotz.data.roughness import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
@@ -42,19 +43,19 @@ Zeroed = tuple["Search", Trial | None, tuple[Tensor, Tensor] | None]
 
 
 class Search:
-    """See the head of this module."""
+    """See the head of this module. A step of its data is `longer` times one of the data that are to be fitted."""
 
     def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False):
-        self.data, self.base, self.config = data, base, config
-        self.over = data  # what functions are made for: of a part of long recordings all of them
+        # Functions are made for what `over` holds: of a part of long recordings all of them.
+        self.data, self.base, self.config, self.over = data, base, config, data
         self.freedom = FREEDOM if outliers else None
         self.order = 4 if is_precise(data) and data.dof == 1 else 2
         self.fitters: dict[Variant, Fitter] = {}
         self.finest = max(1, min(FINEST, STEPS // data.samples))
-        self.tried, self.most, self.part = TRIED, ITERATIONS, self
-        few = data.liveliest(PART)
-        if few.samples < data.samples / 2:
-            self.part, self.tried, self.most = self.of(few), 1, FEW
+        self.tried, self.most, self.part, self.longer = TRIED, ITERATIONS, self, 1.0
+        if (few := part_of(data, PART)) is not data:
+            self.part, self.tried, self.most, m = self.of(few), 1, FEW, few.typical_step / data.typical_step
+            self.part.longer, self.part.base = m, base.stepped(m)
 
     def of(self, data: Trajectories) -> Search:
         """The same of other data."""
@@ -111,7 +112,7 @@ class Search:
         """The model of a trial fitted to these data, from its values; None where it does not follow them."""
         if found.fitter.data is self.data:
             return found
-        fitter = self.fitter(found.fitter.variant)
+        fitter = self.fitter(found.fitter.variant.crossing(self.data.typical_step / found.fitter.data.typical_step))
         if found.fitter.data.lengths == self.data.lengths:
             return fitter.fit(found.taken, found.values, found.length, found, 2 * ITERATIONS)
         first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])

@@ -56,6 +56,10 @@ class Variant:
     functions: tuple[Band, ...] = ()  # of the coordinates, beside named terms
     dissipation: tuple[str, ...] = ()  # powers of s in L
 
+    def crossing(self, times: float) -> Variant:
+        """The same with about as long model steps, where recorded steps are so many times as long."""
+        return replace(self, substeps=max(1, round(times * self.substeps)))
+
 
 class Compared(NamedTuple):
     """A model that was scored."""

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
+from herglotz.data.roughness import part_of
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
 from herglotz.training import Prior, ShootingProblem
@@ -35,6 +36,21 @@ def test_the_liveliest_part_is_where_the_motion_is():
     many = line([900] * 20)
     assert many.liveliest(2000).lengths == (200,) * 10
     assert many.liveliest(20_000) is many
+
+
+def test_a_part_of_fast_samples_is_every_mth_of_all():
+    # fails if a search is made of a few turns of many, of steps that the motion is too fast for, or of short recordings
+    # with next to no samples left
+    noise = 1e-3 * torch.randn(8000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for h, longer in ((0.02, 8), (0.4, 1)):  # 314 and 16 samples a turn
+        t = h * torch.arange(8000, dtype=torch.float64)
+        part = part_of(Trajectories.of(t, t.sin() + noise), 1000)
+        assert part.typical_step == pytest.approx(longer * h)
+        assert part.samples == 1000
+    few = line([900] * 3)
+    assert part_of(few, 1400) is few
+    many = line([90] * 100)
+    assert part_of(many, 1000).typical_step == pytest.approx(0.1)
 
 
 def test_held_out_time_at_the_start_is_predicted_from_its_start():

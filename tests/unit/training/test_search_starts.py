@@ -121,7 +121,7 @@ class Asked:
 
     def __init__(self, data, base, config, *, told, seen, name="whole", **_):
         self.data, self.base, self.config, self.told, self.seen, self.name = data, base, config, told, seen, name
-        self.fitters = {}
+        self.fitters, self.longer = {}, told.get("longer", 1.0)
         self.part = self if name != "whole" or not told.get("long") else self.of(data, "part")
 
     def of(self, data, name=None):
@@ -133,14 +133,18 @@ class Asked:
         return self.told.get(question, default)
 
     def run(self):
+        rms = self.told.get("rms", (0.1, 0.1))[sum(question == "run" for _, question in self.seen)]
         self.seen.append((self.name, "run"))
-        return SimpleNamespace(names=["cos(q1)"], rms=0.1, whole=True, at=self.name, at_the_noise=True)
+        return SimpleNamespace(names=["cos(q1)"], rms=rms, whole=True, at=self.name, at_the_noise=True)
 
     def again(self, found):
         return None if self.told.get("lost") else found
 
     def settled(self, found, **_):
         return found
+
+    def better(self, old, new):
+        return old if new is None or self.told.get("worse") else new
 
     def with_zeros(self, best, sure=False):
         differ = self.answer("zeros") if not sure else self.told["zeros"]
@@ -220,6 +224,21 @@ def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(ask
     found, seen = asked(**{"hold of cos(q1)": "smooth"})
     assert found.hold == "smooth"
     assert [name for name, question in seen if question == "run"] == ["whole", "whole'"]
+
+
+def test_terms_anew_that_are_worse_are_not_taken(asked):
+    # fails if what zeros or a hold ask for is taken, whether it is better or not
+    zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
+    for told in ({"zeros": zeros}, {"hold of cos(q1)": "smooth"}):
+        assert [asked(worse=worse, rms=(0.1, 0.2), **told)[0].sigma for worse in (False, True)] == [0.2, 0.1]
+
+
+def test_the_hold_of_samples_far_apart_is_asked_of_all_samples(asked):
+    # fails if means over several samples decide between holds of one, or the hold of all is not asked for then
+    found, seen = asked(**{"long": True, "longer": 4.0, "hold of cos(q1)": "first"})
+    assert found.hold == "first"
+    assert [name for name, question in seen if question.startswith("hold")] == ["whole"]
+    assert [question for name, question in seen if name == "whole'"] == ["of_part, False", "zeros"]
 
 
 def test_terms_of_inputs_are_those_of_all_data(asked):
