@@ -170,15 +170,17 @@ def test_typical_step_and_gaps():  # fails if the mean is taken for the median
 def test_split_time():  # fails if the cut is not per trajectory, or a sample is lost or seen twice
     data = full().select([0, 2])  # 4 and 6 samples
     with pytest.raises(
-        InputError, match=r"set: fraction 0.5 cuts the 4 samples of trajectory 0 into 2 and 2, each part needs 3"
+        InputError, match=r"set: fraction 0.4 cuts the 6 samples of trajectory 1 into 2 and 4, each part needs 3"
     ):
-        data.split_time(0.5)
+        data.split_time(0.4)
+    train, test = data.split_time(0.5)
+    assert (train.lengths, test.lengths) == ((4, 3), (3,))  # one recording too short is no reason to refuse the others
+    assert torch.equal(test.q, data.q[7:])
     long = Trajectories.of(
         torch.arange(20.0).double(), torch.arange(20.0).double(), (8, 12), s=torch.arange(20).double()
     )
-    with pytest.raises(InputError, match=r"fraction 0.7 cuts the 8 samples of trajectory 0 into 6 and 2"):
-        long.split_time(0.7)
-    with pytest.raises(InputError, match=r"fraction 0.2 cuts the 8 samples of trajectory 0 into 2 and 6"):
+    assert long.split_time(0.7)[0].lengths == (8, 8)
+    with pytest.raises(InputError, match=r"fraction 0.2 cuts the 12 samples of trajectory 1 into 2 and 10"):
         long.split_time(0.2)
     train, test = long.split_time(0.6)
     assert (train.lengths, test.lengths) == ((5, 7), (3, 5))
