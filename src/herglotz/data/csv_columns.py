@@ -192,7 +192,7 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
             doubts.setdefault(guess.doubt, []).append(i)
     own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
     plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
-    if plain and len(own) > 1:
+    if plain and len(plain) < len(own):
         doubts["no unit and no usual name says so"] = plain
     return tuple(_warning(found, columns, doubt) for doubt, columns in doubts.items())
 
@@ -276,8 +276,8 @@ def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:
     if len(q) == len(p) == 1:
         return tuple(p.values())
     raise InputError(
-        f"{where}: momentum columns {', '.join(p)} are not {', '.join(wanted)}; rename them, or leave them out with "
-        f"--drop {','.join(p)} (drop= in Python)"
+        f"{where}: momentum columns {', '.join(p)} are not {', '.join(wanted)}; rename or delete them, or "
+        f"leave them out with --drop {','.join(p)} (drop= in Python)"
     )
 
 

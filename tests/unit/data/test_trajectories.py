@@ -319,3 +319,39 @@ def test_inputs_before_the_first_sample_that_is_kept_act_on_none():
     kept = data.keep(torch.tensor([False, True, False, True, True, False, True, True, True, True]))
     assert kept.u is not None
     assert kept.u.flatten().tolist() == [1.5, 3.0, 4.0, 6.0, 7.0, 8.0, 9.0]
+
+
+@pytest.mark.parametrize(("way", "every"), [(4, 1), (-4, 1), (17, 4)])
+@pytest.mark.parametrize("place", [0.05, 0.5, 0.95])
+def test_a_turn_between_two_steps_is_not_lost(way, every, place):
+    # fails if a sample between both ends of a jump, as resampling leaves one, makes two steps of less than π, and the
+    # turn is lost; if the turn is looked for across two recordings; or if a second pass counts it twice
+    t = torch.arange(200).double() * 0.1
+    true = way * t + 0.3 * torch.sin(2 * t)
+    q = torch.remainder(true + torch.pi, 2 * torch.pi) - torch.pi
+    jumps = (q.diff().abs() > torch.pi).nonzero()[:, 0]
+    wrong = jumps[(jumps > 3) & (jumps < 190)][
+        ::every
+    ]  # the last sample before each jump is somewhere between its neighbours
+    before, after = q[wrong - 1].clone(), q[wrong + 1].clone()
+    q[wrong] = before + place * (after - before)
+    data = Trajectories.of(torch.cat([t, t]), torch.cat([q, q]), (200, 200), angles=(True,), units=("rad",)).unwrapped()
+    good = torch.ones(200, dtype=torch.bool)
+    good[wrong] = False
+    assert len(wrong) >= 11
+    for own in data.q[:, 0].split(200):
+        assert torch.allclose(own[good] - own[0], true[good] - true[0], atol=1e-9)
+    assert torch.equal(data.unwrapped().q, data.q)
+
+
+@pytest.mark.parametrize("size", [1.7, 2.4, 3.1, -3.1, 3.14159])
+@pytest.mark.parametrize("row", [3, 20, 56])
+def test_a_wrong_sample_is_no_turn(size, row):
+    # fails if a gross error beside a step is taken for a share of a turn, and all samples behind it move by 2π
+    t = torch.arange(60).double() * 0.1
+    q = 0.3 * torch.sin(2 * t)
+    wrong = q.clone()
+    wrong[row] += size
+    found = Trajectories.of(t, wrong, angles=(True,), units=("rad",)).unwrapped().q[:, 0]
+    good = torch.arange(60) != row
+    assert torch.allclose(found[good], q[good], atol=1e-12)
