@@ -23,7 +23,8 @@ ROLES = {
     # Words without a unit.
     "motor_position": "coordinate", "ActPos": "coordinate", "left_motor": "input", "friction_torque": "input",
     "motor_encoder": "coordinate", "yaw": "coordinate", "Kraft": "input", "courant": "input", "fuerza": "input",
-    "coppia": "input", "Strom": "input", "Fx": "input", "throttle": "input", "iq": "input", "quality": "left aside", "position_std": "left aside",
+    "coppia": "input", "Strom": "input", "Fx": "input", "throttle": "input", "iq": "input", "quality": "left aside",
+    "position_std": "left aside",
     # Rates and counters.
     "qd1": "left aside", "qdd": "left aside", "dq2": "left aside", "yvel": "left aside", "phi_vel": "left aside",
     "ddx": "left aside", "dphi/dt": "left aside", "wz": "left aside", "v2": "left aside", "a_x": "left aside",
