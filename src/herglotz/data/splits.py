@@ -32,8 +32,8 @@ def time_split(
         first = round(fraction * most)
         raise InputError(
             f"{source or 'trajectories'}: fraction {fraction:g} cuts the {most} samples of trajectory "
-            f"{lengths.index(most)} into {first} and {most - first}, each part needs {MIN_SAMPLES}; record more, change "
-            "the fraction, or hold nothing out: --train-fraction 1 (train_fraction=1 in Python)"
+            f"{lengths.index(most)} into {first} and {most - first}, each part needs {MIN_SAMPLES}; record more, "
+            "change the fraction, or hold nothing out: --train-fraction 1 (train_fraction=1 in Python)"
         )
     train = leading(lengths, cuts)
     return (train.nonzero()[:, 0], cuts), ((~train).nonzero()[:, 0], rest)

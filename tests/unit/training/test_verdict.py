@@ -67,8 +67,8 @@ def test_words(windows, unseen, free, ahead, expected):
         (1e-6, 0.04, True),  # 40 000 × the noise, and less than a twentieth of the spread
         (1e-6, 0.051, False),  # 510 × what counts as exact
         (0.0025, 0.051, False),
-        (0.003, 0.059, True),  # less than 20 × the noise
-        (0.003, 0.061, False),
+        (0.006, 0.059, True),  # less than 10 × the noise
+        (0.006, 0.061, False),
         (0.01, 0.099, True),
         (0.01, 0.101, False),  # a tenth of the spread is no motion of the model, whatever the noise
         (0.1, 0.29, True),
