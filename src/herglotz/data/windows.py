@@ -74,15 +74,26 @@ def unwrap(
     """Remove the multiple of 2π from every jump longer than π; each trajectory keeps its first value.
 
     A sample between both ends of a jump, as a resampled or filtered angle has it, leaves two steps of less than π. Such
-    a turn is removed where the motion on either side of the sample says so.
+    a turn is removed where the motion on either side of the sample says so. A sensor that wraps leaps by its range, or
+    by half of it twice: where no step is longer than a quarter of the range, all turns were counted.
     """
     inside = (trajectory[1:] == trajectory[:-1])[:, None] & angles
+    inside &= _wraps(q, trajectory)[trajectory[1:]]
     turns = torch.zeros_like(q)
     turns[1:] = torch.where(inside, torch.round((q[1:] - q[:-1]) / (2 * torch.pi)), 0.0)
-    turns += _divided_turns(q - 2 * torch.pi * turns.cumsum(0), trajectory) * angles
+    turns[1:] += torch.where(inside, _divided_turns(q - 2 * torch.pi * turns.cumsum(0), trajectory)[1:], 0.0)
     total = turns.cumsum(0)
     first = torch.searchsorted(trajectory, trajectory)  # row at which each row's trajectory starts
     return q - 2 * torch.pi * (total - total[first])
+
+
+def _wraps(q: Tensor, trajectory: Tensor) -> Tensor:
+    """Whether each trajectory has a step of a quarter of its range, (B, n)."""
+    rows = trajectory[:, None].expand_as(q)
+    empty = q.new_zeros(int(trajectory[-1]) + 1, q.shape[1])
+    high, low = (empty.scatter_reduce(0, rows, q, how, include_self=False) for how in ("amax", "amin"))
+    step = torch.where(rows[1:] == rows[:-1], q.diff(dim=0).abs(), 0.0)
+    return 4 * empty.scatter_reduce(0, rows[1:], step, "amax") >= high - low
 
 
 def _divided_turns(q: Tensor, trajectory: Tensor) -> Tensor:

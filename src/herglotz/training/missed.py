@@ -34,11 +34,11 @@ def reason_of(
 ) -> str:
     """What was missed, and what to try; "" where the residual shows no reason."""
     if names := filled_inputs(data):
-        was, its = ("was", "its") if len(names) == 1 else ("were", "their")
+        some, was, its = ("input", "was", "its") if len(names) == 1 else ("inputs", "were", "their")
         return (
-            f"{', '.join(names)} {was} recorded more slowly than the motion and filled in, and {its} steps act at "
-            "times between rows. Try the records of both before they were merged, or blank cells where nothing was "
-            "recorded"
+            f"the {some} {', '.join(names)} {was} recorded more slowly than the motion and filled in, and {its} steps "
+            "act at times between rows. Try the records of both before they were merged, or blank cells where nothing "
+            "was recorded"
         )
     first = torch.arange(max(0, data.samples - SAMPLES + 1), device=data.t.device)
     first = first[owner[first] == owner[first + SAMPLES - 1]]

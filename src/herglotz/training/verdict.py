@@ -34,7 +34,7 @@ from herglotz.training.look import Look
 from herglotz.training.missed import MOST, reason_of
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
-from herglotz.training.problems.robust import FREEDOM, scale_of
+from herglotz.training.problems.robust import FEW, FREEDOM, far_out, scale_of
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
@@ -93,6 +93,13 @@ def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
     return reason_of(data, found.misfit, grid.node // (grid.longest + 1))
 
 
+def _gross(windows: Tensor, data: Trajectories) -> Tensor:
+    """Samples that a heavy-tailed loss outweighed, (N,) bool; none where they are too many to be gross errors."""
+    out = far_out(windows / windows.abs().median(0).values.clamp_min(1e-300))
+    out[list(data.offsets)] = False  # trajectories start there
+    return out if float(out.double().mean()) <= FEW else torch.zeros_like(out)
+
+
 @dataclass(frozen=True)
 class Errors:
     """What a verdict rests on: RMS errors and sizes, all in one unit, or over the spread of each coordinate."""
@@ -104,6 +111,7 @@ class Errors:
     spread: float
     unit: str | None = ""  # None: all are over the spread of each coordinate, which is 1
     degrees: bool = False  # told in deg, as they were recorded; the unit is rad
+    out: int = 0  # samples of the training part that are gross errors, and have no say
 
     @property
     def limit(self) -> float:
@@ -136,6 +144,7 @@ class Errors:
         elif self.free is not None:
             told.append("and one run over all unseen time breaks off or leaves the world")
         spread = f"their spread is {self._size(self.spread)}" if self.unit is not None else EACH
+        spread += f"; {self.out} training samples are far from the model, and have no say" if self.out else ""
         return f"{', '.join(told)}; {self._precision()}, {spread}"
 
     def _missed(self, error: float, what: str, missed: bool = False) -> str:
@@ -177,6 +186,8 @@ def judged(
     used = torch.ones_like(task.data.t, dtype=torch.bool) if fitted.used is None else fitted.used
     kept, states = task.data.keep(used), fitted.states[~seen.spikes]
     windows = window_errors(task, fitted, states[used], kept)
+    out = _gross(windows, kept) if fitted.notes.get("robust") else torch.zeros_like(kept.t, dtype=torch.bool)
+    kept, windows = kept.keep(~out), windows[~out]
     unseen = None if seen.unseen is None else unseen_window_errors(task, fitted, seen.unseen)
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)
     scaled = replace(kept, q=kept.q / unit)
@@ -185,7 +196,7 @@ def judged(
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
     spread = _rms(scaled.q - scaled.q.mean(0))
     named, in_degrees = (common_unit(kept.units), bool(kept.degrees)) if kept.dof == 1 else (None, False)
-    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees)
+    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees, int(out.sum()))
     ahead = foresee(task, fitted, seen, everywhere)
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)

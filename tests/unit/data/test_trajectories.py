@@ -344,6 +344,15 @@ def test_a_turn_between_two_steps_is_not_lost(way, every, place):
     assert torch.equal(data.unwrapped().q, data.q)
 
 
+def test_counted_turns_are_kept():
+    # fails if an angle of many turns, which moves by more than π a sample, is unwrapped, or stops another trajectory
+    t = torch.arange(100).double() * 0.1
+    q = torch.cat([40 * torch.cos(1.1 * t), torch.remainder(20 * t, 2 * torch.pi)])
+    data = Trajectories.of(torch.cat([t, t]), q, (100, 100), angles=(True,), units=("rad",)).unwrapped()
+    assert torch.equal(data.q[:100, 0], q[:100])
+    assert torch.allclose(data.q[100:, 0], 20 * t, atol=1e-9)
+
+
 @pytest.mark.parametrize("size", [1.7, 2.4, 3.1, -3.1, 3.14159])
 @pytest.mark.parametrize("row", [3, 20, 56])
 def test_a_wrong_sample_is_no_turn(size, row):

@@ -52,8 +52,8 @@ FORCES = {
 
 @pytest.mark.parametrize("what", FORCES)
 def test_what_a_residual_shows(what):
-    # fails if a function of the state is said to be the past, or the other way round; if kicks are a memory; or if noise
-    # has a reason
+    # fails if a function of the state is said to be the past, or the other way round; if kicks are a memory; or if
+    # noise has a reason
     force, said = FORCES[what]
     found = reason_of(Trajectories.of(T, noisy()[:, None]), left(force), OWNER)
     assert (said in found) if said else found == "", found
@@ -89,8 +89,8 @@ def test_neighbours_that_are_far_tell_nothing():
     [([2, 3, 3], True), ([1, 2], True), ([3], False), ([40, 55, 70], False), ([1], False), ([2] * 40 + [3], False)],
 )
 def test_inputs_that_were_filled_in(rows, told):
-    # fails if a controller that runs at a third of the rate is told of, set points that come at any time are, or a clock
-    # of its own is not
+    # fails if a controller that runs at a third of the rate is told of, set points that come at any time are, or a
+    # clock of its own is not
     lengths = torch.tensor(rows * (4000 // sum(rows)))[:400]
     levels = torch.randn(len(lengths), generator=MAKE, dtype=torch.float64)
     u = levels.repeat_interleave(lengths)
@@ -98,7 +98,10 @@ def test_inputs_that_were_filled_in(rows, told):
     data = Trajectories.of(t, torch.sin(t)[:, None], u=torch.stack([torch.cos(t), u], -1))
     assert filled_inputs(data) == (["u2"] if told else [])
     found = reason_of(data, 1e-9 * torch.sin(t)[:, None], torch.zeros(len(t)))
-    assert found.startswith("u2 was recorded more slowly than the motion and filled in, and its steps act") is told
+    assert (
+        found.startswith("the input u2 was recorded more slowly than the motion and filled in, and its steps act")
+        is told
+    )
 
 
 @pytest.mark.parametrize(
