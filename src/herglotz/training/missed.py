@@ -1,8 +1,9 @@
 """`reason_of`: what the residual of a model that does not fit shows of the reason, in words.
 
 Free runs of 20 recorded steps, whose starts are fitted, leave a residual. The curvature of parabolas through nine of
-its samples is the acceleration that the model lacks, known to the noise of the data. Three reasons are looked for:
+its samples is the acceleration that the model lacks, known to the noise of the data. These reasons are looked for:
 
+* positions on a circle, which one angle gives;
 * an input that was recorded more slowly than the motion and filled in: its steps act at times between rows;
 * the past: where positions, velocities and inputs of two times are alike, the model lacks other accelerations, which no
   function of these gives;
@@ -11,10 +12,13 @@ its samples is the acceleration that the model lacks, known to the noise of the 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.polar import with_hints
 from herglotz.data.rates import filled_inputs
 from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, precisions
 from herglotz.data.units import size
@@ -32,11 +36,13 @@ def reason_of(
     miss: Tensor,  # (N, n) residual at the samples, in units of q
     owner: Tensor,  # (N,) which free run each sample is of
 ) -> str:
-    """What was missed, and what to try; "" where the residual shows no reason."""
+    """What was missed, and what to try, in sentences; "" where the residual shows no reason."""
+    if hints := with_hints(replace(data, notes=())).notes:
+        return hints[0].removeprefix("warning: ")
     if names := filled_inputs(data):
         some, was, its = ("input", "was", "its") if len(names) == 1 else ("inputs", "were", "their")
         return (
-            f"the {some} {', '.join(names)} {was} recorded more slowly than the motion and filled in, and {its} steps "
+            f"The {some} {', '.join(names)} {was} recorded more slowly than the motion and filled in, and {its} steps "
             "act at times between rows. Try the records of both before they were merged, or blank cells where nothing "
             "was recorded"
         )
@@ -65,11 +71,11 @@ def reason_of(
         row, unit = int(middle[kick]), "" if data.time_unit == "1" else data.time_unit
         when = f"t = {size(float(data.t[row]), unit)} of trajectory {int(data.trajectory[row])}"
         return (
-            f"what is missed comes in kicks, the hardest at {when}. Try what strikes as an input (--inputs), or "
+            f"What is missed comes in kicks, the hardest at {when}. Try what strikes as an input (--inputs), or "
             "recordings that are cut there"
         )
     return (
-        "it misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
+        "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
         "what was not recorded. Try --level full, whose action remembers, or record what else acts (--inputs)"
     )
 

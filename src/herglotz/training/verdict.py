@@ -255,7 +255,7 @@ def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[[], str]) -> 
     if not missed:
         return "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
     if reason := shown():
-        return reason[0].upper() + reason[1:]
+        return reason
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
     return "A force is missing. Try --objective smoothing, another --level (herglotz select), or a --feature for it"

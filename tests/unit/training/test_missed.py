@@ -44,9 +44,9 @@ FORCES = {
     "a force of the position": (0.3 * Q**3, ""),
     "friction": (0.3 * torch.tanh(3 * V), ""),
     "noise alone": (torch.zeros(N, dtype=torch.float64), ""),
-    "what nobody recorded": (0.2 * torch.sin(0.37 * T), "it misses differently where positions, velocities and inputs"),
+    "what nobody recorded": (0.2 * torch.sin(0.37 * T), "It misses differently where positions, velocities and inputs"),
     "the past": (0.2 * Q.roll(40), "the force depends on the past"),
-    "kicks": (kicks(), "what is missed comes in kicks, the hardest at t = "),
+    "kicks": (kicks(), "What is missed comes in kicks, the hardest at t = "),
 }
 
 
@@ -77,6 +77,14 @@ def test_few_samples_show_nothing():  # fails if an empty table of neighbours ra
     assert reason_of(short, Q[:5, None], torch.zeros(5)) == ""
 
 
+def test_a_body_on_an_arm_is_told():
+    # fails if x and y of one angle lack a force, as the verdict says, and the hint stands above a page of other words
+    q = torch.stack([0.4 * Q.sin(), -0.4 * Q.cos()], -1) + 1e-4 * torch.randn(N, 2, generator=MAKE, dtype=torch.float64)
+    found = reason_of(Trajectories.of(T, q, names=("x", "y"), units=("m", "m")), left(0 * T).expand(N, 2), OWNER)
+    assert found.startswith("x, y stay on a circle about ")
+    assert "--polar x,y" in found
+
+
 def test_neighbours_that_are_far_tell_nothing():
     # fails if the states of eight coordinates, none of which comes twice, are taken for alike
     speeds = torch.linspace(0.5, 2.1, 8, dtype=torch.float64).sqrt()
@@ -99,7 +107,7 @@ def test_inputs_that_were_filled_in(rows, told):
     assert filled_inputs(data) == (["u2"] if told else [])
     found = reason_of(data, 1e-9 * torch.sin(t)[:, None], torch.zeros(len(t)))
     assert (
-        found.startswith("the input u2 was recorded more slowly than the motion and filled in, and its steps act")
+        found.startswith("The input u2 was recorded more slowly than the motion and filled in, and its steps act")
         is told
     )
 
@@ -116,7 +124,7 @@ def test_a_verdict_gives_the_reason(errors, told):
     # fails if a misfit of the training data is blamed on the unseen part, or a reason is looked for where none is asked
     all_errors: Any = {"windows": 0.01, "unseen": 0.01, "free": 0.01, "noise": 0.01, "spread": 1.0} | errors
     metrics = {"follows_data": True, "objective": "trajectory"}
-    text = in_words(Errors(**all_errors), None, metrics, lambda: "it is late. Try earlier")
+    text = in_words(Errors(**all_errors), None, metrics, lambda: "It is late. Try earlier")
     assert text.endswith("It is late. Try earlier") is told
     assert ("the unseen part differs from the training part" in text) is not told
     assert ("A force is missing. Try " in in_words(Errors(**all_errors), None, metrics)) is told
