@@ -96,3 +96,6 @@ def test_what_stands_still_by_itself_is_no_error():
     start = torch.where(t < 2, 1.0, torch.cos(2 * t))  # its first sample would be wrong, and has to stay
     for q in (held, counts, rest, start):
         assert int(spikes(Trajectories.of(t, q[:, None])).sum()) == 0
+    later = torch.cat([t[:200], t[200:] + 50])  # it was moved while nothing was recorded
+    assert int(spikes(Trajectories.of(later, torch.where(t < 2, torch.sin(t), 0.9)[:, None])).sum()) == 0
+    assert int(spikes(Trajectories.of(later, torch.where(t < 3.8, 0.1 * t, 0.38 + 9 * (t > 3.99))[:, None])).sum()) == 0

@@ -42,6 +42,7 @@ def kicks():
 
 FORCES = {
     "a force of the position": (0.3 * Q**3, ""),
+    "a force of the position, near the noise": (0.016 * Q**3, ""),
     "friction": (0.3 * torch.tanh(3 * V), ""),
     "noise alone": (torch.zeros(N, dtype=torch.float64), ""),
     "what nobody recorded": (0.2 * torch.sin(0.37 * T), "It misses differently where positions, velocities and inputs"),
@@ -55,9 +56,17 @@ def test_what_a_residual_shows(what):
     # fails if a function of the state is said to be the past, or the other way round; if kicks are a memory; or if
     # noise has a reason
     force, said = FORCES[what]
-    found = reason_of(Trajectories.of(T, noisy()[:, None]), left(force), OWNER)
-    assert (said in found) if said else found == "", found
-    assert ("Try " in found) is bool(said)
+    for _ in range(4):
+        found = reason_of(Trajectories.of(T, noisy()[:, None]), left(force), OWNER)
+        assert (said in found) if said else found == "", found
+        assert ("Try " in found) is bool(said)
+
+
+def test_neighbours_are_of_other_times():
+    # fails if the samples before and behind, which lack the same as all that changes slowly does, are the neighbours
+    q = torch.sin(0.2 * T) + 0.6 * torch.sin(0.3 * T + 1)
+    data = Trajectories.of(T, (q + 1e-5 * torch.randn(N, generator=MAKE, dtype=torch.float64))[:, None])
+    assert "the force depends on the past" in reason_of(data, left(0.2 * torch.sin(0.37 * T)), OWNER)
 
 
 def test_the_hardest_kick_is_named():  # fails if the place is a row of the windows, or that of any other kick
@@ -94,7 +103,15 @@ def test_neighbours_that_are_far_tell_nothing():
 
 @pytest.mark.parametrize(
     ("rows", "told"),
-    [([2, 3, 3], True), ([1, 2], True), ([3], False), ([40, 55, 70], False), ([1], False), ([2] * 40 + [3], False)],
+    [
+        ([2, 3, 3], True),
+        ([1, 2], True),
+        ([3], False),
+        ([40, 55, 70], False),
+        ([40, 55], False),
+        ([1], False),
+        ([2] * 40 + [3], False),
+    ],
 )
 def test_inputs_that_were_filled_in(rows, told):
     # fails if a controller that runs at a third of the rate is told of, set points that come at any time are, or a
@@ -110,6 +127,13 @@ def test_inputs_that_were_filled_in(rows, told):
         found.startswith("The input u2 was recorded more slowly than the motion and filled in, and its steps act")
         is told
     )
+
+
+def test_recordings_of_a_slow_input_begin_anywhere():
+    # fails if rows are counted from the last step of one recording to the first of the next
+    u = torch.randn(14, generator=MAKE, dtype=torch.float64).repeat_interleave(3)[:40].repeat(30)
+    t = H * torch.arange(40, dtype=torch.float64).repeat(30)
+    assert filled_inputs(Trajectories.of(t, torch.sin(t)[:, None], (40,) * 30, u=u[:, None])) == []
 
 
 @pytest.mark.parametrize(
