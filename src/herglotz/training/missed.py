@@ -24,13 +24,12 @@ from herglotz.data.roughness import SAMPLES, precisions
 from herglotz.data.units import size
 
 MOST = 2000  # samples: the distances between all of them take 32 MB
-# Times its noise: of less than twice the noise, known to a tenth, too little is left to be compared.
-CLEAR = 2.0
 FEW = 20  # accelerations at least: a twentieth of them is one
 NEAR = 0.5  # standard deviations of the state: neighbours farther apart differ by forces of a narrow range, too
 # Of the variance of what is lacking, beside the noise: neighbours that differ by more do not tell it. Measured: laws
 # with a memory, and forces that were not recorded, 0.2 to 2; forces of the state that were left out at most 0.11.
 OTHER = 0.15
+CLEAR = 2.0  # times the noise: curvatures of neighbouring windows share samples, and differ by 1.5 times it by chance
 
 
 def reason_of(
@@ -58,16 +57,14 @@ def reason_of(
     value, slope, bend = torch.linalg.pinv(torch.stack([place**0, place, place**2 / 2], -1))
     at = lambda weights, x: (weights[:, None] * x[rows]).sum(1)  # noqa: E731
     noise = precisions(data).to(data.q) * data.balance * bend.norm() / h**2
-    lacking, own = at(bend, miss) / h**2, noise.square().mean(0)
-    lacking, own = lacking / lacking.std(0), own / lacking.var(0)
-    if float(own.mean()) * CLEAR**2 > 1:
-        return ""
+    lacking = at(bend, miss) / h**2
+    lacking, noise = lacking / lacking.std(0), noise / lacking.std(0)
     q, turning = at(value, data.q), torch.tensor(data.angles, device=miss.device)
     state = [q[:, ~turning], q[:, turning].sin(), q[:, turning].cos(), at(slope, data.q) / h]
     state += [] if data.u is None else [at(value, data.u)]
     x = torch.cat(state, 1)
     middle = rows[:, SAMPLES // 2]
-    if not _is_other(lacking, own, x / x.std(0).clamp_min(1e-300), middle):
+    if not _is_other(lacking, float(noise.square().mean()), x / x.std(0).clamp_min(1e-300), middle):
         return ""
     if (kick := _kick(lacking)) is not None:
         row, unit = int(middle[kick]), "" if data.time_unit == "1" else data.time_unit
@@ -89,8 +86,8 @@ def _kick(lacking: Tensor) -> int | None:
     return int(top[0]) if float(square[top].sum()) > 0.5 * float(square.sum()) else None
 
 
-def _is_other(lacking: Tensor, noise: Tensor, x: Tensor, row: Tensor) -> bool:
-    """Whether accelerations (K, n) of variance 1 differ where states (K, m) of other times are alike.
+def _is_other(lacking: Tensor, noise: float, x: Tensor, row: Tensor) -> bool:
+    """Whether accelerations (K, n) of variance 1, of it `noise`, differ where states (K, m) of other times are alike.
 
     The quarter of the samples whose neighbours are nearest is compared.
     """
@@ -99,5 +96,5 @@ def _is_other(lacking: Tensor, noise: Tensor, x: Tensor, row: Tensor) -> bool:
     near = distance.argsort()[: max(1, len(x) // 4)]
     if not float(distance[near[-1]]) < NEAR:
         return False
-    differ = (lacking[near] - lacking[other[near]]).square().mean(0) / 2
-    return float(((differ - noise) / (1 - noise)).mean()) > OTHER
+    differ = float((lacking[near] - lacking[other[near]]).square().mean()) / 2
+    return differ > max(CLEAR * noise, noise + OTHER * (1 - noise))

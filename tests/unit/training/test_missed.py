@@ -64,7 +64,7 @@ def test_what_a_residual_shows(what):
 
 def test_neighbours_are_of_other_times():
     # fails if the samples before and behind, which lack the same as all that changes slowly does, are the neighbours
-    q = torch.sin(0.2 * T) + 0.6 * torch.sin(0.3 * T + 1)
+    q = torch.sin(0.3 * T) + 0.6 * torch.sin(0.3 * math.sqrt(2.3) * T + 1)
     data = Trajectories.of(T, (q + 1e-5 * torch.randn(N, generator=MAKE, dtype=torch.float64))[:, None])
     assert "the force depends on the past" in reason_of(data, left(0.2 * torch.sin(0.37 * T)), OWNER)
 
@@ -131,9 +131,9 @@ def test_inputs_that_were_filled_in(rows, told):
 
 def test_recordings_of_a_slow_input_begin_anywhere():
     # fails if rows are counted from the last step of one recording to the first of the next
-    u = torch.randn(14, generator=MAKE, dtype=torch.float64).repeat_interleave(3)[:40].repeat(30)
-    t = H * torch.arange(40, dtype=torch.float64).repeat(30)
-    assert filled_inputs(Trajectories.of(t, torch.sin(t)[:, None], (40,) * 30, u=u[:, None])) == []
+    u = torch.randn(14, generator=MAKE, dtype=torch.float64).repeat_interleave(3)[:19].repeat(30)
+    t = H * torch.arange(19, dtype=torch.float64).repeat(30)
+    assert filled_inputs(Trajectories.of(t, torch.sin(t)[:, None], (19,) * 30, u=u[:, None])) == []
 
 
 @pytest.mark.parametrize(
