@@ -267,8 +267,8 @@ def test_recordings_too_short_to_be_cut_train_whole(capsys):
 
 @pytest.mark.parametrize(("wrong", "told"), [(8, True), (12, False)])
 def test_gross_errors_have_no_say(wrong, told):
-    # fails if wrong samples that a heavy-tailed loss outweighed are the precision, by which what misses them fits to the
-    # noise; if a model that follows no more than the rest is excused; if a recording loses its start; or if nobody is told
+    # fails if wrong samples that a heavy-tailed loss outweighed are the precision, by which what misses them fits to
+    # the noise; if a model that follows too few is excused; if a recording loses its start; or if nobody is told
     data = Trajectories.of(torch.arange(100).double().repeat(2), torch.zeros(200, 2).double(), (100, 100))
     miss = torch.tensor([1e-3, 1.0]) * torch.randn(200, 2, generator=torch.Generator().manual_seed(0))
     miss[[*range(100, 100 + wrong), *range(40, 40 + wrong)], 0] = 0.02
