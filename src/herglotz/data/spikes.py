@@ -50,7 +50,8 @@ def _stuck(data: Trajectories) -> Tensor:
     """Repeated readings of a sensor that stuck, (N,) bool: equal ones, and behind them a leap to where the motion is.
 
     They are `STUCK` at least, and the leap is `LEAP` times as fast as the fastest step between other readings: what
-    friction holds leaves slowly, and a slow motion goes from count to count.
+    friction holds leaves slowly, and a slow motion goes from count to count. A sensor that stands still in half of its
+    steps is not judged.
     """
     found = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
     for first, length in zip(data.offsets, data.lengths, strict=True):
@@ -62,7 +63,7 @@ def _stuck(data: Trajectories) -> Tensor:
             going = step.clone()
             going[end[long]] = 0
             leaps = long.clone()
-            leaps[long] = step[end[long]] > LEAP * going.max()
+            leaps[long] = (step[end[long]] > LEAP * going.max()) & (2 * int((going > 0).sum()) > len(step))
             for a, b in zip(begin[leaps].tolist(), end[leaps].tolist(), strict=True):
                 found[first + a + 1 : first + b + 1] = True
     return found
