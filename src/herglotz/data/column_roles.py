@@ -31,9 +31,9 @@ ROLES = {
     "counter": re.compile(r"index|row|sample|frame|step|dt|unnamed: \d+"),
     "input": re.compile(rf"u{NUMBERED}|F|f(\d+|[xyz]|_.*)|i_?[qd]"),
 }
-SYMBOL = r"(?:[qxyzr]|theta|phi|psi|alpha|beta|gamma|th|θ|φ|ϕ|ψ|α|β|pos|position|angle|joint)"
+SYMBOL = r"(?:[qxyzr]|theta|phi|psi|alpha|beta|gamma|th|θ|φ|ϕ|ψ|α|β|pos|position|angle|joint|roll|pitch|yaw)"
 RATE = re.compile(
-    rf"v\d*|[va]_?[xyz]|w[xyz]|d?d?{SYMBOL}_?\d*_?(d?dot|vel|velocity|speed|acc)(_?\d+)?|{SYMBOL}_?d?d_?\d+|{SYMBOL}dd"
+    rf"v\d*|[va]_?[xyz]|w[xyz]|d?d?{SYMBOL}_?\d*_?(d?dot|vel|velocity|speed|rate|acc)(_?\d+)?|{SYMBOL}_?d?d_?\d+|{SYMBOL}dd"
     rf"|dd?_?{SYMBOL}{NUMBERED}|d\d?.+?_?/?dt(\^?2)?|(vel|acc|gyro)[xyz]\d*"
 )
 LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")  # of a velocity or an acceleration, unless the unit is that of a position
@@ -41,17 +41,21 @@ DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")  # a desired value, or a derivat
 KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")  # usual names of coordinates
 _WORDS = {
     "goal": "goal target setpoint setpoints sp desired des reference ref command commands commanded cmd demand "
-            "demanded soll sollwert consigne consigna",
+            "demanded wanted consigne consigna",
     # Of what is measured beside a motion.
     "side": "error err std sd stderr variance var covariance cov uncertainty residual quality confidence likelihood "
-            "temperature temp battery batt supply humidity status valid checksum crc",
-    "rate": "velocity velocities vel speed rate acceleration acc accel omega gyro jerk dot ddot rpm",
+            "temperature temp temperatur température temperatura battery batt supply humidity status valid checksum "
+            "crc",
+    "rate": "velocity velocities vel speed rate acceleration acc accel omega gyro jerk dot ddot rpm "
+            "geschwindigkeit winkelgeschwindigkeit drehzahl beschleunigung vitesse accélération velocidad aceleración "
+            "velocità accelerazione",
     "position": "position positions pos angle angles displacement height elongation location coordinate "
-                "winkel weg lage",
-    "angle": "theta phi psi angle alpha beta gamma winkel θ φ ϕ ψ α β",
-    "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle",
+                "winkel weg lage ángulo posición posizione angolo",
+    "angle": "theta phi psi angle alpha beta gamma roll pitch yaw winkel ángulo angolo θ φ ϕ ψ α β",
+    "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle kraft drehmoment moment "
+              "strom spannung couple courant tension fuerza corriente coppia corrente forza tensione",
     "attribute": "motor current input inputs control controls",  # of a position: motor_angle; else of an input
-    "reading": "pot potentiometer lvdt encoder laser",  # of a position, in volts
+    "reading": "pot potentiometer lvdt encoder laser",  # of a position, even in volts
     "excitation": "road ground floor shaker excitation disturbance seismic",  # where a motion comes from
     "support": "base pivot support platform",  # places that may be moved from outside
 }  # fmt: skip
@@ -75,9 +79,9 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     words = words_of(name)
     if whole := _whole(key, kind):
         return Guess(whole, _letter(key) if kind == "position" else "")
-    if words & WORDS["side"] or {"set", "point"} <= words:
-        return Guess("dropped" if words & WORDS["side"] else "input")
-    if words & WORDS["goal"]:
+    if words & WORDS["side"]:
+        return Guess("dropped")
+    if words & WORDS["goal"] or ("set" in words and len(words) > 1) or any(word.startswith("soll") for word in words):
         return Guess("input")
     if DESIRED.fullmatch(key) and kind in ("", "position"):
         role = "input" if kind else "dropped"
@@ -170,7 +174,7 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
     if _is_rate(key, words, others, ""):
         return Guess("rate")
     attribute = words & WORDS["attribute"]
-    if words & WORDS["position"] and not words & WORDS["effort"]:
+    if words & (WORDS["position"] | WORDS["reading"]) and not words & WORDS["effort"]:
         return Guess("q", "its name may be that of an input" if words & GIVEN else "")
     last = re.split(r"[\W\d_]+", key.rstrip("0123456789_"))[-1]
     if attribute and re.fullmatch(SYMBOL, last):

@@ -13,6 +13,8 @@ from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
 HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
+# A unit without a space before it, where it is a unit: x(1) is a name.
+TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
 # A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
 SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
 AS_SHOWN = {  # roles by their names in the table of columns
@@ -255,9 +257,13 @@ def name_and_unit(cell: str) -> tuple[str, str] | None:
     match = HEADER_CELL.fullmatch(cell)
     if not match or not cell.isprintable():
         return None
-    if match[2] is None and match[3] is None and (ends := SUFFIX.fullmatch(match[1])):
+    if match[2] is not None or match[3] is not None:
+        return match[1], (match[2] or match[3]).strip()
+    if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
+        return tight[1], tight[2]
+    if ends := SUFFIX.fullmatch(match[1]):
         return ends[1] or ends[3], (ends[2] or ends[4]).lower().replace("_", "/")
-    return match[1], (match[2] or match[3] or "").strip()
+    return match[1], ""
 
 
 def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:
@@ -269,7 +275,10 @@ def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:
         return tuple(p[name] for name in wanted)
     if len(q) == len(p) == 1:
         return tuple(p.values())
-    raise InputError(f"{where}: momentum columns {', '.join(p)} are not {', '.join(wanted)}; rename or delete them")
+    raise InputError(
+        f"{where}: momentum columns {', '.join(p)} are not {', '.join(wanted)}; rename or delete them, or "
+        f"leave them out with --drop {','.join(p)} (drop= in Python)"
+    )
 
 
 def is_number(text: str) -> bool:

@@ -38,21 +38,21 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     input that is empty is held from the row before, or goes in a straight line where its hold is "first" or "smooth".
     Rows of stacked tables are sorted by time, and those of one time joined.
 
-    The header's cells are `name`, `name[unit]`, `name (unit)`, or of angles and times `name_deg`, `t_ms`; it may stand
-    behind #, as `numpy.savetxt` writes it, and the units in a row of their own below it. `t`, `time`, `timestamp`,
-    `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time; `trajectory`, `trial` or `run`, if
-    there, groups the rows; `s` is the action, `p`/`p_*` momenta. Of other columns an explicit unit decides before the
-    name (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions, N, Nm, A, V, % inputs, m/s, rad/s, rpm
-    rates, which are left aside, and so are °C, Pa, W. What is wanted of a motion is an input in any unit: goal,
-    target, setpoint, desired, reference, command. Without a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage,
-    motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors, temperatures, batteries and counters
-    (`index`, `frame`, a first column without a name) are left aside; every other column is a coordinate. A role that
-    is a guess is said in a warning. A column may be named with its unit. Times may be dates in ISO 8601: they become
-    seconds since the first row. Lines that start with # and blank lines are skipped, but for
-    `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do between
-    samples and how late they act, in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5`, which make
-    q = scale · (reading − zero) of the coordinates, one after the other (`herglotz.data.sensors`). A coordinate in rad
-    is taken for an angle.
+    The header's cells are `name`, `name[unit]`, `name (unit)`, `name(unit)` of a known unit, or of angles and times
+    `name_deg`, `t_ms`; it may stand behind #, as `numpy.savetxt` writes it, and the units in a row of their own below
+    it. `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time;
+    `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta. Of other columns an
+    explicit unit decides before the name (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions, N, Nm, A,
+    V, % inputs, m/s, rad/s, rpm rates, which are left aside, and so are °C, Pa, W. What is wanted of a motion is an
+    input in any unit: goal, target, set point, desired, reference, command, soll. Without a unit `u`, `u1`, `u_*`, `F`,
+    force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors,
+    temperatures, batteries and counters (`index`, `frame`, a first column without a name) are left aside; every other
+    column is a coordinate. A role that is a guess is said in a warning. A column may be named with its unit. Times may
+    be dates in ISO 8601: they become seconds since the first row. Lines that start with # and blank lines are skipped,
+    but for `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do
+    between samples and how late they act, in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5`,
+    which make q = scale · (reading − zero) of the coordinates, one after the other (`herglotz.data.sensors`). A
+    coordinate in rad is taken for an angle.
 
     Returns
     -------

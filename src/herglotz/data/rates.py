@@ -14,7 +14,10 @@ import torch
 
 from herglotz.data.csv_columns import Columns
 from herglotz.data.holds import lagrange
+from herglotz.data.trajectories import Trajectories
 
+MIN_STEPS = 20  # of an input that is told from one whose steps fell two numbers of rows apart by chance
+OFTEN = 0.1  # of these numbers of rows each: a row that is missing here and there is no clock
 NEAR = 4  # samples of a column that a value between them is made of: a cubic
 
 
@@ -124,4 +127,27 @@ def _where_blank(names: Sequence[str], straight: bool, longest: float, unit: str
     size = f"{longest:.3g}" if unit == "1" else f"{longest:.3g} {unit}"
     return (
         f"warning: {some}: the last one is held, for up to {size}; --hold first (hold= in Python) draws straight lines"
+    )
+
+
+def filled_inputs(data: Trajectories) -> list[str]:
+    """Names of inputs that were recorded at a slower rate and filled in: they change every k-th or (k + 1)-th row.
+
+    Clocks that run together make every k-th row alone; steps of a signal's own come after any number of rows.
+    """
+    labels = [name for name, _ in data.input_labels]
+    return [name for name, u in zip(labels, [] if data.u is None else data.u.T, strict=True) if _filled_in(data, u)]
+
+
+def _filled_in(data: Trajectories, u: torch.Tensor) -> bool:
+    """Whether an input (N,) steps in every k-th or (k + 1)-th row, and in both often."""
+    steps = data.steps()
+    at = (u[steps.index + 1] != u[steps.index]).nonzero()[:, 0]
+    apart = (steps.index[at].diff())[steps.trajectory[at].diff() == 0]
+    numbers, counts = apart.unique(return_counts=True)
+    return (
+        len(apart) >= MIN_STEPS
+        and len(numbers) == 2
+        and int(numbers[1] - numbers[0]) == 1
+        and float(counts.min() / counts.sum()) > OFTEN
     )

@@ -229,6 +229,10 @@ def _usable(
             kept.append(file)
         except Unusable as error:
             wrong.append(error)
+        except InputError as error:
+            if not path.is_dir():
+                raise
+            raise InputError(f"{error}; or take {file.name} out of the folder") from None
     return kept, sets, left_out(path, wrong, len(files))
 
 

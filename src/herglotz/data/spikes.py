@@ -1,4 +1,4 @@
-"""Gross errors in recorded positions: one to three samples that no smooth motion through their neighbours explains."""
+"""Gross errors in recorded positions: samples that no smooth motion explains, and readings of a sensor that stuck."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ NOISE = 8.0  # times the noise of the whole trajectory
 SIZE = 0.01  # times the standard deviation of the motion: quantisation is no gross error
 RESOLVED = 0.1  # times the standard deviation of the motion: above, sampling is too coarse to judge
 PASSES = 10  # the worst spikes are removed and the rest is judged anew, at most this often
+STUCK = 4  # equal readings behind the first, beyond the runs below
+LEAP = 2.0  # times the fastest step: two of them in one
 RUNS = (1, 2, 3)  # numbers of wrong samples in a row that are looked for
 
 
@@ -26,11 +28,13 @@ def spikes(data: Trajectories) -> Tensor:
     A sample (or a run of two or three) is compared with the cubic in time through its eight neighbours (deleted
     residuals, Cook & Weisberg 1982). A spike exceeds the misfit of its neighbours, so that fast smooth motion is kept,
     and the noise. The worst spikes are removed and the rest is judged anew, until none is left. Spikes within four
-    samples of one another may hide each other; a robust loss serves those. Angles should be `unwrapped()`.
+    samples of one another may hide each other; a robust loss serves those. Angles should be `unwrapped()`. Readings
+    that stand still while the motion goes on (`_stuck`) are left out, too.
     """
-    found = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
+    found = _stuck(data)
     for first, length in zip(data.offsets, data.lengths, strict=True):
         rows = torch.arange(first, first + length, device=data.t.device)
+        rows = rows[~found[rows]]
         size = SIZE * data.q[rows].std(0, correction=0).double()
         for run in RUNS:
             for _ in range(PASSES):
@@ -40,6 +44,35 @@ def spikes(data: Trajectories) -> Tensor:
                 found[rows[bad]] = True
                 rows = rows[~bad]
     return found
+
+
+def _stuck(data: Trajectories) -> Tensor:
+    """Repeated readings of a sensor that stuck, (N,) bool: equal ones, and behind them a leap to where the motion is.
+
+    They are `STUCK` at least, and the leap is `LEAP` times as fast as the fastest step between other readings: what
+    friction holds leaves slowly, and a slow motion goes from count to count. A sensor that stands still in half of its
+    steps is not judged.
+    """
+    found = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
+    for first, length in zip(data.offsets, data.lengths, strict=True):
+        h = data.t[first : first + length].diff()
+        for q in data.q[first : first + length].T:
+            step = q.diff().abs() / h
+            begin, end = _runs(step == 0)
+            long = (end - begin >= STUCK) & (begin > 0) & (end < len(step))
+            going = step.clone()
+            going[end[long]] = 0
+            leaps = long.clone()
+            leaps[long] = (step[end[long]] > LEAP * going.max()) & (2 * int((going > 0).sum()) > len(step))
+            for a, b in zip(begin[leaps].tolist(), end[leaps].tolist(), strict=True):
+                found[first + a + 1 : first + b + 1] = True
+    return found
+
+
+def _runs(flags: Tensor) -> tuple[Tensor, Tensor]:
+    """First and one past the last place of each run of True."""
+    edges = torch.nn.functional.pad(flags.int(), (1, 1)).diff()
+    return (edges > 0).nonzero()[:, 0], (edges < 0).nonzero()[:, 0]
 
 
 def _worst(t: Tensor, q: Tensor, size: Tensor, run: int) -> Tensor:

@@ -19,24 +19,42 @@ def time_split(
     fraction: float,  # of every trajectory that trains
     source: str = "",
 ) -> tuple[Part, Part]:
-    """Cut each trajectory after its first `round(fraction * length)` samples.
+    """Cut each trajectory after its first `round(fraction * length)` samples; one too short to be cut trains whole.
 
-    Raise InputError if the fraction is not inside (0, 1), or a part of any trajectory would have fewer than three
-    samples.
+    Raise InputError if the fraction is not inside (0, 1), or no trajectory has two parts of three samples.
     """
     if not 0.0 < fraction < 1.0:
         raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
-    cuts = tuple(round(fraction * length) for length in lengths)
-    rest = tuple(length - cut for cut, length in zip(cuts, lengths, strict=True))
-    for b, (cut, left) in enumerate(zip(cuts, rest, strict=True)):
-        if min(cut, left) < MIN_SAMPLES:
-            raise InputError(
-                f"{source or 'trajectories'}: fraction {fraction:g} cuts the {cut + left} samples of trajectory {b} "
-                f"into {cut} and {left}, each part needs {MIN_SAMPLES}; record more, change the fraction, or leave the "
-                "trajectory out"
-            )
+    cuts = tuple(cut_of(length, fraction) for length in lengths)
+    rest = tuple(length - cut for cut, length in zip(cuts, lengths, strict=True) if cut < length)
+    if not rest:
+        most = max(lengths)
+        first = round(fraction * most)
+        raise InputError(
+            f"{source or 'trajectories'}: fraction {fraction:g} cuts the {most} samples of trajectory "
+            f"{lengths.index(most)} into {first} and {most - first}, each part needs {MIN_SAMPLES}; record more, "
+            "change the fraction, or hold nothing out: --train-fraction 1 (train_fraction=1 in Python)"
+        )
     train = leading(lengths, cuts)
     return (train.nonzero()[:, 0], cuts), ((~train).nonzero()[:, 0], rest)
+
+
+def cut_of(length: int, fraction: float) -> int:
+    """How many of so many samples train: this fraction, or all where a part would have fewer than three."""
+    cut = round(fraction * length)
+    return cut if MIN_SAMPLES <= cut <= length - MIN_SAMPLES else length
+
+
+def trained_whole(lengths: Sequence[int], fraction: float) -> str:
+    """A warning of trajectories that are too short to be cut: nothing of them is held out; "" where there are none."""
+    whole = [b for b, length in enumerate(lengths) if cut_of(length, fraction) == length]
+    if fraction == 1 or len(whole) in (0, len(lengths)):
+        return ""
+    plural = "y is" if len(whole) == 1 else "ies are"
+    return (
+        f"warning: {len(whole)} of {len(lengths)} trajector{plural} too short to be cut at {fraction:g}, and nothing "
+        f"is held out there: the first, number {whole[0]} from 0, has {lengths[whole[0]]} samples"
+    )
 
 
 def leading(of: Sequence[int], lengths: Sequence[int]) -> Tensor:

@@ -71,10 +71,45 @@ def unwrap(
     trajectory: Tensor,  # (N,) long
     angles: Tensor,  # (n,) bool, the columns to make continuous
 ) -> Tensor:
-    """Remove the multiple of 2π from every jump longer than π; each trajectory keeps its first value."""
+    """Remove the multiple of 2π from every jump longer than π; each trajectory keeps its first value.
+
+    A sample between both ends of a jump, as a resampled or filtered angle has it, leaves two steps of less than π. Such
+    a turn is removed where the motion on either side of the sample says so. A sensor that wraps leaps by its range, or
+    by half of it twice: where no step is longer than a quarter of the range, all turns were counted.
+    """
     inside = (trajectory[1:] == trajectory[:-1])[:, None] & angles
+    inside &= _wraps(q, trajectory)[trajectory[1:]]
     turns = torch.zeros_like(q)
     turns[1:] = torch.where(inside, torch.round((q[1:] - q[:-1]) / (2 * torch.pi)), 0.0)
+    turns[1:] += torch.where(inside, _divided_turns(q - 2 * torch.pi * turns.cumsum(0), trajectory)[1:], 0.0)
     total = turns.cumsum(0)
     first = torch.searchsorted(trajectory, trajectory)  # row at which each row's trajectory starts
     return q - 2 * torch.pi * (total - total[first])
+
+
+def _wraps(q: Tensor, trajectory: Tensor) -> Tensor:
+    """Whether each trajectory has a step of a quarter of its range, (B, n)."""
+    rows = trajectory[:, None].expand_as(q)
+    empty = q.new_zeros(int(trajectory[-1]) + 1, q.shape[1])
+    high, low = (empty.scatter_reduce(0, rows, q, how, include_self=False) for how in ("amax", "amin"))
+    step = torch.where(rows[1:] == rows[:-1], q.diff(dim=0).abs(), 0.0)
+    return 4 * empty.scatter_reduce(0, rows[1:], step, "amax") >= high - low
+
+
+def _divided_turns(q: Tensor, trajectory: Tensor) -> Tensor:
+    """Turns that a step and the next one make together, (N, n), at the end of the second step.
+
+    Across one sample the motion goes as far as in the step before and the step behind; what it departs from that by is
+    whole turns. The steps on either side of these two agree, so that a wrong sample there is no turn.
+    """
+    turns, step = torch.zeros_like(q), q.diff(dim=0)
+    if len(q) < 7:
+        return turns
+    before, behind = step[:-5], step[5:]  # with the steps next to them: the motion on either side of five samples
+    near, far = step[1:-4], step[4:-1]
+    across = q[4:-2] - q[2:-4]
+    found = torch.round((across - near - far) / (2 * torch.pi))
+    smooth = torch.stack([near - before, behind - far, far - near, across - near - far - 2 * torch.pi * found]).abs()
+    one = (trajectory[6:] == trajectory[:-6])[:, None]
+    turns[4:-2] = torch.where(one & (smooth < torch.pi / 2).all(0), found, 0.0)
+    return turns

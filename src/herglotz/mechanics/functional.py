@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.func import vjp
 
-from herglotz.mechanics.partials import DiscreteLagrangian, Forced, Forces, Partials, checked
+from herglotz.mechanics.partials import DiscreteLagrangian, Forced, Forces, Partials, called, checked
 
 
 def functional_partials(
@@ -29,7 +29,7 @@ def functional_partials(
     xs, h = (q0, q1, s[..., 0]), steps[..., 0]
 
     def first(*x: Tensor) -> tuple[Tensor, Tensor]:
-        L, pull = cast(Any, vjp(lambda *x: checked(L_d, cast(Any, L_d)(*x, h), x[2]), *x))
+        L, pull = cast(Any, vjp(lambda q0, q1, s: checked(L_d, called(L_d, q0, q1, s, h), s), *x))
         D1, D2, D3 = pull(torch.ones_like(L))
         return torch.cat([D1, D2, D3[..., None]], -1), L
 

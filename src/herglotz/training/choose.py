@@ -186,7 +186,7 @@ def _outlier_reason(seen: Look) -> str:
     if seen.settings.robust != "auto":
         return f"robust '{seen.settings.robust}' was set"
     if lone:
-        return f"{lone} single spikes left out; there may be more"
+        return f"{lone} samples left out, as spikes or as readings of a sensor that stuck; there may be more"
     return "some samples pull the least-squares start" if seen.outliers else "no single samples stand out"
 
 

@@ -17,8 +17,10 @@ from herglotz.data.files import remove_leftovers
 from herglotz.data.holds import Arrival
 from herglotz.data.input_terms import with_input_terms
 from herglotz.data.lock import locked
+from herglotz.data.splits import trained_whole
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError, refuse
+from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
@@ -116,6 +118,8 @@ def fit(
     data = data if plan is None else with_input_terms(data, plan.input_terms)
     data = told_arrival(data, config, None if plan is None else Arrival(plan.hold, plan.delay, plan.lag))
     check_sizes(data.source or "data", data.q, data.names)
+    if short := trained_whole(data.lengths, config.train_fraction):
+        tell(f"{data.source or 'data'}: {short}")
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     with tensorboard_log(tensorboard) as log, nullcontext() if out is None else locked(out):
         if checkpoint is not None and is_first():  # only its process holds the lock

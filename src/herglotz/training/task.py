@@ -26,7 +26,7 @@ AS_SET = ("level", "seed", "activation", "mass_width", "action_width", "dissipat
 class Task:
     """The data of a fit, the first look at them, its settings, and the record of its stages."""
 
-    data: Trajectories  # what is fitted: the training part without single spikes
+    data: Trajectories  # what is fitted: the training part without spikes
     base: Baseline
     config: FitConfig
     stages: Stages

@@ -18,14 +18,18 @@ ROLES = {
     "supply_voltage[V]": "left aside", "MotorTemp[C]": "left aside", "loop[ms]": "left aside", "power[W]": "left aside",
     # What is wanted of a motion is an input.
     "q_cmd": "input", "thetaRef": "input", "Set Point [mm]": "input", "x_desired[m]": "input", "demand": "input",
+    "set_position": "input", "wanted angle": "input", "Sollwinkel": "input", "x_set[m]": "input", "set": "coordinate",
     "angle_sp[deg]": "input", "Sollwert[mm]": "input", "target_vel[m/s]": "input", "commanded_angle": "input",
     # Words without a unit.
     "motor_position": "coordinate", "ActPos": "coordinate", "left_motor": "input", "friction_torque": "input",
-    "Fx": "input", "throttle": "input", "iq": "input", "quality": "left aside", "position_std": "left aside",
+    "motor_encoder": "coordinate", "yaw": "coordinate", "Kraft": "input", "courant": "input", "fuerza": "input",
+    "coppia": "input", "Strom": "input", "Fx": "input", "throttle": "input", "iq": "input", "quality": "left aside",
+    "position_std": "left aside",
     # Rates and counters.
     "qd1": "left aside", "qdd": "left aside", "dq2": "left aside", "yvel": "left aside", "phi_vel": "left aside",
     "ddx": "left aside", "dphi/dt": "left aside", "wz": "left aside", "v2": "left aside", "a_x": "left aside",
-    "joint_speed": "left aside", "alphadot": "left aside", "dt": "left aside",
+    "joint_speed": "left aside", "yawrate": "left aside", "Geschwindigkeit": "left aside", "vitesse": "left aside",
+    "velocidad": "left aside", "Temperatur": "left aside", "alphadot": "left aside", "dt": "left aside",
     # No rates: there is no column ist or x, or the unit is that of a position.
     "dist": "coordinate", "dz[mm]": "coordinate", "v1[m]": "coordinate", "depth": "coordinate",
     "base_angle[rad]": "coordinate", "elbow_x": "coordinate",
@@ -49,6 +53,14 @@ def table(header, rows=8):
 def test_units_and_words_give_roles(cell):
     # fails if a first word decides against the unit, a set point is a second coordinate, or a rate is one
     assert assign(["t[s]", "theta[rad]", cell], "header").roles()[2][1] == ROLES[cell]
+
+
+def test_a_unit_without_a_space_before_it():
+    # fails if x(m) is a coordinate without a unit, v(m/s) a coordinate, or the brackets of a name hold a unit
+    found = assign(["t(s)", "x(m)", "v(m/s)", "F(N)", "x(1)"], "header")
+    assert found.names == ("t", "x", "v", "F", "x(1)")
+    assert found.units == ("s", "m", "m/s", "N", "")
+    assert [role for _, role, _ in found.roles()] == ["time", "coordinate", "left aside", "input", "coordinate"]
 
 
 def test_a_position_and_its_goal(tmp_path):  # fails if both are coordinates, or the position is left to be an input

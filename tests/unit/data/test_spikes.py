@@ -75,3 +75,28 @@ def test_a_short_fast_motion_is_none(width):
     t = torch.arange(300, dtype=torch.float64) * 0.05
     data = Trajectories.of(t, torch.sin(t) + torch.exp(-(((t - 7.01) / width) ** 2)))
     assert not spikes(data).any()
+
+
+def test_a_sensor_that_stuck_is_left_out():
+    # fails if 40 equal readings in the midst of a motion are a position, if the sample before or behind them goes, or
+    # if another trajectory is cut
+    t = torch.arange(300, dtype=torch.float64) * 0.02
+    q = torch.stack([torch.sin(4 * t), torch.cos(3 * t)], -1)
+    q[100:140, 0] = q[99, 0]
+    data = Trajectories.of(torch.cat([t, t]), torch.cat([torch.cos(2 * t)[:, None].expand(300, 2), q]), (300, 300))
+    assert spikes(data).nonzero()[:, 0].tolist() == list(range(400, 440))
+
+
+def test_what_stands_still_by_itself_is_no_error():
+    # fails if friction that holds, the dead band of a slow encoder, or a rest at the end of a recording is left out
+    t = torch.arange(400, dtype=torch.float64) * 0.02
+    held = torch.where(t < 3, torch.sin(t * torch.pi / 6), torch.where(t < 5, 1.0, torch.cos((t - 5) * torch.pi / 6)))
+    counts = (20 * torch.sin(0.5 * t)).round() / 20
+    rest = torch.where(t < 4, torch.sin(2 * t), torch.tensor(8.0, dtype=torch.float64).sin())
+    start = torch.where(t < 2, 1.0, torch.cos(2 * t))  # its first sample would be wrong, and has to stay
+    slips = t.clamp_max(0.1) + t // 0.3  # stick and slip, a slip between two samples
+    for q in (held, counts, rest, start, slips):
+        assert int(spikes(Trajectories.of(t, q[:, None])).sum()) == 0
+    later = torch.cat([t[:200], t[200:] + 50])  # it was moved while nothing was recorded
+    assert int(spikes(Trajectories.of(later, torch.where(t < 2, torch.sin(t), 0.9)[:, None])).sum()) == 0
+    assert int(spikes(Trajectories.of(later, torch.where(t < 3.8, 0.1 * t, 0.38 + 9 * (t > 3.99))[:, None])).sum()) == 0

@@ -170,15 +170,17 @@ def test_typical_step_and_gaps():  # fails if the mean is taken for the median
 def test_split_time():  # fails if the cut is not per trajectory, or a sample is lost or seen twice
     data = full().select([0, 2])  # 4 and 6 samples
     with pytest.raises(
-        InputError, match=r"set: fraction 0.5 cuts the 4 samples of trajectory 0 into 2 and 2, each part needs 3"
+        InputError, match=r"set: fraction 0.4 cuts the 6 samples of trajectory 1 into 2 and 4, each part needs 3"
     ):
-        data.split_time(0.5)
+        data.split_time(0.4)
+    train, test = data.split_time(0.5)
+    assert (train.lengths, test.lengths) == ((4, 3), (3,))  # one recording too short is no reason to refuse the others
+    assert torch.equal(test.q, data.q[7:])
     long = Trajectories.of(
         torch.arange(20.0).double(), torch.arange(20.0).double(), (8, 12), s=torch.arange(20).double()
     )
-    with pytest.raises(InputError, match=r"fraction 0.7 cuts the 8 samples of trajectory 0 into 6 and 2"):
-        long.split_time(0.7)
-    with pytest.raises(InputError, match=r"fraction 0.2 cuts the 8 samples of trajectory 0 into 2 and 6"):
+    assert long.split_time(0.7)[0].lengths == (8, 8)
+    with pytest.raises(InputError, match=r"fraction 0.2 cuts the 12 samples of trajectory 1 into 2 and 10"):
         long.split_time(0.2)
     train, test = long.split_time(0.6)
     assert (train.lengths, test.lengths) == ((5, 7), (3, 5))
@@ -317,3 +319,48 @@ def test_inputs_before_the_first_sample_that_is_kept_act_on_none():
     kept = data.keep(torch.tensor([False, True, False, True, True, False, True, True, True, True]))
     assert kept.u is not None
     assert kept.u.flatten().tolist() == [1.5, 3.0, 4.0, 6.0, 7.0, 8.0, 9.0]
+
+
+@pytest.mark.parametrize(("way", "every"), [(4, 1), (-4, 1), (17, 4)])
+@pytest.mark.parametrize("place", [0.05, 0.5, 0.95])
+def test_a_turn_between_two_steps_is_not_lost(way, every, place):
+    # fails if a sample between both ends of a jump, as resampling leaves one, makes two steps of less than π, and the
+    # turn is lost; if the turn is looked for across two recordings; or if a second pass counts it twice
+    t = torch.arange(200).double() * 0.1
+    true = way * t + 0.3 * torch.sin(2 * t)
+    q = torch.remainder(true + torch.pi, 2 * torch.pi) - torch.pi
+    jumps = (q.diff().abs() > torch.pi).nonzero()[:, 0]
+    wrong = jumps[(jumps > 3) & (jumps < 190)][
+        ::every
+    ]  # the last sample before each jump is somewhere between its neighbours
+    before, after = q[wrong - 1].clone(), q[wrong + 1].clone()
+    q[wrong] = before + place * (after - before)
+    data = Trajectories.of(torch.cat([t, t]), torch.cat([q, q]), (200, 200), angles=(True,), units=("rad",)).unwrapped()
+    good = torch.ones(200, dtype=torch.bool)
+    good[wrong] = False
+    assert len(wrong) >= 11
+    for own in data.q[:, 0].split(200):
+        assert torch.allclose(own[good] - own[0], true[good] - true[0], atol=1e-9)
+    assert torch.equal(data.unwrapped().q, data.q)
+
+
+def test_counted_turns_are_kept():
+    # fails if an angle of many turns, which moves by more than π a sample, is unwrapped, or stops another trajectory
+    t = torch.arange(100).double() * 0.1
+    q = torch.cat([40 * torch.cos(1.1 * t), torch.remainder(20 * t, 2 * torch.pi)])
+    data = Trajectories.of(torch.cat([t, t]), q, (100, 100), angles=(True,), units=("rad",)).unwrapped()
+    assert torch.equal(data.q[:100, 0], q[:100])
+    assert torch.allclose(data.q[100:, 0], 20 * t, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1.7, 2.4, 3.1, -3.1, 3.14159])
+@pytest.mark.parametrize("row", [3, 20, 56])
+def test_a_wrong_sample_is_no_turn(size, row):
+    # fails if a gross error beside a step is taken for a share of a turn, and all samples behind it move by 2π
+    t = torch.arange(60).double() * 0.1
+    q = 0.3 * torch.sin(2 * t)
+    wrong = q.clone()
+    wrong[row] += size
+    found = Trajectories.of(t, wrong, angles=(True,), units=("rad",)).unwrapped().q[:, 0]
+    good = torch.arange(60) != row
+    assert torch.allclose(found[good], q[good], atol=1e-12)

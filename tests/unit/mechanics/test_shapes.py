@@ -5,6 +5,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import partials
+from herglotz.mechanics.functional import functional_partials
 from herglotz.mechanics.partials import value
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
@@ -142,6 +143,7 @@ def test_an_L_d_of_three_arguments_is_told_what_to_take(L_d, name):
         lambda: Stepper(L_d).step(State(Q, P, S), 0.1),
         lambda: Stepper(L_d).velocity(State(Q, P, S), 0.1),
         lambda: value(L_d, Q, Q, S, 0.1),
+        lambda: functional_partials(L_d, Q, Q, S, S),
     ):
         with pytest.raises(InputError, match=rf"{name} must take four arguments, L_d\(q0, q1, s0, h\): .* 0 \* s0"):
             call()

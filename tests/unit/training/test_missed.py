@@ -1,0 +1,154 @@
+"""What the residual of a model that does not fit shows of the reason."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.data.rates import filled_inputs
+from herglotz.training.missed import FEW, reason_of
+from herglotz.training.verdict import Errors, in_words
+
+N, H, NOISE = 800, 0.1, 1e-3
+T = H * torch.arange(N, dtype=torch.float64)
+OWNER = torch.arange(N) // 20  # free runs of 20 samples
+MAKE = torch.Generator().manual_seed(0)
+Q = torch.sin(T) + 0.6 * torch.sin(math.sqrt(2.3) * T + 1)  # fills its states, time and again
+V = torch.gradient(Q, spacing=H)[0]
+
+
+def noisy(x=Q):
+    return x + NOISE * torch.randn(N, generator=MAKE, dtype=torch.float64)
+
+
+def left(force):
+    """The residual of free runs of 20 samples that lack a force (N,), from starts that are fitted."""
+    out = torch.zeros(N, dtype=torch.float64)
+    line = torch.stack([torch.ones(20).double(), torch.arange(20).double()], -1)
+    for rows in torch.arange(N).split(20):
+        moved = (force[rows].cumsum(0) * H).cumsum(0) * H
+        out[rows] = moved - line @ torch.linalg.lstsq(line, moved[:, None]).solution[:, 0]
+    return (out + NOISE * torch.randn(N, generator=MAKE, dtype=torch.float64))[:, None]
+
+
+def kicks():
+    """Eight steps of the velocity."""
+    force = torch.zeros(N, dtype=torch.float64)
+    force[30::100] = torch.tensor([1.0, -1.3, 0.8, 1.1, -0.9, 1.2, -1.0, 0.9])
+    return force
+
+
+FORCES = {
+    "a force of the position": (0.3 * Q**3, ""),
+    "a force of the position, near the noise": (0.016 * Q**3, ""),
+    "friction": (0.3 * torch.tanh(3 * V), ""),
+    "noise alone": (torch.zeros(N, dtype=torch.float64), ""),
+    "what nobody recorded": (0.2 * torch.sin(0.37 * T), "It misses differently where positions, velocities and inputs"),
+    "the past": (0.2 * Q.roll(40), "the force depends on the past"),
+    "kicks": (kicks(), "What is missed comes in kicks, the hardest at t = "),
+}
+
+
+@pytest.mark.parametrize("what", FORCES)
+def test_what_a_residual_shows(what):
+    # fails if a function of the state is said to be the past, or the other way round; if kicks are a memory; or if
+    # noise has a reason
+    force, said = FORCES[what]
+    for _ in range(4):
+        found = reason_of(Trajectories.of(T, noisy()[:, None]), left(force), OWNER)
+        assert (said in found) if said else found == "", found
+        assert ("Try " in found) is bool(said)
+
+
+def test_neighbours_are_of_other_times():
+    # fails if the samples before and behind, which lack the same as all that changes slowly does, are the neighbours
+    q = torch.sin(0.3 * T) + 0.6 * torch.sin(0.3 * math.sqrt(2.3) * T + 1)
+    data = Trajectories.of(T, (q + 1e-5 * torch.randn(N, generator=MAKE, dtype=torch.float64))[:, None])
+    assert "the force depends on the past" in reason_of(data, left(0.2 * torch.sin(0.37 * T)), OWNER)
+
+
+def test_the_hardest_kick_is_named():  # fails if the place is a row of the windows, or that of any other kick
+    data = Trajectories.of(torch.cat([T, T]), torch.cat([noisy(), noisy()])[:, None], (N, N))
+    owner = torch.cat([OWNER, OWNER + N])
+    found = reason_of(data, torch.cat([left(0 * T), left(3 * kicks())]), owner)
+    when = float(found.split("t = ")[1].split()[0])
+    assert abs(when - 13.0) <= 5 * H, found  # the second kick, at row 130
+    assert "of trajectory 1" in found
+
+
+def test_few_samples_show_nothing():  # fails if an empty table of neighbours raises
+    rows = FEW + 7
+    data = Trajectories.of(T[:rows], noisy()[:rows, None])
+    assert reason_of(data, left(0.3 * torch.sin(0.4 * T))[:rows], torch.zeros(rows)) == ""
+    short = Trajectories.of(T[:5], Q[:5, None])
+    assert reason_of(short, Q[:5, None], torch.zeros(5)) == ""
+
+
+def test_a_body_on_an_arm_is_told():
+    # fails if x and y of one angle lack a force, as the verdict says, and the hint stands above a page of other words
+    q = torch.stack([0.4 * Q.sin(), -0.4 * Q.cos()], -1) + 1e-4 * torch.randn(N, 2, generator=MAKE, dtype=torch.float64)
+    found = reason_of(Trajectories.of(T, q, names=("x", "y"), units=("m", "m")), left(0 * T).expand(N, 2), OWNER)
+    assert found.startswith("x, y stay on a circle about ")
+    assert "--polar x,y" in found
+
+
+def test_neighbours_that_are_far_tell_nothing():
+    # fails if the states of eight coordinates, none of which comes twice, are taken for alike
+    speeds = torch.linspace(0.5, 2.1, 8, dtype=torch.float64).sqrt()
+    q = torch.sin(T[:, None] * speeds) + NOISE * torch.randn(N, 8, generator=MAKE, dtype=torch.float64)
+    assert reason_of(Trajectories.of(T, q), left(0.3 * Q).expand(N, 8), OWNER) == ""
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ([2, 3, 3], True),
+        ([1, 2], True),
+        ([3], False),
+        ([40, 55, 70], False),
+        ([40, 55], False),
+        ([1], False),
+        ([2] * 40 + [3], False),
+    ],
+)
+def test_inputs_that_were_filled_in(rows, told):
+    # fails if a controller that runs at a third of the rate is told of, set points that come at any time are, or a
+    # clock of its own is not
+    lengths = torch.tensor(rows * (4000 // sum(rows)))[:400]
+    levels = torch.randn(len(lengths), generator=MAKE, dtype=torch.float64)
+    u = levels.repeat_interleave(lengths)
+    t = H * torch.arange(len(u), dtype=torch.float64)
+    data = Trajectories.of(t, torch.sin(t)[:, None], u=torch.stack([torch.cos(t), u], -1))
+    assert filled_inputs(data) == (["u2"] if told else [])
+    found = reason_of(data, 1e-9 * torch.sin(t)[:, None], torch.zeros(len(t)))
+    assert (
+        found.startswith("The input u2 was recorded more slowly than the motion and filled in, and its steps act")
+        is told
+    )
+
+
+def test_recordings_of_a_slow_input_begin_anywhere():
+    # fails if rows are counted from the last step of one recording to the first of the next
+    u = torch.randn(14, generator=MAKE, dtype=torch.float64).repeat_interleave(3)[:19].repeat(30)
+    t = H * torch.arange(19, dtype=torch.float64).repeat(30)
+    assert filled_inputs(Trajectories.of(t, torch.sin(t)[:, None], (19,) * 30, u=u[:, None])) == []
+
+
+@pytest.mark.parametrize(
+    ("errors", "told"),
+    [
+        ({"windows": 0.05, "free": 1.2}, True),
+        ({"windows": 0.5}, True),
+        ({"windows": 0.012, "free": 1.2}, False),  # the training part is met: it is the other part that differs
+    ],
+)
+def test_a_verdict_gives_the_reason(errors, told):
+    # fails if a misfit of the training data is blamed on the unseen part, or a reason is looked for where none is asked
+    all_errors: Any = {"windows": 0.01, "unseen": 0.01, "free": 0.01, "noise": 0.01, "spread": 1.0} | errors
+    metrics = {"follows_data": True, "objective": "trajectory"}
+    text = in_words(Errors(**all_errors), None, metrics, lambda: "It is late. Try earlier")
+    assert text.endswith("It is late. Try earlier") is told
+    assert ("the unseen part differs from the training part" in text) is not told
+    assert ("A force is missing. Try " in in_words(Errors(**all_errors), None, metrics)) is told
