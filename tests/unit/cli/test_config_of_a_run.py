@@ -57,7 +57,7 @@ READ = ("--time", "clock", "--coordinates", "x", "--inputs", "drive", "--every",
 def driven(tmp_path_factory):
     """A driven recording whose columns have to be told: `driven.csv`, and the run `told` of it."""
     folder = tmp_path_factory.mktemp("driven")
-    data = simulate(scene("driven_duffing"), trajectories=1, steps=120, h=0.1, noise=0.001, gaps=0, seed=3)
+    data = simulate(scene("driven_duffing"), trajectories=1, steps=60, h=0.1, noise=0.001, gaps=0, seed=3)
     assert data.u is not None
     columns = zip(data.t.tolist(), data.q[:, 0].tolist(), data.u[:, 0].tolist(), strict=True)
     rows = "".join(f"{t!r},{x!r},{u!r},{k}\n" for k, (t, x, u) in enumerate(columns))
@@ -93,7 +93,7 @@ def test_flags_stand_over_what_was_read(driven):  # fails if a flag beside --con
     assert main(["fit", file, "--out", str(driven / "other"), "--no-plots", "--config", told, *more]) in (0, 3)
     run = load_run(driven / "other")
     assert run.data.u is None
-    assert run.data.samples == 41
+    assert run.data.samples == 21
     assert run.reading["every"] == 3
 
 
