@@ -18,7 +18,7 @@ from herglotz.training.stages import Stages
 H = 0.04
 
 
-def driven(force, u, steps=8, samples=150, noise=2e-4, seed=0):
+def driven(force, u, steps=8, samples=220, noise=2e-4, seed=0):
     """A damped spring x″ = −20 x − x′ + force(u, u′), integrated finely, with noise."""
     make = np.random.default_rng(seed)
     t, h = np.arange(samples) * H, H / steps
