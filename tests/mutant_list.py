@@ -189,7 +189,8 @@ MUTANTS = [
     ("cli/verify.py", 'result["status"] == 0 and', ""),
     ("data/spikes.py", "torch.maximum(LOCAL * local, NOISE * noise)", "NOISE * noise"),
     ("export/runtime/step.h", "if (hz_fabs(FN_LANE(A->lu[i][k], 0)) > hz_fabs", "if (hz_fabs(FN_LANE(A->lu[i][k], 0)) < hz_fabs"),
-    ("export/runtime/api.h", "!hz_all_finite(q0) || hz_BAD_U(u)) return", "!hz_all_finite(q0)) return"),
+    ("export/runtime/api.h", "hz_before(&next, h) || hz_BAD_U(u)) return", "hz_before(&next, h)) return"),
+    ("export/runtime/api.h", "P->s0 = before->s;", "P->s0 = after->s;"),
     # issue of theory: symmetries, translations and explicit time
     ("theory/symmetries.py", 'for k in range(1, steps):', 'for k in range(2, steps):'),
     ("theory/symmetries.py", 'rows.append(P.c[:, k, None] * rows[-1] + step[:, k])', 'rows.append(rows[-1] + step[:, k])'),

@@ -116,38 +116,42 @@ def _narrower(a: Gate, b: Gate) -> Gate:
 def _gates(program: Program, numbers: list[int], wanted: Mapping[int, Gate]) -> dict[int, Gate]:
     """The gate of every statement: without it the statement is 0, or nothing needs it."""
     operations = {ref.statement: key for ref, key in program.operations.items()}
-    vanishing: dict[int, Gate] = {}
+    vanishing = _vanishing(program, numbers, operations)
+    read: dict[int, Gate] = dict(wanted)
+    gate: dict[int, Gate] = {}
+    for i in reversed(numbers):
+        gate[i] = _narrower(vanishing.get(i), read[i]) if i in operations else None
+        for j in program.statements[i].reads:
+            read[j] = _either(read.get(j, frozenset()), gate[i])
+    plain = {i for i in numbers if operations.get(i, ("",))[0] in PLAIN}
+    worth: Counter[Gate] = Counter()
+    for i in numbers:
+        worth[gate[i]] += 1 if i in plain else WORTH_A_BRANCH
+    return {i: None if i in plain and worth[x] < WORTH_A_BRANCH else x for i, x in gate.items()}
+
+
+def _vanishing(program: Program, numbers: list[int], operations: Mapping[int, tuple]) -> dict[int, Gate]:
+    """The parameters without which a number is 0, of every operation on single numbers."""
+    found: dict[int, Gate] = {}
 
     def zero(atom: object) -> Gate:
-        """The parameters without which a number is 0."""
         if not isinstance(atom, Ref):
             return None
         is_parameter = program.statements[atom.statement].name == "theta"
-        return frozenset([atom.index]) if is_parameter else vanishing.get(atom.statement)
+        return frozenset([atom.index]) if is_parameter else found.get(atom.statement)
 
     for i in numbers:
         form, *atoms = operations.get(i, ("",))
         parts = [zero(atom) for atom in atoms]
         if form == "{0} * {1}":
-            vanishing[i] = _narrower(*parts)
+            found[i] = _narrower(*parts)
         elif form in ("-{0}", "{0} / {1}"):
-            vanishing[i] = parts[0]
+            found[i] = parts[0]
         elif form in SUMS:  # makes no gate of its own
-            parts = [parts[0], _narrower(*parts[1:]) if len(parts) > 2 else parts[1]]
-            both = _either(*parts)
-            vanishing[i] = both if both in parts else None
-    read: dict[int, Gate] = dict(wanted)
-    gate: dict[int, Gate] = {}
-    for i in reversed(numbers):
-        single = i in operations
-        gate[i] = _narrower(vanishing.get(i), read[i]) if single else None
-        for j in program.statements[i].reads:
-            read[j] = _either(read.get(j, frozenset()), gate[i])
-    worth: Counter[Gate] = Counter()
-    plain = {i for i in numbers if operations.get(i, ("",))[0] in PLAIN}
-    for i in numbers:
-        worth[gate[i]] += 1 if i in plain else WORTH_A_BRANCH
-    return {i: None if i in plain and worth[x] < WORTH_A_BRANCH else x for i, x in gate.items()}
+            second = _narrower(*parts[1:]) if len(parts) > 2 else parts[1]
+            both = _either(parts[0], second)
+            found[i] = both if both in (parts[0], second) else None
+    return found
 
 
 def _statements(
@@ -155,31 +159,32 @@ def _statements(
 ) -> Iterator[str]:
     """Declarations of what is read outside of its block, and the blocks, each behind its gate."""
     blocks = list(_blocks(program, numbers, gate))
-    block = {i: at for at, (_, own) in enumerate(blocks) for i in own}
-    shared = {i for i in numbers if gate[i] is not None and i in wanted}
-    zeros = {i for i in shared if not _covers(gate[i], wanted[i])}
-    for i in numbers:
-        for j in program.statements[i].reads:
-            if j in block and gate[j] is not None and block[j] != block[i]:
-                shared.add(j)
-                if not _covers(gate[j], gate[i]):
-                    zeros.add(j)
+    outside = [(i, x) for i, x in _read_outside(program, blocks, gate, wanted) if gate[i] is not None]
+    shared = {i for i, _ in outside}
+    zeros = {i for i, reader in outside if not _covers(gate[i], reader)}
     for i in numbers:
         if size := program.statements[i].size:
             yield f"  REAL @{i}[{size}];"
         elif i in shared:
             yield f"  REAL @{i}{' = 0' if i in zeros else ''};"
     for own, statements in blocks:
-        lines = [
-            text.removeprefix("const REAL ") if i in shared else text
-            for i, text in ((i, program.statements[i].text) for i in statements)
-        ]
-        if own is None:
-            yield from (f"  {line}" for line in lines)
-        else:
-            yield f"  if ({prepared.flag(own)}) {{"
-            yield from (f"    {line}" for line in lines)
-            yield "  }"
+        lines = [program.statements[i].text.removeprefix("const REAL " if i in shared else "") for i in statements]
+        yield from [f"  {line}" for line in lines] if own is None else _behind(prepared.flag(own), lines)
+
+
+def _behind(flag: str, lines: list[str]) -> list[str]:
+    return [f"  if ({flag}) {{", *(f"    {line}" for line in lines), "  }"]
+
+
+def _read_outside(
+    program: Program, blocks: list[tuple[Gate, list[int]]], gate: Mapping[int, Gate], wanted: Mapping[int, Gate]
+) -> Iterator[tuple[int, Gate]]:
+    """The numbers that outputs or other blocks read, each with the gate of its reader."""
+    block = {i: at for at, (_, own) in enumerate(blocks) for i in own}
+    for i, at in block.items():
+        if i in wanted:
+            yield i, wanted[i]
+        yield from ((j, gate[i]) for j in program.statements[i].reads if block.get(j, at) != at)
 
 
 def _covers(outer: Gate, inner: Gate) -> bool:

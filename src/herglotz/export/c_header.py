@@ -132,16 +132,9 @@ def export_c(
 
     Parameters
     ----------
-    model
-        Not changed.
-    path
-        The header to write, atomically; the name should end in `.h`.
-    h
-        Typical step of the model, in the data's time unit: recorded, not imposed.
-    box
-        Where the model was fitted, as in `export_pt2`; states outside it are flagged in the status.
-    units
-        Unit of each coordinate.
+    model, path, h, box, units, metadata
+        As of `export_pt2`. The name of the file should end in `.h`; states outside the box are flagged in the status,
+        and metadata stand in the comment at the top.
     name
         Prefix of every name in the file, a C identifier; default that of the file. Headers of different prefixes can
         be included in one program.
@@ -159,8 +152,6 @@ def export_c(
         the defaults.
     extras
         What else the header holds: "adjoint" (`NAME_step_vjp`, `NAME_rollout_vjp`), "filter" (`NAME_filter_…`).
-    metadata
-        Further JSON-ready entries for the comment at the top.
 
     Returns
     -------

@@ -27,24 +27,9 @@ def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None 
 
     Parameters
     ----------
-    model
-        Not changed.
-    path
-        The file to write, atomically; the name should end in `.c`.
-    name
-        Prefix of every name in the file, a C identifier; default that of the file.
-    settings
-        h, box, units, dtype, h_range, tolerance and metadata, as of `export_c`.
-
-    Returns
-    -------
-    Path
-        The file written.
-
-    Raises
-    ------
-    InputError
-        As `export_c`.
+    model, path, name, settings
+        As of `export_c`, without parameters and extras; the name of the file should end in `.c`. What is returned and
+        raised is as there.
     """
     functions = [
         runtime("casadi_function.c").replace("NAME_FN", f"NAME_{function}").replace("FN_STEPS(h)", steps)
@@ -62,11 +47,6 @@ def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None 
     ----------
     model, path, name, settings
         As of `export_casadi`; h is the shooting interval.
-
-    Returns
-    -------
-    Path
-        The file written.
 
     Raises
     ------

@@ -104,21 +104,15 @@ def filter(
         raise InputError(f"{', '.join(chosen)} stand for several numbers of the model; name each of them")
     std = torch.tensor([first for first, _ in chosen.values()], dtype=torch.float64)
     beliefs, surprises, steps = [], [], []
+    _check_lengths(data, lag)
     for first, length in zip(data.offsets, data.lengths, strict=True):
-        if length < 2:
-            raise InputError(f"{data.source or 'data'}: a trajectory has {length} sample; a filter starts at two")
-        if not 0 <= lag < length:
-            raise InputError(f"lag must be 0 to {length - 1}, as a trajectory has {length} samples, got {lag}")
         belief, surprise = _started(kalman, data, first, std), math.nan
         for row in range(first, first + length):
             h = float(data.t[row] - data.t[row - 1]) if row > first else float(data.t[row + 1] - data.t[row])
             if row > first:
-                parts = max(1, math.ceil(h / run.h_range[1] - 1e-6))
                 belief = kalman.remember(belief, lag) if lag else belief
-                for k in range(parts):
-                    part = torch.tensor((k + 0.5) / parts, dtype=torch.float64)
-                    belief = kalman.predict(belief, h / parts, _input(model, data, row - 1, part))
-                belief, surprise = kalman.update(belief, data.q[row])
+                before = _carried(kalman, model, data, belief, row, h, run.h_range[1])
+                belief, surprise = kalman.update(before, data.q[row])
             beliefs.append(kalman.smoothed(belief, 0))
             # The sample that waits no longer; all of them at the end.
             for back in range(1, lag + 1) if row + 1 == first + length else [lag] * (lag <= row - first):
@@ -126,6 +120,25 @@ def filter(
             surprises.append(surprise)
             steps.append(min(h, run.h_range[1]))
     return _told(kalman, model, data, beliefs, surprises, steps)
+
+
+def _check_lengths(data: Trajectories, lag: int) -> None:
+    shortest = min(data.lengths)
+    if shortest < 2:
+        raise InputError(f"{data.source or 'data'}: a trajectory has {shortest} sample; a filter starts at two")
+    if not 0 <= lag < shortest:
+        raise InputError(f"lag must be 0 to {shortest - 1}, as a trajectory has {shortest} samples, got {lag}")
+
+
+def _carried(
+    kalman: KalmanFilter, model: ContactLagrangian, data: Trajectories, belief: Belief, row: int, h: float, most: float
+) -> Belief:
+    """What is known at a row before its sample, by as few equal steps as are no longer than `most`."""
+    parts = max(1, math.ceil(h / most - 1e-6))
+    for k in range(parts):
+        part = torch.tensor((k + 0.5) / parts, dtype=torch.float64)
+        belief = kalman.predict(belief, h / parts, _input(model, data, row - 1, part))
+    return belief
 
 
 def _compiled(model: ContactLagrangian, names: list[str]) -> ExportedStepper | None:

@@ -46,22 +46,11 @@ def export_fmu(
 
     Parameters
     ----------
-    model
-        Not changed.
-    path
-        The file to write, atomically; the name should end in `.fmu`.
-    name
-        The model's identifier, a C identifier; default that of the file.
+    model, path, name, settings
+        As of `export_casadi`; the name of the file should end in `.fmu`, and `name` is the model's identifier. Of the
+        metadata, names, columns, start and time_unit name the variables, their starts and units.
     version
         "3.0" or "2.0", of FMI.
-    settings
-        h, box, units, dtype, h_range, tolerance and metadata, as of `export_c`. Of the metadata, names, columns, start
-        and time_unit name the variables, their starts and units.
-
-    Returns
-    -------
-    Path
-        The file written.
 
     Raises
     ------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,14 @@ IN_C: dict[str, Callable[..., Path]] = {
     "fmu2": partial(export_fmu, version="2.0"),
 }
 WRITERS = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx} | IN_C
+# What only some kinds take: these kinds, and words for the refusal.
+OF_KINDS: dict[str, tuple[Collection[str], str]] = {
+    "name": (IN_C, "a prefix (name) is of C headers only"),
+    "dtype": (IN_C, "dtype is of C headers only"),
+    "parameters": (("c",), "parameters are of C headers only"),
+    "extras": (("c",), "extras are of C headers only"),
+    "unroll": (("onnx",), "unroll is of ONNX only"),
+}
 KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c", ".c": "casadi", ".fmu": "fmu"}  # of a file, by the end of its name
 
 
@@ -80,15 +88,10 @@ def export_run(
     kind = kind or KINDS.get(path.suffix.lower())
     if kind not in WRITERS:
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
-    refuse({
-        f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out":
-            name is not None and kind not in IN_C,
-        f"{path}: dtype {dtype} is of C headers only, not of {kind}; leave it out":
-            dtype is not None and kind not in IN_C,
-        f"{path}: parameters and extras are of C headers only, not of {kind}; leave them out":
-            (parameters or extras) and kind != "c",
-        f"{path}: unroll is of ONNX only, not of {kind}; leave it out": unroll is not None and kind != "onnx",
-    })  # fmt: skip
+    given = {"name": name, "dtype": dtype, "parameters": parameters, "extras": list(extras), "unroll": unroll}
+    asked = {key: value for key, value in given.items() if value not in (None, (), [], {})}
+    refuse({f"{path}: {words}, not of {kind}; leave it out": key in asked and kind not in kinds
+            for key, (kinds, words) in OF_KINDS.items()})  # fmt: skip
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or _steps(run)]
     metadata = {
@@ -99,16 +102,13 @@ def export_run(
         "metrics": run.metrics,
         "card": model_card(run, (span[0], span[-1])),
         "h_range": span,
-        **({"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]} if run.model.inputs else {}),
-        **_input_range(run),
+        **_of_inputs(run),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and kind in IN_C and dtype in (None, run.setting["dtype"]):
+        # A tolerance of tune is one of its own dtype.
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
-    elif dtype is not None:  # a tolerance of tune is one of its own dtype
-        described["dtype"] = dtype
-    asked = {"name": name, "parameters": parameters, "extras": list(extras), "unroll": unroll}
-    described |= {key: value for key, value in asked.items() if value not in (None, (), [], {})}
+    described |= asked
     if "filter" in extras:
         still = (0.0,) * len(described_parameters(run.model, parameters))
         metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}
@@ -116,13 +116,16 @@ def export_run(
     return path
 
 
-def _input_range(run: Run) -> dict[str, list[float]]:
-    """Lowest and highest inputs of the training part; nothing where none were recorded."""
-    if run.data.u is None or not run.model.inputs:
+def _of_inputs(run: Run) -> dict[str, Any]:
+    """How inputs are read and, where they were recorded, the lowest and highest of the training part."""
+    if not run.model.inputs:
         return {}
-    parts = zip(run.data.u.split(run.data.lengths), run.train_lengths, strict=True)
-    fitted = torch.cat([u[:count] for u, count in parts])
-    return {"input_low": fitted.amin(0).tolist(), "input_high": fitted.amax(0).tolist()}
+    found: dict[str, Any] = {"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]}
+    if run.data.u is not None:
+        parts = zip(run.data.u.split(run.data.lengths), run.train_lengths, strict=True)
+        fitted = torch.cat([u[:count] for u, count in parts])
+        found |= {"input_low": fitted.amin(0).tolist(), "input_high": fitted.amax(0).tolist()}
+    return found
 
 
 def _steps(run: Run) -> tuple[float, float]:

@@ -28,9 +28,16 @@ def tiny_run(tiny_csv, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def exported_pt2(tiny_run, tmp_path_factory) -> tuple[Path, dict]:
-    """The run as an exported file, and what `export --json` said; treat the file as read-only."""
-    path, said = tmp_path_factory.mktemp("cli_pt2") / "tiny.pt2", StringIO()
+def exported(tiny_run, tmp_path_factory) -> tuple[Path, dict]:
+    """The run as an ONNX file, the quickest to write and to read, and what `export --json` said; read-only."""
+    pytest.importorskip("onnxruntime")
+    path, said = tmp_path_factory.mktemp("cli_onnx") / "tiny.onnx", StringIO()
     with redirect_stdout(said):
         assert main(["export", str(tiny_run), "--out", str(path), "--json"]) == 0
     return path, json.loads(said.getvalue())
+
+
+@pytest.fixture(scope="session")
+def tiny_onnx(exported) -> Path:
+    """The ONNX file; treat it as read-only."""
+    return exported[0]

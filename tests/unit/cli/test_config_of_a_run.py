@@ -57,13 +57,13 @@ READ = ("--time", "clock", "--coordinates", "x", "--inputs", "drive", "--every",
 def driven(tmp_path_factory):
     """A driven recording whose columns have to be told: `driven.csv`, and the run `told` of it."""
     folder = tmp_path_factory.mktemp("driven")
-    data = simulate(scene("driven_duffing"), trajectories=1, steps=120, h=0.1, noise=0.001, gaps=0, seed=3)
+    data = simulate(scene("driven_duffing"), trajectories=1, steps=60, h=0.1, noise=0.001, gaps=0, seed=3)
     assert data.u is not None
     columns = zip(data.t.tolist(), data.q[:, 0].tolist(), data.u[:, 0].tolist(), strict=True)
     rows = "".join(f"{t!r},{x!r},{u!r},{k}\n" for k, (t, x, u) in enumerate(columns))
     (folder / "driven.csv").write_text("clock,x,drive,ticks\n" + rows)
-    # How the data are read is the question here.
-    short = ["--level", "forced", "--iterations", "5", "--objective", "residual"]
+    # How the data are read is the question here: a fit without networks is the quickest.
+    short = ["--level", "forced", "--iterations", "5", "--objective", "residual", "--order", "4"]
     assert main(["fit", str(folder / "driven.csv"), "--out", str(folder / "told"), "--no-plots", *READ, *short]) in (
         0,
         3,
@@ -93,14 +93,14 @@ def test_flags_stand_over_what_was_read(driven):  # fails if a flag beside --con
     assert main(["fit", file, "--out", str(driven / "other"), "--no-plots", "--config", told, *more]) in (0, 3)
     run = load_run(driven / "other")
     assert run.data.u is None
-    assert run.data.samples == 41
+    assert run.data.samples == 21
     assert run.reading["every"] == 3
 
 
 def test_python_remembers_how_data_were_read(driven, tmp_path):
     # fails if a run of `hz.fit(path, time=...)` cannot be repeated by --config, or arrays end up in config.json
     file = driven / "driven.csv"
-    few = FitConfig(iterations=5, objective="residual")
+    few = FitConfig(iterations=5, objective="residual", order=4)
     run = fit(file, few, time="clock", coordinates="x", inputs=("drive",))
     assert run.reading == {"time": "clock", "coordinates": "x", "inputs": ["drive"]}
     save_run(run, tmp_path / "run")
@@ -114,7 +114,7 @@ def test_angles_and_sensors_are_remembered(driven, tmp_path, told, named):
     # fails if --config reads an angle as a length because Python said angles=True, or an array of zeros is forgotten
     sensors = {"sensor_zeros": np.array([0.25]), "sensor_scales": 2}
     columns = {"time": "clock", "coordinates": np.array(["x"]), "inputs": "drive"}
-    run = fit(driven / "driven.csv", angles=told, iterations=5, objective="residual", **columns, **sensors)
+    run = fit(driven / "driven.csv", angles=told, iterations=5, objective="residual", order=4, **columns, **sensors)
     assert run.reading == {"angles": named, "time": "clock", "coordinates": ["x"], "inputs": "drive",
                            "sensor_zeros": [0.25], "sensor_scales": [2.0]}  # fmt: skip
     save_run(run, tmp_path / "run")
@@ -128,7 +128,7 @@ def test_angles_and_sensors_are_remembered(driven, tmp_path, told, named):
 
 def test_a_selected_run_remembers_too(driven):  # fails if hz.select forgets how its data were read
     told = {"time": "clock", "coordinates": "x", "inputs": (), "drop": "ticks", "angles": True}
-    few = FitConfig(iterations=5, objective="residual")
+    few = FitConfig(iterations=5, objective="residual", order=4)
     found = select(driven / "driven.csv", ["conservative"], 1, few, progress=False, **told)
     assert found.run.reading == {**told, "inputs": [], "angles": ["x"]}
 

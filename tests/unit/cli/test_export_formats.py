@@ -26,16 +26,9 @@ from herglotz.training import load_run, save_run
 pytest.importorskip("onnxruntime")
 
 
-@pytest.fixture(scope="module")
-def tiny_onnx(tiny_run, tmp_path_factory):
-    path = tmp_path_factory.mktemp("cli_onnx") / "tiny.onnx"
-    assert main(["export", str(tiny_run), "--format", "onnx", "--out", str(path)]) == 0
-    return path
-
-
 def test_verify_and_compare_with_the_run(tiny_onnx, tiny_run, monkeypatch, capsys):
     # fails if the file is not differentiated by differences, or --against is not part of the verdict
-    # (60 steps; test_verify_finds_the_run takes as many as the command does)
+    # (60 steps; test_verify_finds_the_run takes as many as the command does, of fewer motions)
     monkeypatch.setattr("herglotz.export.compare", partial(compare, steps=60))
     capsys.readouterr()
     arguments = ["verify", str(tiny_onnx), "--samples", "8", "--steps", "3", "--against", str(tiny_run), "--json"]
@@ -160,6 +153,7 @@ def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys
     # fails if a file is not compared with its model unless it is named, a run of other weights is taken for it, or the
     # user is not told
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("herglotz.export.compare", partial(compare, batches=(1, 7)))
     few = ["verify", str(tiny_onnx), "--samples", "4", "--steps", "2"]
     other = load_run(tiny_run)
     other.model.load_state_dict({key: 2 * value for key, value in other.model.state_dict().items()})

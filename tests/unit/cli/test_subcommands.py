@@ -199,22 +199,11 @@ def test_rollout_goes_on_where_training_ended(tiny_run, tmp_path, capsys):
     assert (tmp_path / "a.csv").read_text().startswith("trajectory,t[s],theta[rad],theta_dot[rad/s]\n")
 
 
-def test_rollout_of_a_file_is_that_of_the_run(tiny_run, exported_pt2, tmp_path):
-    # fails if export loses start, h or names
-    for name, source in (("a.npz", tiny_run), ("b.npz", exported_pt2[0])):
-        assert main(["rollout", str(source), "--steps", "5", "--out", str(tmp_path / name)]) == 0
-    one, two = load(tmp_path / "a.npz"), load(tmp_path / "b.npz")
-    torch.testing.assert_close(one.q, two.q, rtol=0, atol=1e-12)
-    assert (one.names, one.units, one.angles, one.time_unit) == (two.names, two.units, two.angles, two.time_unit)
-
-
-@pytest.mark.parametrize("kind", ["run", "file"])
-def test_rollout_from_given_state(kind, tiny_run, tmp_path):  # fails if -1e-1 is taken for an option, or h is ignored
-    source, h = str(tiny_run), 0.05
-    if kind == "file":  # which takes the steps of its data; ONNX is the quickest to write and to read
-        pytest.importorskip("onnxruntime")
-        source, h = str(tmp_path / "a.onnx"), 0.2
-        assert main(["export", str(tiny_run), "--format", "onnx", "--out", source]) == 0
+# A file takes the steps of its data.
+@pytest.mark.parametrize(("kind", "h"), [("tiny_run", 0.05), ("tiny_onnx", 0.2)])
+def test_rollout_from_given_state(kind, h, request, tmp_path):
+    # fails if -1e-1 is taken for an option, or h is ignored
+    source = str(request.getfixturevalue(kind))
     state = ["--q0", "-1e-1", "--p0", "0.5", "--s0", "0.25", "--h", str(h), "--momenta"]
     assert main(["rollout", source, "--steps", "3", *state, "--out", str(tmp_path / "a.csv")]) == 0
     motion = load(tmp_path / "a.csv")
@@ -230,9 +219,9 @@ def test_rollout_from_given_state(kind, tiny_run, tmp_path):  # fails if -1e-1 i
     assert float(motion.v[0]) == pytest.approx(0.5, rel=1e-12)
 
 
-def test_export(exported_pt2):
+def test_export(exported):
     # fails if the report lacks the box or the names (that the file loads without herglotz: test_pt2.py)
-    _, report = exported_pt2
+    _, report = exported
     assert report["metadata"]["names"] == ["theta"]
     assert report["metadata"]["box"] is not None
 

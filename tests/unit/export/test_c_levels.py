@@ -28,8 +28,10 @@ CASES: dict[str, dict[str, Any]] = {
     "dry": {"level": "forced", "coulomb": True, "correction_width": 4},
     "viscous, motors": {"level": "forced", "inputs": 2},
     "full": {"level": "full", "action_width": 3},
-    "full, correction": {"level": "full", "correction_width": 4, "activation": "silu", "mass_width": 3},
-    "powers of s": {"level": "full", "dissipation": ("s^2", "s^3")},
+    "full, correction": {
+        "level": "full", "correction_width": 3, "activation": "silu", "mass_width": 2, "potential_width": 2,
+        "damping_width": 2, "action_width": 2,
+    },
     "powers of s, motors": {"level": "forced", "dissipation": ("s^3",), "coupled": True, "coulomb": True, "inputs": 2},
     "mass": {"level": "linear", "mass_width": 4, "activation": "softplus"},
     "motors": {"level": "forced", "coulomb": True, "inputs": 3},

@@ -41,13 +41,11 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "forced", "order": 4, "alike": True, "features": ("cos(q1)", "sin(q1) v1^2"),
         "drag": ("|v1| v1", "load 1"), "coulomb": True, "inputs": 1,
     }),
-    "powers": ("l", {
-        "level": "forced", "alike": True, "features": ("q1", *(f"q1^{k}" for k in range(2, 7))),
-        "drag": ("|v1| v1", "q1 v1", "q1^2 v1"),
-    }),
-    "functions": ("l", {
-        "level": "forced", "alike": True, "drag": ("sin(0.7 q1) v1", "cos(1.4 q1) v1"),
-        "features": ("q1^2", "sin(1.3 q1 + 0.4)", "cos(2.6 q1 - 1) v1^2", "cos(q1 + 1) - cos(2 q1 - 0.5)"),
+    "powers and functions": ("l", {
+        "level": "forced", "alike": True,
+        "drag": ("|v1| v1", "q1 v1", "q1^2 v1", "sin(0.7 q1) v1", "cos(1.4 q1) v1"),
+        "features": ("q1", *(f"q1^{k}" for k in range(2, 7)), "sin(1.3 q1 + 0.4)", "cos(2.6 q1 - 1) v1^2",
+                     "cos(q1 + 1) - cos(2 q1 - 0.5)"),
     }),
     "one bent spring": ("l", {"alike": True, "order": 4, "features": ("|q1|^3",)}),
     "bent springs that stick": ("l", {
@@ -57,8 +55,8 @@ CASES: dict[str, tuple[str, Setting]] = {
     "double pendulum": ("aa", {"order": 4, "features": ("cos(q1 - q2) v1 v2",)}),
     "joints": ("aa", {"level": "forced", "coupled": True, "coulomb": True, "features": ("revolute",)}),
     "cart and pole": ("la", {
-        "level": "forced", "diagonal": True, "features": ("cos(q2) v1 v2", "q1^3", "sin(q2) v1^2"),
-        "inputs": 1, "input_map": (1.0, 0.0), "drag": ("load 2", "|v2| v2"),
+        "level": "forced", "diagonal": True, "features": ("cos(q2) v1 v2", "q1^3", "sin(q2) v1^2"), "coulomb": True,
+        "inputs": 1, "input_map": (1.0, 0.0), "drag": ("load 2", "|v2| v2", "q1 sgn(v2)", "sin(q2) sgn(v1)"),
     }),
     "lengths": ("ll", {
         "level": "forced", "diagonal": True, "coulomb": True, "sticking": True, "features": ("lengths", "q1 v1^2 v2"),
@@ -71,10 +69,8 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "forced", "coulomb": True, "sticking": True, "coupled": True, "features": ("q2^4",),
         "drag": ("q2^2 sgn(v2)", "cos(q1) sgn(v1)", "v2^3"), "inputs": 1,
     }),
-    "dry by position": ("al", {"level": "forced", "coulomb": True, "drag": ("q2 sgn(v1)", "sin(q1) sgn(v2)")}),
-    "motors": ("al", {"level": "forced", "inputs": 3}),
     "translations": ("ll", {"translations": ("q1 + q2",), "features": ("(q1 - q2)^2", "(q1 - q2)^4")}),
-    "network": ("a", {"level": "linear", "potential_width": 3, "potential_depth": 2}),
+    "networks of one": ("a", {"level": "linear", "potential_width": 3, "potential_depth": 2, "mass_width": 2}),
     "networks": ("al", {
         "level": "affine", "potential_width": 3, "damping_width": 3, "correction_width": 3, "activation": "softplus",
         "features": ("1", "q2^2"),
@@ -86,8 +82,9 @@ CASES: dict[str, tuple[str, Setting]] = {
     "powers of s, forces": ("al", {
         "level": "forced", "dissipation": ("s^3", "s^2"), "inputs": 1, "coulomb": True, "drag": ("q2^2 v2",),
     }),
-    "mass of one": ("l", {"mass_width": 2}),
-    "mass": ("al", {"level": "forced", "mass_width": 3, "mass_depth": 2, "coupled": True, "coulomb": True}),
+    "mass": ("al", {
+        "level": "forced", "mass_width": 3, "mass_depth": 2, "coupled": True, "coulomb": True, "inputs": 3,
+    }),
 }  # fmt: skip
 
 

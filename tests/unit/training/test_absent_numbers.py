@@ -76,13 +76,6 @@ def test_the_equation_gives_each_number_its_own_deviation():
     assert ("a″", "a") not in found
 
 
-class OneNumber(SimpleNamespace):
-    """A fit of two bodies with the numbers `x`, each known to 1."""
-
-    def information(self, _floor):
-        return self.x, torch.eye(len(self.x), dtype=self.x.dtype)
-
-
 def test_the_message_on_a_misspelt_number_names_no_weights():
     # fails if the hundreds of weights of a network stand between the user and the numbers that have names
     config = replace(two_bodies(()).config, potential_width=16)

@@ -48,7 +48,8 @@ def runs():
     return {}
 
 
-@pytest.mark.parametrize("term", CASES)
+# That |u| is a column like u^2 is shown by test_input_terms.py.
+@pytest.mark.parametrize("term", ["u'", "u^2", pytest.param("|u|", marks=pytest.mark.slow)])
 def test_what_an_input_acts_by_is_found(term, runs):
     # fails if a term is not offered, or columns that nothing asks for stay
     data = driven(CASES[term], sway)

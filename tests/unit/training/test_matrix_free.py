@@ -1,4 +1,4 @@
-"""Gauss–Newton by products: the dense step where both can be had, and a model that is too large for a matrix."""
+"""Gauss–Newton by products: the dense step where both can be had, and where a fit takes it."""
 
 import sys
 from dataclasses import replace
@@ -13,7 +13,7 @@ from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquar
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.solvers.levenberg_marquardt import _damped_step
-from herglotz.training.solvers.matrix_free import DENSE, Curvature, MatrixFree
+from herglotz.training.solvers.matrix_free import Curvature, MatrixFree
 
 
 def problem_of(width, freedom=None, chunk=4096, sigma=1e-3, trajectories=6):
@@ -90,11 +90,10 @@ def test_the_search_does_not_hang_on_rounding():
     torch.testing.assert_close(y, x, rtol=0, atol=1e-10)
 
 
-def test_a_model_too_large_for_a_matrix_is_fitted():
-    # fails if the search by products stalls after its first step
-    problem = problem_of(70, trajectories=2)
+def test_a_search_by_products_goes_on():
+    # fails if it stalls after its first step
+    problem = problem_of(24, trajectories=2)
     x = problem.start()
-    assert len(x) > DENSE
     result = levenberg_marquardt(MatrixFree(problem), x, max_iterations=18)
     assert len(result.history) > 6
     assert result.cost < 0.1 * float(problem.cost(x))

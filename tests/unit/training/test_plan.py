@@ -1,6 +1,5 @@
 """The plan of a fit: chosen with reasons, stored, followed again, drawn in the docs."""
 
-import importlib
 import json
 from dataclasses import replace
 from functools import cache
@@ -21,7 +20,6 @@ from herglotz.training.plan import DECISIONS, WORDS
 from herglotz.training.stages import Stages
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "trajectory.md"
-fit_module = importlib.import_module("herglotz.training.fit")
 QUICK = FitConfig(iterations=15, departures=(2e-3,))
 
 

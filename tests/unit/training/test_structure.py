@@ -189,7 +189,7 @@ def test_few_samples_of_many_bodies_show_their_springs():
 
 def test_bodies_that_share_nothing_are_left_alone():
     # fails if the scale of each, which nothing fixes, ends a fit, or features of rounding are kept
-    data = bodies(2, springs=0.0)
+    data = bodies(2, springs=0.0).select(range(3))
     told = FitConfig(iterations=10, objective="residual")
     config, base, *_ = structured(data, estimate_baseline(data), told.resolved(data))
     assert bool(config.features) is bool(base.start)

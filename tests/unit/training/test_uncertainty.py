@@ -95,7 +95,7 @@ def test_more_noise_means_wider_bands():
     widths = []
     for noise in (0.003, 0.03):
         data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=noise, seed=1)
-        run = fit(data, SETTINGS, progress=False)
+        run = fit(data, replace(SETTINGS, departures=(2e-3,)), progress=False)
         widths.append(float(laplace(run).bands().std[held_out(run)].mean()))
     assert 3 < widths[1] / widths[0] < 30
 

@@ -24,23 +24,12 @@ static inline int hz_step_vjp(const hz_state *before, const hz_state *after, hz_
   if (hz_before(before, h)) return hz_before(before, h);
   if (hz_before(after, h) || hz_BAD_U(u)) return hz_DIVERGED;
 #if hz_P
-  if (!theta) theta = &hz_defaults;
-  if (!hz_in_bounds(theta)) return hz_BAD_INPUT;
-  for (i = 0; i < hz_P; i++) P.theta[i] = theta->value[i];
+  if (theta && !hz_in_bounds(theta)) return hz_BAD_INPUT;
 #endif /* hz_P */
-  for (i = 0; i < hz_N; i++) {
-    P.q0[i] = before->q[i];
-    P.p0[i] = before->p[i];
-    move[i] = after->q[i] - before->q[i];
-  }
-  P.s0 = before->s;
-  P.h = h;
-#if hz_INPUTS
-  hz_push(u, hz_WITH_THETA(theta) P.push);
-#endif
+  hz_pose(before, after, h, hz_WITH_U(u) hz_WITH_THETA(theta) &P, move);
 #if hz_P && hz_INPUTS
-  hz_inputs_at(theta->value, hz_input_map, hz_input_offset);
-  if (u) hz_push_slopes(u, theta->value, push_by_theta);
+  hz_inputs_at(P.theta, hz_input_map, hz_input_offset);
+  if (u) hz_push_slopes(u, P.theta, push_by_theta);
 #endif /* hz_P */
   hz_pull(&P, move, of, pulled);
   for (i = 0; i < WIDTH; i++)

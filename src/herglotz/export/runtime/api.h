@@ -14,6 +14,26 @@ static inline int hz_alone(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA
   return hz_advance(state, &track, h, hz_WITH_U(u) residual);
 }
 
+/* The equation of a step from `before`, and the move from there to `after`. */
+static inline void hz_pose(const hz_state *before, const hz_state *after, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_problem *P,
+    hz_real move[hz_N]) {
+  int i;
+  for (i = 0; i < hz_N; i++) {
+    P->q0[i] = before->q[i];
+    P->p0[i] = before->p[i];
+    move[i] = after->q[i] - before->q[i];
+  }
+  P->s0 = before->s;
+  P->h = h;
+#if hz_P
+  if (!theta) theta = &hz_defaults;
+  for (i = 0; i < hz_P; i++) P->theta[i] = theta->value[i];
+#endif /* hz_P */
+#if hz_INPUTS
+  hz_push(u, hz_WITH_THETA(theta) P->push);
+#endif
+}
+
 /* The state at q1 from two positions h apart: (q1, D2 L_d, s0 + L_d); sigma starts at 1. `out` is written on success
    only. Returns a status. */
 static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_real s0, hz_real h,
@@ -21,27 +41,22 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
   hz_problem P;
   hz_terms t;
   hz_potential_t V1;
-  hz_state next;
+  hz_state first, next;
   hz_real move[hz_N], dp[hz_N], ds, E;
   int i, pass;
   for (i = 0; i < hz_N; i++) {
-    P.q0[i] = q0[i];
-    P.p0[i] = hz_R(0.0);
+    first.q[i] = q0[i];
     next.q[i] = q1[i];
-    next.p[i] = t.move[i] = q1[i] - q0[i];
+    first.p[i] = hz_R(0.0);
+    next.p[i] = q1[i] - q0[i]; /* checked with the rest */
   }
-  P.s0 = next.s = s0;
-  P.h = h;
-  next.sigma = hz_R(1.0);
-  if (hz_before(&next, h) || !hz_all_finite(q0) || hz_BAD_U(u)) return hz_BAD_INPUT;
+  first.s = next.s = s0;
+  first.sigma = next.sigma = hz_R(1.0);
+  if (hz_before(&first, h) || hz_before(&next, h) || hz_BAD_U(u)) return hz_BAD_INPUT;
 #if hz_P
-  if (!theta) theta = &hz_defaults;
-  if (!hz_in_bounds(theta)) return hz_BAD_INPUT;
-  for (i = 0; i < hz_P; i++) P.theta[i] = theta->value[i];
+  if (theta && !hz_in_bounds(theta)) return hz_BAD_INPUT;
 #endif /* hz_P */
-#if hz_INPUTS
-  hz_push(u, hz_WITH_THETA(theta) P.push);
-#endif
+  hz_pose(&first, &next, h, hz_WITH_U(u) hz_WITH_THETA(theta) &P, t.move);
   hz_potential(q0, hz_WITH_THETA(P.theta) &P.V0);
   hz_potential(q1, hz_WITH_THETA(P.theta) &V1);
   hz_prepare(&P);
@@ -94,23 +109,10 @@ static inline int hz_step_slopes(const hz_state *before, const hz_state *after, 
 #if hz_P && hz_INPUTS
   hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS], push_by_theta[hz_INPUTS * hz_P];
 #endif /* hz_P */
-  for (i = 0; i < hz_N; i++) {
-    P.q0[i] = before->q[i];
-    P.p0[i] = before->p[i];
-    move[i] = after->q[i] - before->q[i];
-  }
-  P.s0 = before->s;
-  P.h = h;
-#if hz_P
-  if (!theta) theta = &hz_defaults;
-  for (i = 0; i < hz_P; i++) P.theta[i] = theta->value[i];
-#endif /* hz_P */
-#if hz_INPUTS
-  hz_push(u, hz_WITH_THETA(theta) P.push);
-#endif
+  hz_pose(before, after, h, hz_WITH_U(u) hz_WITH_THETA(theta) &P, move);
 #if hz_P && hz_INPUTS
-  hz_inputs_at(theta->value, hz_input_map, hz_input_offset);
-  if (u) hz_push_slopes(u, theta->value, push_by_theta);
+  hz_inputs_at(P.theta, hz_input_map, hz_input_offset);
+  if (u) hz_push_slopes(u, P.theta, push_by_theta);
 #endif /* hz_P */
   hz_slopes(&P, move, slopes);
   for (i = 0; i < SIZE * WIDTH; i++)

@@ -24,34 +24,6 @@ static inline hz_real hz_beyond(hz_real z, hz_real bound) {
   return z > bound ? z - bound : z < -bound ? z + bound : hz_R(0.0);
 }
 
-/* x = A^-1 x by Gauss with row exchanges; A is lost. */
-static inline void hz_eliminate(hz_real A[hz_N * hz_N], hz_real x[hz_N]) {
-  int i, j, k;
-  for (k = 0; k < hz_N; k++) {
-    int best = k;
-    hz_real other;
-    for (i = k + 1; i < hz_N; i++)
-      if (hz_fabs(A[i * hz_N + k]) > hz_fabs(A[best * hz_N + k])) best = i;
-    for (j = 0; j < hz_N; j++) {
-      other = A[best * hz_N + j];
-      A[best * hz_N + j] = A[k * hz_N + j];
-      A[k * hz_N + j] = other;
-    }
-    other = x[best];
-    x[best] = x[k];
-    x[k] = other;
-    for (i = k + 1; i < hz_N; i++) {
-      const hz_real factor = A[i * hz_N + k] / A[k * hz_N + k];
-      for (j = k + 1; j < hz_N; j++) A[i * hz_N + j] -= factor * A[k * hz_N + j];
-      x[i] -= factor * x[k];
-    }
-  }
-  for (i = hz_N - 1; i >= 0; i--) {
-    for (j = i + 1; j < hz_N; j++) x[i] -= A[i * hz_N + j] * x[j];
-    x[i] /= A[i * hz_N + i];
-  }
-}
-
 static inline hz_real hz_largest(const hz_real x[hz_N]) {
   hz_real size = hz_R(0.0);
   int i;
@@ -91,7 +63,8 @@ static inline int hz_init_qv(const hz_real q[hz_N], const hz_real v[hz_N], hz_re
    hz_MAX_ITERATIONS where no velocity with this p is found. */
 static inline int hz_velocity(const hz_state *state, hz_real h, hz_TAKES_THETA hz_real v[hz_N]) {
   hz_legendre at;
-  hz_real z[hz_N], base[hz_N], move[hz_N], own[hz_N], bound[hz_N], G[hz_N], A[hz_N * hz_N], now[hz_N];
+  hz_real z[hz_N], base[hz_N], move[hz_N], own[hz_N], bound[hz_N], G[hz_N], now[hz_N];
+  hz_real A[hz_N * hz_N], inverse[hz_N * hz_N];
   hz_real scale = hz_R(0.0), merit, before = hz_R(0.0), last = hz_R(0.0), part = hz_R(1.0);
   int i, j, sweep, iteration, better;
   const int status = hz_before(state, h);
@@ -129,14 +102,17 @@ static inline int hz_velocity(const hz_state *state, hz_real h, hz_TAKES_THETA h
     if (!hz_all_finite(G)) {
       if (!iteration) return hz_DIVERGED;
     } else if (better || merit <= hz_floor * hz_largest(state->p)) { /* the last digits need not lessen */
-      hz_eliminate(A, G);
-      if (!hz_all_finite(G)) return hz_SINGULAR;
-      last = hz_largest(G);
+      hz_inverse(hz_N, A, inverse);
+      for (i = 0; i < hz_N; i++) {
+        move[i] = hz_R(0.0);
+        for (j = 0; j < hz_N; j++) move[i] += inverse[i * hz_N + j] * G[j];
+      }
+      if (!hz_all_finite(move)) return hz_SINGULAR;
+      last = hz_largest(move);
       if (!iteration) scale = last > hz_largest(z) ? last : hz_largest(z);
       for (i = 0; i < hz_N; i++) {
         base[i] = z[i];
-        move[i] = G[i];
-        z[i] += G[i];
+        z[i] += move[i];
       }
       if (last <= hz_floor * scale) break;
       before = merit;
