@@ -192,13 +192,10 @@ def _size(cells: int, height: float) -> tuple[float, float]:
 def _axes(figure: Figure, cells: int, rows: int) -> list[list[Axes]]:
     """Make `cells` groups of panels in at most two columns; the rows of a group share their time axis."""
     columns = 1 if cells == 1 else 2
-    grid = figure.add_gridspec(math.ceil(cells / columns), columns)
-    found = []
-    for k in range(cells):
-        ratios = [2.4, 1.0] if rows == 2 else [1.0]
-        inner = grid[k // columns, k % columns].subgridspec(rows, 1, height_ratios=ratios, hspace=0.03)
-        found.append([figure.add_subplot(inner[r]) for r in range(rows)])
-    return found
+    lines = math.ceil(cells / columns)
+    grid = figure.add_gridspec(lines * rows, columns, height_ratios=[2.4, 1.0][:rows] * lines)
+    places = [(rows * (k // columns), k % columns) for k in range(cells)]
+    return [[figure.add_subplot(grid[top + r, column]) for r in range(rows)] for top, column in places]
 
 
 def _series(data: Trajectories, values: torch.Tensor, b: int, i: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,13 +11,16 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from herglotz.data import Trajectories
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
+from herglotz.plots.layout import Panels
+from herglotz.training.equation_words import raised
 
 DPI = 150  # sharp on a screen at twice the size
 # Okabe & Ito (2008): distinguishable with every common form of colour blindness, and in grey.
@@ -66,7 +69,7 @@ class Picture(Figure):
 
 def new_figure(width: float, height: float, title: str) -> Figure:
     """Return an empty figure (inches) with a title; without pyplot there is no window and no global list of figures."""
-    figure = Picture(figsize=(width, height), dpi=DPI, layout="constrained")
+    figure = Picture(figsize=(width, height), dpi=DPI, layout=Panels())
     figure.suptitle(title, x=0.01, ha="left", fontsize=11.5, fontweight="bold")
     return figure
 
@@ -85,8 +88,10 @@ def save_figure(figure: Figure, path: PathLike) -> None:
 def _image(figure: Figure, form: str) -> bytes:
     buffer = io.BytesIO()
     with styled():
-        quick: dict[str, Any] = {"pil_kwargs": {"compress_level": 1}} if form == "png" else {}
-        figure.savefig(buffer, format=form, dpi=DPI, **quick)
+        if form == "png":  # `savefig` would draw twice: once for the layout, without ink
+            FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={"compress_level": 1})
+        else:
+            figure.savefig(buffer, format=form, dpi=DPI)
     return buffer.getvalue()
 
 
@@ -116,6 +121,24 @@ def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left"
 def with_unit(name: str, unit: str) -> str:
     """Return an axis label: `theta (rad)`, or the name alone for a number without unit."""
     return name if unit in ("", "1") else f"{name} ({unit})"
+
+
+class Powers(LogFormatter):
+    """Numbers of a logarithmic axis as text, `20` and `2×10⁻⁵`; matplotlib's own ones take its parser of formulas."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return the text of a tick, empty where matplotlib leaves its number out."""
+        mantissa, _, exponent = f"{x:g}".partition("e")
+        power = raised("10", int(exponent)) if exponent else ""
+        text = power if mantissa == "1" and power else "×".join(filter(None, (mantissa, power)))
+        return text if super().__call__(x, pos) else ""
+
+
+def logarithmic(ax: Axes) -> None:
+    """Make the ordinate logarithmic."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(Powers())
+    ax.yaxis.set_minor_formatter(Powers())
 
 
 def position_axis(ax: Axes, data: Trajectories, i: int) -> None:
