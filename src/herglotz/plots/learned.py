@@ -13,8 +13,7 @@ from torch import Tensor
 from herglotz.models import refuse_own
 from herglotz.models.phase import Phase
 from herglotz.models.terms import LinearDamping
-from herglotz.plots.fan import momentum_unit
-from herglotz.plots.motion import trained_mask
+from herglotz.plots.motion import momentum_unit, trained_mask
 from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, position_axis, styled, with_unit
 from herglotz.stepping.field import FieldOf
 

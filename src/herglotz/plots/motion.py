@@ -133,6 +133,16 @@ def trained_mask(run: Run) -> torch.Tensor:
     return leading(run.data.lengths, run.train_lengths)
 
 
+def momentum_unit(run: Run) -> str:
+    """Return the unit of p: with the first mass fixed at 1, p is a velocity."""
+    length, time = run.data.units[0], run.data.time_unit
+    if len(set(run.data.units)) > 1:
+        return ""
+    per_time = "" if time in ("", "1") else f"/{time}"
+    length = "" if length in ("", "1") else length
+    return f"{length or '1'}{per_time}" if length or per_time else ""
+
+
 def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
     data, unit, count = motion.data, motion.data.units[i], motion.counts[b]
     t, q = _series(data, data.q, b, i)

@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from herglotz.plots.fan import momentum_unit
-from herglotz.plots.motion import trained_mask
+from herglotz.plots.motion import momentum_unit, trained_mask
 from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, position_axis, styled, with_unit
 from herglotz.stepping import State, Stepper
 from herglotz.training.flow import motion

@@ -17,7 +17,7 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from herglotz.data import Trajectories
-from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.files import PathLike, folder_at, write_atomically
 from herglotz.errors import InputError
 from herglotz.plots.layout import Panels
 from herglotz.training.equation_words import raised
@@ -83,6 +83,14 @@ def save_figure(figure: Figure, path: PathLike) -> None:
     if form not in FORMATS:
         raise InputError(f"{path}: a figure's name must end in .{', .'.join(FORMATS)}")
     write_atomically(path, _image(figure, form))
+
+
+def save_all(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path]:
+    """Write figures by their names into `folder`, which is made if it is missing; return the files."""
+    files = [folder_at(folder) / f"{name}.{form}" for name in drawn]
+    for file, figure in zip(files, drawn.values(), strict=True):
+        save_figure(figure, file)
+    return files
 
 
 def _image(figure: Figure, form: str) -> bytes:
