@@ -81,12 +81,14 @@ def test_panels_are_in_line_and_have_their_ratios():  # fails if a panel has the
     assert places[0].height == pytest.approx(2.4 * places[2].height)
 
 
-def test_a_panel_may_take_several_cells():  # fails if its end is that of its first cell
+def test_a_panel_may_take_several_cells():  # fails if its end, or its label, is that of its first cell
     with styled():
         figure = new_figure(7.0, 4.0, "A title")
         cells = figure.add_gridspec(2, 2)
         upper, lower, right = (figure.add_subplot(cells[where]) for where in ((0, 0), (1, 0), (slice(None), 1)))
+        right.set_xlabel("time (s)")
     drawn(figure)
+    assert right.get_tightbbox().min[1] > -PIXEL
     assert right.get_position().y1 == pytest.approx(upper.get_position().y1)
     assert right.get_position().y0 == pytest.approx(lower.get_position().y0)
 
