@@ -59,7 +59,9 @@ def _room(ax: Axes, axis: Axis, renderer: Any) -> tuple[float, float]:
         return 0.0, 0.0
     k, point = 0 if axis is ax.yaxis else 1, renderer.dpi / 72
     low, high = ax.bbox.min[1 - k], ax.bbox.max[1 - k]
-    texts = [text for text in axis.get_ticklabels(which="both") if text.get_text()]
+    # Each call finds all ticks anew, and between ticks a linear axis has no numbers.
+    numbers = [*axis.get_majorticklabels(), *(axis.get_minorticklabels() if axis.get_scale() == "log" else ())]
+    texts = [text for text in numbers if text.get_text()]
     # Ticks beyond the limits have texts, too, which are not drawn.
     boxes = [box for text in texts if low - 1 < _middle(box := text.get_window_extent(renderer), 1 - k) < high + 1]
     across = axis.get_tick_padding() * point + max((box.size[k] for box in boxes), default=0.0)

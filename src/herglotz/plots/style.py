@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import math
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -64,7 +67,7 @@ class Picture(Figure):
     """A figure that a notebook shows, although pyplot, which would register it there, is not used."""
 
     def _repr_png_(self) -> bytes:
-        return _image(self, "png")
+        return image(self, "png")
 
 
 def new_figure(width: float, height: float, title: str) -> Figure:
@@ -82,7 +85,7 @@ def save_figure(figure: Figure, path: PathLike) -> None:
     form = Path(path).suffix.lower().removeprefix(".")
     if form not in FORMATS:
         raise InputError(f"{path}: a figure's name must end in .{', .'.join(FORMATS)}")
-    write_atomically(path, _image(figure, form))
+    write_atomically(path, image(figure, form))
 
 
 def save_all(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path]:
@@ -93,14 +96,36 @@ def save_all(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path
     return files
 
 
-def _image(figure: Figure, form: str) -> bytes:
+def image(figure: Figure, form: str) -> bytes:
+    """Return what a file of a figure holds, in the form png, svg or pdf."""
     buffer = io.BytesIO()
     with styled():
-        if form == "png":  # `savefig` would draw twice: once for the layout, without ink
-            FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={"compress_level": 1})
-        else:
+        if form != "png":
             figure.savefig(buffer, format=form, dpi=DPI)
-    return buffer.getvalue()
+            return buffer.getvalue()
+        canvas = FigureCanvasAgg(figure)  # `savefig` would draw twice: once for the layout, without ink
+        canvas.draw()
+    return _png(np.asarray(canvas.buffer_rgba()), figure.dpi)
+
+
+def _png(pixels: np.ndarray, dpi: float) -> bytes:
+    """The file (PNG, W3C 2003) of pixels (height, width, 4), bytes.
+
+    Rows are not filtered: Pillow tries five filters a row, which took 0.2 of the 1.3 s of a fit's figures, and made
+    the files of lines on white larger.
+    """
+    height, width = pixels.shape[:2]
+    rows = np.zeros((height, 1 + 4 * width), dtype=np.uint8)  # a row begins with its filter: 0, none
+    rows[:, 1:] = pixels.reshape(height, -1)
+    per_metre = round(dpi / 0.0254)
+    parts = {
+        b"IHDR": struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0),  # 8 bits of red, green, blue and opacity
+        b"pHYs": struct.pack(">IIB", per_metre, per_metre, 1),
+        b"IDAT": zlib.compress(rows.tobytes(), 1),
+        b"IEND": b"",
+    }
+    packed = [struct.pack(">I", len(x)) + k + x + struct.pack(">I", zlib.crc32(k + x)) for k, x in parts.items()]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
 def label(ax: Axes, x: float, y: float, text: str, color: str = INK, **options: Any) -> None:

@@ -55,7 +55,7 @@ def called(node: ast.AST) -> str | None:
 @pytest.mark.parametrize("module", SUBCOMMANDS, ids=lambda m: m.__name__.rpartition(".")[2])
 def test_every_subcommand_imports_torch_so(module):  # fails if torch is imported before its objects are left out
     tree = ast.parse(inspect.getsource(module.run))
-    (ours,) = (node.lineno for node in ast.walk(tree) if called(node) == "import_torch")
+    (ours,) = (node.lineno for node in ast.walk(tree) if isinstance(node, ast.expr) and called(node) == "import_torch")
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             assert ours < node.lineno

@@ -8,6 +8,8 @@ import pytest
 from fake_run import fake_run
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+from PIL import Image
 
 from herglotz.plots import plot_plan, plot_trajectory, save_figure
 from herglotz.plots.phase import _draw_flow
@@ -88,7 +90,7 @@ def test_a_panel_may_take_several_cells():  # fails if its end, or its label, is
         upper, lower, right = (figure.add_subplot(cells[where]) for where in ((0, 0), (1, 0), (slice(None), 1)))
         right.set_xlabel("time (s)")
     drawn(figure)
-    assert right.get_tightbbox().min[1] > -PIXEL
+    assert cast("Bbox", right.get_tightbbox()).min[1] > -PIXEL
     assert right.get_position().y1 == pytest.approx(upper.get_position().y1)
     assert right.get_position().y0 == pytest.approx(lower.get_position().y0)
 
@@ -114,6 +116,16 @@ def test_a_picture_is_drawn_once(tmp_path, monkeypatch):  # fails if `savefig` d
     monkeypatch.setattr(Figure, "draw", lambda self, renderer: (count.append(1), draw(self, renderer)))
     save_figure(plot_plan(fake_run(steps=12)), tmp_path / "plan.png")
     assert len(count) == 1
+
+
+def test_a_file_has_the_pixels_that_were_drawn(tmp_path):  # fails if rows shift, or colours, opacity or dpi are lost
+    figure = plot_plan(fake_run(steps=12))
+    save_figure(figure, tmp_path / "plan.png")
+    with styled(), Image.open(tmp_path / "plan.png") as read:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        assert np.array_equal(np.asarray(read), np.asarray(canvas.buffer_rgba()))
+        assert read.info["dpi"] == pytest.approx((150, 150), abs=0.01)
 
 
 def numbers(low: float, high: float) -> list[str]:
