@@ -25,10 +25,10 @@ def drawn(figure: Figure) -> Figure:
     return figure
 
 
-def grid(rows: int = 2, columns: int = 2, top: float = 1.0, **ratios: Any) -> Figure:
+def grid(rows: int = 2, columns: int = 2, top: float = 1.0, height: float = 5.0, **ratios: Any) -> Figure:
     """A grid of labelled panels; numbers up to `top`, those of the lower left panel a thousand times as large."""
     with styled():
-        figure = new_figure(7.0, 5.0, "A title")
+        figure = new_figure(7.0, height, "A title")
         axes = figure.subplots(rows, columns, squeeze=False, **ratios)
         for ax in axes.flat:
             ax.plot([0.0, 16.0], [0.0, 1000 * top if ax is axes[-1, 0] else top])
@@ -47,6 +47,7 @@ def offset(figure: Figure) -> str:
         ("wide numbers", lambda: grid(top=123456.0)),
         ("a factor above the ordinate", lambda: grid(top=1e-9)),
         ("one panel", lambda: grid(1, 1)),
+        ("a tall one, whose title is not lower", lambda: grid(1, 1, height=16.0)),
         ("a run", lambda: drawn(plot_trajectory(fake_run(trajectories=5, steps=20)))),
     ],
 )
