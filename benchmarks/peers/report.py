@@ -117,7 +117,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         title = "Error of rollouts from unseen starts: RMS (rad) of every seed, and the median seed"
         figure = new_figure(width, height, title)
         top = {"rect": (0.0, 0.0, 1.0, 1.0 - 0.32 / height)}  # room for the key under the title
-        figure.get_layout_engine().set(**top)  # type: ignore[union-attr]
+        figure.set_layout_engine("constrained", **top)
         axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
         for ax in list(axes.flat)[len(shown) :]:
             ax.set_visible(False)

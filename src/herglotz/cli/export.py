@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import KICKS, check_output_file, flag, positive, print_json, print_next, say, warn_of_misfit
+from herglotz.cli.common import (
+    KICKS,
+    check_output_file,
+    flag,
+    import_torch,
+    positive,
+    print_json,
+    print_next,
+    say,
+    warn_of_misfit,
+)
 from herglotz.cli.flags import FORCE
 from herglotz.errors import InputError
 
@@ -79,6 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.parameters is not None or arguments.extras is not None:
             raise InputError("--parameters, --extras: kicks that tune chose have neither; leave them out")
         return _kicks(arguments, kicks)
+    import_torch()
 
     from herglotz.training import load_run
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_folder, exit_code, flag, print_json, print_next_of, say
+from herglotz.cli.common import check_output_folder, exit_code, flag, import_torch, print_json, print_next_of, say
 from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
 from herglotz.cli.settings import EXPERT, MACHINE, MODEL, OPTIMISER, data_of, settings_of
 
@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Read, check the output, train, save, draw, report."""
     out: Path = arguments.out
     check_run_folder(out, arguments.resume)
+    import_torch()
 
     from herglotz.training import load_run
 

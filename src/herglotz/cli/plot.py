@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import check_output_folder, flag
+from herglotz.cli.common import check_output_folder, flag, import_torch
 from herglotz.cli.flags import READING, columns_of
 from herglotz.errors import InputError
 
@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     source: Path = arguments.source
     folder = arguments.out or (source if source.is_dir() else Path())
     check_output_folder(folder)
+    import_torch()
     theory = arguments.theory or _is_scene(source)
     if columns_of(arguments) and (theory or source.is_dir()):
         flags = ", ".join(f"--{name}" for name in columns_of(arguments))

@@ -8,7 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_file, count, existing, flag, positive, print_json, print_table, say
+from herglotz.cli.common import (
+    check_output_file,
+    count,
+    existing,
+    flag,
+    import_torch,
+    positive,
+    print_json,
+    print_table,
+    say,
+)
 from herglotz.cli.flags import FORCE, READING, columns_of
 from herglotz.errors import InputError
 
@@ -61,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     out: Path | None = arguments.out
     if out is not None:
         check_output_file(out, (".csv", ".npz"), arguments.force)
+    import_torch()
 
     from herglotz.data import load
     from herglotz.training import load_run

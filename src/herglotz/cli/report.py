@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import check_output_folder, existing, flag
+from herglotz.cli.common import check_output_folder, existing, flag, import_torch
 from herglotz.cli.flags import READING, columns_of
 
 DESCRIPTION = """\
@@ -31,6 +31,7 @@ FLAGS = (
 def run(arguments: argparse.Namespace) -> int:
     """Write both files and say where."""
     folder = arguments.out or arguments.source
+    import_torch()
 
     from herglotz.data import load
     from herglotz.report import write_report

@@ -11,7 +11,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_file, count, existing, finite, flag, positive, print_json, say
+from herglotz.cli.common import (
+    check_output_file,
+    count,
+    existing,
+    finite,
+    flag,
+    import_torch,
+    positive,
+    print_json,
+    say,
+)
 from herglotz.cli.flags import FORCE, TRUST
 from herglotz.errors import InputError, check_start
 
@@ -94,6 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.steps < 2:
         raise InputError(f"--steps must be at least 2, got {arguments.steps}")
     check_start(*(x is not None for x in (arguments.q0, arguments.v0, arguments.p0)), dash="--")
+    import_torch()
 
     import torch
 

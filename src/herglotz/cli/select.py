@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from herglotz.cli.common import count, exit_code, flag, print_json, print_next_of
+from herglotz.cli.common import count, exit_code, flag, import_torch, print_json, print_next_of
 from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
 from herglotz.cli.settings import LEVELS, MACHINE, data_of, settings_of
 
@@ -40,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Read, check the output, fit the ladder, save the chosen run, report."""
     out: Path = arguments.out
     check_run_folder(out, arguments.resume)
+    import_torch()
 
     from herglotz.data.files import write_atomically
     from herglotz.data.lock import locked

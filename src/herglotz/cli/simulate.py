@@ -5,7 +5,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import check_output_file, count, finite, flag, positive, print_json, print_next, say, seed
+from herglotz.cli.common import (
+    check_output_file,
+    count,
+    finite,
+    flag,
+    import_torch,
+    positive,
+    print_json,
+    print_next,
+    say,
+    seed,
+)
 from herglotz.cli.flags import FORCE
 from herglotz.errors import InputError
 
@@ -51,6 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Simulate and write."""
     check_output_file(arguments.out, (".csv", ".npz"), arguments.force)
     parameters = parse_parameters(arguments.param)
+    import_torch()
 
     from herglotz.data import save, simulate
     from herglotz.scenes import scene

@@ -7,7 +7,16 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import COLUMNS, check_output_folder, finite, flag, print_json, print_table, warn_of_misfit
+from herglotz.cli.common import (
+    COLUMNS,
+    check_output_folder,
+    finite,
+    flag,
+    import_torch,
+    print_json,
+    print_table,
+    warn_of_misfit,
+)
 
 if TYPE_CHECKING:
     from herglotz.training import Bands, Laplace, Run
@@ -38,6 +47,8 @@ FLAGS = (
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, draw, report."""
+    import_torch()
+
     from herglotz.training import ensemble_bands, laplace, load_run
     from herglotz.training.quantities import quantities
 

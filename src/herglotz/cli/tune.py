@@ -7,7 +7,18 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import KICKS, check_output_folder, count, flag, positive, print_json, print_next, say, seed
+from herglotz.cli.common import (
+    KICKS,
+    check_output_folder,
+    count,
+    flag,
+    import_torch,
+    positive,
+    print_json,
+    print_next,
+    say,
+    seed,
+)
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,6 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_output_folder(out)
     if (out / "model.pt").exists() and not (out / "tuned.json").exists():
         raise InputError(f"--out {out}: already holds a run that tune did not write; choose another folder")
+    import_torch()
 
     from herglotz.data.files import write_atomically
     from herglotz.plots import save_figure

@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import check_output_folder, count, flag, positive, print_json, seed
+from herglotz.cli.common import check_output_folder, count, flag, import_torch, positive, print_json, seed
 from herglotz.cli.flags import TRUST
 from herglotz.errors import InputError
 
@@ -49,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Verify and report; 1 when a check fails."""
     if arguments.samples < 1 or arguments.steps < 2:
         raise InputError(f"--samples must be >= 1 and --steps >= 2, got {arguments.samples} and {arguments.steps}")
+    import_torch()
     target = arguments.target
     if Path(target).is_file():
         target = _opened(Path(target), arguments)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -11,7 +11,9 @@ from torch import Tensor
 from herglotz.data.checks import DTYPES, MIN_SAMPLES, check_positive
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
-from herglotz.scenes import Scene, scene as scene_named
+
+if TYPE_CHECKING:
+    from herglotz.scenes import Scene
 
 LONGEST_GAP = 3  # consecutive samples that one gap deletes at most
 Range = tuple[float | Sequence[float] | Tensor, float | Sequence[float] | Tensor]
@@ -77,7 +79,10 @@ def simulate(
     InputError
         If there is no such scene, an argument is out of range, or the motion leaves the finite numbers.
     """
-    scene = scene_named(scene) if isinstance(scene, str) else scene
+    if isinstance(scene, str):
+        from herglotz.scenes import scene as scene_named  # a fit needs no scene
+
+        scene = scene_named(scene)
     if not hasattr(scene, "dof"):
         raise InputError(f"simulate takes a scene, got a {type(scene).__name__}; {OF_AN_L_D}")
     h = scene.h if h is None else h

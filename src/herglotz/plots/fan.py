@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,12 +11,10 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
+from herglotz.plots.motion import momentum_unit
 from herglotz.stepping import State, Stepper
 from herglotz.theory import GeneratingFunction, generating_functions
 from herglotz.verify.subject import subject
-
-if TYPE_CHECKING:
-    from herglotz.training import Run
 
 CAUSTIC = 1e-3  # smallest spread of ∂q_k/∂p̂0, relative to the median, at which S^k is still drawn
 
@@ -90,16 +88,6 @@ def _sound(states: State) -> State:
 def _is_run(source: Any) -> bool:
     """Whether the source has states fitted to data; hand-made runs of tests have, too."""
     return hasattr(source, "states") and hasattr(source, "model")
-
-
-def momentum_unit(run: Run) -> str:
-    """Return the unit of p: with the first mass fixed at 1, p is a velocity."""
-    length, time = run.data.units[0], run.data.time_unit
-    if len(set(run.data.units)) > 1:
-        return ""
-    per_time = "" if time in ("", "1") else f"/{time}"
-    length = "" if length in ("", "1") else length
-    return f"{length or '1'}{per_time}" if length or per_time else ""
 
 
 def _typical_step(source: Any) -> float | None:

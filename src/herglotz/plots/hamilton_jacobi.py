@@ -108,6 +108,7 @@ def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Fig
     with styled():
         title = f"The action solves the discrete Hamilton–Jacobi equation: largest relative residual {worst:.1e}"
         figure = new_figure(10.2, 4.2, title)
+        figure.set_layout_engine("constrained")  # which makes room for the bar of colours
         left, right = figure.subplots(1, 2, width_ratios=[1.15, 1.0])
         _draw_table(figure, left, fan, np.maximum(table, floor))
         unit = common_unit(source.data.units) if hasattr(source, "data") else ""

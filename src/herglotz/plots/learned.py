@@ -13,8 +13,7 @@ from torch import Tensor
 from herglotz.models import refuse_own
 from herglotz.models.phase import Phase
 from herglotz.models.terms import LinearDamping
-from herglotz.plots.fan import momentum_unit
-from herglotz.plots.motion import trained_mask
+from herglotz.plots.motion import momentum_unit, trained_mask
 from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, position_axis, styled, with_unit
 from herglotz.stepping.field import FieldOf
 
@@ -62,7 +61,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
             _panel(axes[0, i], x, _curves(posterior, _potential(run, i, x)), (low, high))
             axes[0, i].set_ylabel(with_unit("potential V", energy))
             _panel(axes[1, i], x, _curves(posterior, _force(run, i, x)), (low, high))
-            axes[1, i].set_ylabel(with_unit(r"force $-\partial V/\partial q$", force))
+            axes[1, i].set_ylabel(with_unit("force −∂V/∂q", force))
             if rubs:
                 v, low, high = _range(speeds[:, i])
                 _panel(axes[2, i], v, _curves(posterior, _friction(run, i, v)), (low, high))

@@ -133,6 +133,16 @@ def trained_mask(run: Run) -> torch.Tensor:
     return leading(run.data.lengths, run.train_lengths)
 
 
+def momentum_unit(run: Run) -> str:
+    """Return the unit of p: with the first mass fixed at 1, p is a velocity."""
+    length, time = run.data.units[0], run.data.time_unit
+    if len(set(run.data.units)) > 1:
+        return ""
+    per_time = "" if time in ("", "1") else f"/{time}"
+    length = "" if length in ("", "1") else length
+    return f"{length or '1'}{per_time}" if length or per_time else ""
+
+
 def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
     data, unit, count = motion.data, motion.data.units[i], motion.counts[b]
     t, q = _series(data, data.q, b, i)
@@ -192,13 +202,10 @@ def _size(cells: int, height: float) -> tuple[float, float]:
 def _axes(figure: Figure, cells: int, rows: int) -> list[list[Axes]]:
     """Make `cells` groups of panels in at most two columns; the rows of a group share their time axis."""
     columns = 1 if cells == 1 else 2
-    grid = figure.add_gridspec(math.ceil(cells / columns), columns)
-    found = []
-    for k in range(cells):
-        ratios = [2.4, 1.0] if rows == 2 else [1.0]
-        inner = grid[k // columns, k % columns].subgridspec(rows, 1, height_ratios=ratios, hspace=0.03)
-        found.append([figure.add_subplot(inner[r]) for r in range(rows)])
-    return found
+    lines = math.ceil(cells / columns)
+    grid = figure.add_gridspec(lines * rows, columns, height_ratios=[2.4, 1.0][:rows] * lines)
+    places = [(rows * (k // columns), k % columns) for k in range(cells)]
+    return [[figure.add_subplot(grid[top + r, column]) for r in range(rows)] for top, column in places]
 
 
 def _series(data: Trajectories, values: torch.Tensor, b: int, i: int) -> tuple[np.ndarray, np.ndarray]:

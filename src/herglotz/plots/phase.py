@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from herglotz.plots.fan import momentum_unit
-from herglotz.plots.motion import trained_mask
+from herglotz.plots.motion import momentum_unit, trained_mask
 from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, position_axis, styled, with_unit
 from herglotz.stepping import State, Stepper
 from herglotz.training.flow import motion
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 LINES, MOST_PANELS = 13, 3
 SHORT, MOST_STEPS = 0.35, 400  # length of a rollout from the grid, in the typical time |q|/|p|, and its steps at most
+HEAD = 0.05  # length of an arrow head (inches)
 NEAR_PI = 1.6  # the panel of an angle that goes beyond this (rad) reaches to ±π
 
 
@@ -49,8 +50,7 @@ def _points(run: Run, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _draw_panel(run: Run, i: int, ax: Axes, lines: np.ndarray) -> None:
     data, unit, (q, p, fine) = run.data, momentum_unit(run), _points(run, i)
     (q_low, q_high), (p_low, p_high) = _limits(q[fine], data.angles[i]), _limits(p[fine])
-    for line in lines:
-        _draw_line(ax, line[:, 0], line[:, 1])
+    _draw_flow(ax, lines)
     seen = trained_mask(run).numpy()
     for mask, color in ((fine & seen, MODEL), (fine & ~seen, UNSEEN)):
         ax.plot(q[mask], p[mask], ".", ms=3.2, color=color, zorder=3)
@@ -93,23 +93,21 @@ def _flow(model: ContactLagrangian, start: State, h: float, steps: int) -> torch
     return x[..., : 2 * model.dof].unflatten(-1, (2, model.dof))
 
 
-def _draw_line(ax: Axes, q: np.ndarray, p: np.ndarray) -> None:
-    """Draw a thin line with one arrow head, which shows the direction of time."""
-    fine = np.isfinite(q) & np.isfinite(p)
-    q, p = q[fine], p[fine]
-    if len(q) < 2:
+def _draw_flow(ax: Axes, lines: np.ndarray) -> None:
+    """Draw thin lines, (lines, K + 1, 2), with one arrow head each, which shows the direction of time."""
+    sound = np.isfinite(lines).all(-1).sum(-1)  # the points before a step that failed
+    known = [line[:count] for line, count in zip(lines, sound, strict=True) if count > 1]
+    if not known:
         return
-    ax.plot(q, p, color=MUTED, lw=0.6, alpha=0.7, zorder=1)
-    at = len(q) - 2 if len(q) < 12 else len(q) // 4
-    ax.annotate(
-        "",
-        (q[at + 1], p[at + 1]),
-        (q[at], p[at]),
-        arrowprops={"arrowstyle": "-|>", "color": MUTED, "lw": 0.6, "mutation_scale": 5, "alpha": 0.8}
-        | {"shrinkA": 0, "shrinkB": 0},
-        annotation_clip=True,
-        zorder=1,
-    )
+    ax.add_collection(LineCollection(known, colors=MUTED, lw=0.6, alpha=0.7, zorder=1), autolim=False)
+    at = [len(line) - 2 if len(line) < 12 else len(line) // 4 for line in known]
+    tip, last = (np.array([line[k + j] for line, k in zip(known, at, strict=True)]) for j in (1, 0))
+    way = np.linalg.norm(tip - last, axis=-1)
+    moves = way > 0  # a rollout from a state of rest stays there
+    ahead = (tip - last)[moves] / way[moves, None]
+    head = {"headwidth": 1, "headlength": 1.2, "headaxislength": 1.2, "width": HEAD / 1.2, "scale": 1 / HEAD}
+    shape: Any = {"angles": "xy", "pivot": "tip", "units": "inches", "scale_units": "inches", **head}
+    ax.quiver(*tip[moves].T, *ahead.T, color=MUTED, alpha=0.8, lw=0, zorder=1, **shape)
 
 
 def _limits(x: np.ndarray, angle: bool | None = None) -> tuple[float, float]:

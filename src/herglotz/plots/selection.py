@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure
 
 from herglotz.data.units import common_unit
-from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, new_figure, styled, with_unit
+from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, logarithmic, new_figure, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.training.selection import Selection
@@ -32,7 +32,7 @@ def plot_selection(selection: Selection) -> Figure:
             label(ax, k + 0.22, min(c.error, ceiling), text, color, va="center", xytext=(5, 0))
             if any(failed) and math.isfinite(c.error):
                 label(ax, k, ceiling, f"{sum(failed)} failed", MUTED, ha="center", xytext=(0, 6))
-        ax.set_yscale("log")
+        logarithmic(ax)
         ax.set_ylim(min(finite) / 3, 1.5 * ceiling)  # at least a decade, so that a few per cent look small
         names = [f"{c.level}\n{c.parameters} parameters\n{c.step_us:.0f} µs a step" for c in candidates]
         ax.set_xticks(range(len(names)), names)

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from herglotz.data.units import common_unit
 from herglotz.errors import InputError
-from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, new_figure, styled, with_unit
+from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, logarithmic, new_figure, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -38,7 +38,7 @@ def plot_sizes(run: Run) -> Figure:
         ax.plot(taken["numbers"], taken["held_out"], "o", color=UNSEEN, ms=9)
         label(ax, taken["numbers"], taken["held_out"], "taken", UNSEEN, ha="center", xytext=(0, -16))
         if min(errors) > 0 and max(errors) > 3 * min(errors):
-            ax.set_yscale("log")
+            logarithmic(ax)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.margins(0.08, 0.15)
         unit = common_unit(run.data.units) if run.data.dof == 1 else ""

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from herglotz.errors import InputError
-from herglotz.plots.style import MODEL, MUTED, new_figure, styled
+from herglotz.plots.style import MODEL, MUTED, logarithmic, new_figure, styled
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -44,7 +44,8 @@ def plot_training(run: Run) -> Figure:
             ax.set_axis_off()
         for ax in axes[::columns]:
             ax.set_ylabel("cost")
-        figure.supxlabel("iteration of the stage", fontsize=9.5)
+        for ax in axes[: len(shown)][-columns:]:  # the lowest of each column
+            ax.set_xlabel("iteration of the stage")
     return figure
 
 
@@ -58,7 +59,7 @@ def _draw(ax: Axes, number: int, stage: Stage) -> None:
     y = np.array(cost)
     ax.plot(np.arange(len(y)), y, color=MODEL, marker="o", ms=3 if len(y) < 60 else 0)
     if (y > 0).all() and np.isfinite(y).all() and y.max() > 3 * y.min():
-        ax.set_yscale("log")
+        logarithmic(ax)
     else:
         ax.ticklabel_format(axis="y", useOffset=False)
     ax.xaxis.set_major_locator(MaxNLocator(4, integer=True))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 from html import escape
 from importlib.resources import files
 
-from herglotz.plots.style import DPI, styled
+from herglotz.plots.style import image
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
 
 COLOURS = {"fits to the noise": "#1b7f4d", "fits, worse": "#b26a00", "does not fit": "#b3261e"}
@@ -69,10 +68,7 @@ def _cell(text: str) -> str:
 
 
 def _data(picture: Picture) -> str:
-    buffer = io.BytesIO()
-    with styled():
-        picture.figure.savefig(buffer, format="png", dpi=DPI)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return "data:image/png;base64," + base64.b64encode(image(picture.figure, "png")).decode()
 
 
 def _slider(slider: Slider) -> str:

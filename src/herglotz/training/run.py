@@ -5,21 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories, as_trajectories
-from herglotz.data.anything import split_options
+from herglotz.data.anything import as_trajectories, split_options
 from herglotz.data.holds import Arrival
-from herglotz.data.trajectories import GAP
+from herglotz.data.trajectories import GAP, Trajectories
 from herglotz.errors import InputError, refuse
 from herglotz.mechanics import Driven
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.stepping.method import OneStepMethod
-from herglotz.theory import ContinuousEquation, FractionalStepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
@@ -28,6 +26,9 @@ from herglotz.training.motion import Motion, free_motion
 from herglotz.training.plan import Plan
 from herglotz.training.predict import Prediction, predict
 from herglotz.training.summary import as_html, one_line, summary
+
+if TYPE_CHECKING:
+    from herglotz.theory import ContinuousEquation
 
 
 @dataclass(frozen=True, repr=False)
@@ -114,7 +115,7 @@ class Run:
         """The continuous equation of the model at its typical step: field, energy H̃, modified Lagrangian L̃."""
         if isinstance(self.model, Driven) and self.data.u is not None:
             raise InputError("the model takes inputs: give them, ContinuousEquation(run.model.at(u), run.h)")
-        return ContinuousEquation(self.model, self.h)
+        return _asked("theory").ContinuousEquation(self.model, self.h)
 
     def at_step(self, h: float) -> OneStepMethod:
         """The model's motion at any step h > 0: a stepper, exact for the motion that the model has at its own step.
@@ -140,7 +141,8 @@ class Run:
         refuse({f"h must be > 0, got {h:g}": not h > 0})
         if self.h_range[0] <= h <= self.h_range[1]:
             return self.stepper
-        return FractionalStepper(self.continuous, tolerance=1e-3 if self.states.q.dtype == torch.float32 else 1e-6)
+        tolerance = {torch.float32: 1e-3, torch.float64: 1e-6}[self.states.q.dtype]
+        return _asked("theory").FractionalStepper(self.continuous, tolerance=tolerance)
 
     def energy(self, state: State) -> Tensor:
         """The energy H̃(q, p, s) of the model at states; dH̃/dt = −(∂H̃/∂s) H̃.
@@ -254,7 +256,7 @@ class Run:
         Parameters
         ----------
         name
-            trajectory, phase_portrait, learned, training, plan, momentum_vs_dS or hj_residual.
+            trajectory, phase_portrait, learned, training, plan, sizes, momentum_vs_dS or hj_residual.
 
         Returns
         -------
@@ -266,13 +268,13 @@ class Run:
         InputError
             If there is no figure of that name.
         """
-        known = _above("plots").NAMED
+        known = _asked("plots.theory").NAMED
         refuse({f"there is no figure {name!r}; choose one of {', '.join(known)}": name not in known})
         return known[name](self)
 
     def save(self, folder: str | Path) -> None:
         """Write the run into a folder, made if missing, as `save_run` does; `herglotz.load_run` reads it."""
-        _above("training.run_folder").save_run(self, folder)
+        _asked("training.run_folder").save_run(self, folder)
 
     def export(self, path: str | Path, kind: str | None = None, **settings: Any) -> Path:
         """Write one file that steps without this package (`herglotz.export.export_run`).
@@ -296,18 +298,18 @@ class Run:
         InputError
             If the kind is not known, or its extra is missing.
         """
-        return _above("export").export_run(self, path, kind, **settings)
+        return _asked("export").export_run(self, path, kind, **settings)
 
     def verify(self, **settings: Any) -> Any:
         """Measure every identity; `print(run.verify().table())` (`herglotz.verify.verify`)."""
-        return _above("verify").verify(self, **settings)
+        return _asked("verify").verify(self, **settings)
 
     def symmetries(self, **settings: Any) -> Any:
         """Find translations, rotations and other affine symmetries, and what they keep; `print(run.symmetries())`.
 
         J_{k+1} = c_k J_k within the error of the run's own free run (section 6 of `docs/mathematics.md`).
         """
-        return _above("verify").symmetries(self, **settings)
+        return _asked("verify").symmetries(self, **settings)
 
     def report(self, folder: str | Path, against: Any = None) -> list[Path]:
         """Write report.html, which fetches nothing, and its twin report.md.
@@ -330,7 +332,7 @@ class Run:
             If the recording cannot be read, or is not of the same coordinates.
         """
         other = None if against is None else as_trajectories(against, like=self.data)
-        return _above("report").write_report(self, folder, other, name=str(folder))
+        return _asked("report").write_report(self, folder, other, name=str(folder))
 
     def summary(self) -> str:
         """What was reached, in a few lines."""
@@ -343,6 +345,6 @@ class Run:
         return as_html(self)
 
 
-def _above(module: str) -> Any:
-    """A module that knows runs; loaded when a run is asked for something of it."""
+def _asked(module: str) -> Any:
+    """A module that fits do without, loaded when a run is asked for something of it; most of them know runs."""
     return import_module(f"herglotz.{module}")

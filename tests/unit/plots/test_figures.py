@@ -10,12 +10,14 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
 from fake_run import TERMS, fake_run
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
@@ -245,7 +247,8 @@ def test_lines_of_the_flow_last_as_long_as_the_longest_motion():
     flow = _background(run)
     assert flow.shape == (1, 31, 2, 2)
     for i, ax in enumerate(plot_phase_portrait(run).axes):
-        assert np.allclose(np.asarray(ax.lines[0].get_xydata()), flow[0, :, :, i])
+        (line,) = cast("LineCollection", ax.collections[0]).get_segments()
+        assert np.allclose(np.asarray(line), flow[0, :, :, i])
 
 
 def test_residuals_are_data_minus_model():  # fails if the lower panel shows something else
