@@ -19,7 +19,8 @@ from herglotz.data.smoothing import local_polynomials
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.functions import bands
+from herglotz.training.functions import functions_of
+from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import DRY, candidates, special, started
@@ -127,9 +128,12 @@ class Search:
         if best.at_the_noise or self.config.translations:
             return best
         part(MORE_TERMS)
-        fitter = self.fitter(Variant(self.order, functions=tuple(bands(self.over))))
-        other = self.climbed(fitter, fitter.simple, {})
-        if other is not None and not other.taken & {band.name for band in fitter.variant.functions}:
+        fitter = self.fitter(Variant(self.order, functions=tuple(functions_of(self.over, self.base))))
+        if len(fitter.start) > MAX_PARAMETERS:  # no kernel holds these
+            return best
+        forces = {name for name in fitter.functions if not name.startswith("mass")}
+        other = self.climbed(fitter, {*fitter.simple, *forces}, {}, joining=False)
+        if other is not None and not other.taken & set(fitter.functions):
             plain = self.fitter(replace(other.fitter.variant, functions=()))
             other = plain.fit(other.taken, other.values, other.length, other, 2 * ITERATIONS)
         better = self.better(best, other) or best
@@ -167,12 +171,14 @@ class Search:
         values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
         return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
 
-    def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
+    def climbed(
+        self, fitter: Fitter, taken: Iterable[str], values: dict[str, float], *, joining: bool = True
+    ) -> Trial | None:
         """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
         while trial is not None:
             trial = self.finer(trial)
-            while not trial.whole and (more := self.moved(trial)) is not None:
+            while joining and not trial.whole and (more := self.moved(trial)) is not None:
                 trial = self.finer(more)
             if (longer := trial.fitter.longer(trial)) is None:
                 return self.settled(trial)
