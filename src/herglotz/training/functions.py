@@ -1,20 +1,21 @@
-"""Functions of the coordinates that no named term says, as sums of waves with a Gaussian prior.
+"""Functions of coordinates and speeds that no named term says, as sums of waves with a Gaussian prior.
 
 A Gaussian process on an interval is a sum of the waves that vanish at its ends, each with a coefficient of its own
 (Solin & Särkkä 2020, Hilbert-space methods for reduced-rank Gaussian process regression): smooth functions need the
 longest waves alone. The interval is `REACH` times as long as what was recorded, so that its ends lie outside. On an
 angle they are whole waves, which are periodic; of a speed, and in the plane, waves whose period is the interval. What
-data do not tell of a function its prior holds at 0, so that all waves join a model together. Every wave is a named
-term, which is stepped, printed and exported like any other.
+data do not tell of a function its prior holds at 0, so that all waves join a model together. Octaves of a function are
+bands, each with a strength of its own. Every wave is a named term, which is stepped, printed and exported like any
+other.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations, combinations_with_replacement, groupby
 from typing import NamedTuple
 
 import torch
@@ -26,19 +27,22 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.named_terms import NamedTerms, own_terms
 
 REACH = 1.5  # times the recorded interval
-POTENTIAL, OF_MANY = 48, 16  # waves of the potential of one length, of each of several lengths; harmonics of an angle
+POTENTIAL, OF_MANY = 47, 15  # waves of the potential of one length, of each of several lengths; harmonics of an angle
 PLANE = 80  # of a potential of two lengths: pairs of cos and sin
-MASS = 8  # of the mass of one coordinate
-DAMPING = 4  # of damping by position: pairs of cos and sin
-FRICTION = 6  # of friction by speed: pairs of cos and sin
+MASS = 7  # of the mass of one coordinate
+DAMPING = 3  # of damping by position: pairs of cos and sin
+FRICTION = 7  # of friction by speed: pairs of cos and sin
+
+OWN = re.compile(r"(cos|sin)\(q\d+\)")  # of an angle: what the baseline has
 
 
-class Function(NamedTuple):
-    """Waves that join a model together."""
+class Band(NamedTuple):
+    """Waves of a function that join a model together, with one strength."""
 
-    name: str  # V(q1), damping(q1), mass(q1), friction(v1)
+    name: str  # V(q1) 1, damping(q1) 1, mass(q1) 2, friction(v1) 1
     texts: tuple[str, ...]
     rates: tuple[float, ...]  # of each wave, per unit of its coordinate
+    longest: float  # rate of the longest wave of the function
 
     @property
     def brakes(self) -> bool:
@@ -46,13 +50,13 @@ class Function(NamedTuple):
         return self.name.startswith(("damping", "friction"))
 
 
-def functions_of(data: Trajectories, base: Baseline) -> list[Function]:
+def bands(data: Trajectories, base: Baseline) -> list[Band]:
     """All functions that these coordinates may be given beside their named terms."""
     found: dict[str, list[tuple[str, float]]] = {}
     several = data.dof > 1
     for i, angle in enumerate(data.angles):
         own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], OF_MANY if several else POTENTIAL)
-        found[f"V(q{i + 1})"] = own[2:] if angle else own  # its first waves are named terms
+        found[f"V(q{i + 1})"] = own
         around = own if angle else _pairs(data, i)
         found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * DAMPING]]
         found[f"friction(v{i + 1})"] = _of_speed(f"v{i + 1}", base.speed[i])
@@ -68,10 +72,10 @@ def functions_of(data: Trajectories, base: Baseline) -> list[Function]:
         found[f"friction(v{j + 1} - v{i + 1})"] = _of_speed(f"(v{j + 1} - v{i + 1})", base.speed[i] + base.speed[j])
         if data.dof == 2 and data.units[i] == data.units[j]:
             found[f"V(q{i + 1}, q{j + 1})"] = _plane(data, i, j)
-    return [Function(name, *zip(*waves, strict=True)) for name, waves in found.items()]
+    return [band for name, waves in found.items() for band in _octaves(name, waves)]
 
 
-def terms_with(every: Sequence[Function], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
+def terms_with(every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
     """The terms with all waves of these functions, which take the place of powers in the potential but the lowest."""
     own = own_terms(angles)
     kept = [
@@ -83,11 +87,12 @@ def terms_with(every: Sequence[Function], terms: NamedTerms, angles: tuple[bool,
     return replace(terms, features=tuple(kept)).joined(still)
 
 
-def prior_spreads(every: Sequence[Function], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
-    """Prior deviations, by what a number is: forces, masses and rates of the motion's own size, and continuous.
+def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
+    """Prior deviations, by what a number is: forces and rates of the motion's own size, and half the mass.
 
-    Deviations fall with the number of the wave: of a potential that is a Matérn process of ν = 3/2. The lowest
-    `powers`, whose place waves could take, are known to the same size.
+    They fall with the rate k of the wave as those of a Matérn process of ν = 3/2 do, as k^−2 on a line and k^−2.5 in
+    the plane. A mass that is rougher or larger is negative somewhere in a fit of short segments. The lowest `powers`,
+    whose place waves could take, are known to the same size.
     """
     found: dict[str, float] = {}
     force = max(v * v / x for v, x in zip(base.speed, base.scale, strict=True))
@@ -97,13 +102,25 @@ def prior_spreads(every: Sequence[Function], base: Baseline, balance: Tensor, po
         scale = base.scale[int(at.rstrip("]") or 0)]
         found[key] = force * {"potential.stiffness": 1 / scale, "q1^2": 0.5 / scale}.get(stem, 1.0)
     for own in every:
-        longest = min(own.rates)
         for text, k in zip(own.texts, own.rates, strict=True):
             speeds = [int(x) - 1 for x in re.findall(r"v(\d+)", text)]
             mass = float((balance[0] / balance[speeds]).prod()) if len(speeds) == 2 else 1.0
-            size = {"V": force / k, "mass": mass, "damping": rate, "friction": force}[own.name.split("(")[0]]
-            found[text] = size * (longest / k) ** (1.5 if "," in own.name else 1.0)
+            sizes = {"V": force / own.longest, "mass": mass / 2, "damping": rate, "friction": force}
+            found[text] = sizes[own.name.split("(")[0]] * (own.longest / k) ** (2.5 if "," in own.name else 2.0)
     return found
+
+
+def _octaves(name: str, waves: list[tuple[str, float]]) -> Iterator[Band]:
+    """The waves of a function in octaves of their rates, the first two together.
+
+    An angle's own cos and sin are named terms.
+    """
+    longest = min(k for _, k in waves)
+    rest = [(text, k) for text, k in waves if not OWN.fullmatch(text)]
+    octave = lambda wave: max(2, math.floor(round(wave[1] / longest, 6)).bit_length())  # noqa: E731
+    for number, (_, part) in enumerate(groupby(rest, octave), 1):
+        texts, rates = zip(*part, strict=True)
+        yield Band(f"{name} {number}", texts, rates, longest)
 
 
 def _interval(data: Trajectories, form: list[tuple[int, float]]) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 
 from herglotz.models import ContactLagrangian
-from herglotz.training.functions import Function
+from herglotz.training.functions import Band
 from herglotz.training.named_terms import own_terms
 from herglotz.training.parameter_vector import ParameterVector
 
@@ -36,15 +36,15 @@ class Offer(NamedTuple):
 
 
 def offers_of(
-    model: ContactLagrangian, keys: list[str], functions: Sequence[Function] = (), terms: int = 0
+    model: ContactLagrangian, keys: list[str], bands: Sequence[Band] = (), terms: int = 0
 ) -> tuple[tuple[str, ...], list[Offer], frozenset[str]]:
     """The numbers that every model has, all offers, and the names of those that the simplest one has taken.
 
-    `keys` (`training.dictionary.keys_of`) are what the numbers are; those of waves join with their function. The last
+    `keys` (`training.dictionary.keys_of`) are what the numbers are; those of waves join in their `bands`. The last
     inputs are `terms` of others, which the simplest model is without.
     """
     numbers, always, found, simple = ParameterVector(model).numbers, [], [], set()
-    waves = {text for own in functions for text in own.texts}
+    waves = {text for own in bands for text in own.texts}
     m, n = model.inputs, model.dof
     of_terms = {f"{INPUTS}[{i * m + j}]" for i in range(n) for j in range(m - terms, m)}
     own = own_terms(model.config.angles)  # of one coordinate: its spring and tilt
@@ -61,7 +61,7 @@ def offers_of(
             if (stem in SIMPLE and number not in of_terms) or key in own:
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
-    found += [Offer(own.name, tuple(place[text] for text in own.texts)) for own in functions]
+    found += [Offer(own.name, tuple(place[text] for text in own.texts)) for own in bands]
     return tuple(always), found, frozenset(simple)
 
 

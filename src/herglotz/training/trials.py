@@ -22,7 +22,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
-from herglotz.training.functions import Function, prior_spreads, terms_with
+from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
 from herglotz.training.named_terms import DRY, candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import offers_of, without_offers
@@ -53,7 +53,7 @@ class Variant:
     order: int
     substeps: int = 1
     sticking: bool = False
-    functions: tuple[Function, ...] = ()  # of the coordinates, beside named terms
+    functions: tuple[Band, ...] = ()  # of the coordinates, beside named terms
 
 
 class Compared(NamedTuple):
@@ -176,8 +176,8 @@ class Fitter:
         like: Fitter | None = None,
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
-        every_function, terms = variant.functions, candidates(data, config.translations)
-        self.terms = terms = terms_with(every_function, terms, data.angles) if every_function else terms
+        every_band, terms = variant.functions, candidates(data, config.translations)
+        self.terms = terms = terms_with(every_band, terms, data.angles) if every_band else terms
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
         base = started(base, data, first, settings)
@@ -187,7 +187,7 @@ class Fitter:
         every = ParameterVector(self.model)
         self.keys = dict(zip(every.numbers, keys_of(every.numbers, self.model.config), strict=True))
         self.always, every_offer, self.simple = offers_of(
-            self.model, list(self.keys.values()), every_function, len(input_terms_of(data.columns))
+            self.model, list(self.keys.values()), every_band, len(input_terms_of(data.columns))
         )
         without_offers(self.model, every_offer)
         one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]  # is dry friction already
@@ -196,11 +196,11 @@ class Fitter:
         self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
         own, self.weights = prior_of(self.model, base, None), {}
         place = {key: name for name, key in self.keys.items()}
-        self.functions = {own.name: [place[text] for text in own.texts] for own in every_function}  # numbers of waves
+        self.functions = {own.name: [place[text] for text in own.texts] for own in every_band}  # numbers of waves
         for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
             self.weights[every.numbers[i]] = spread**-2
-        powers = [key for key in place if every_function and self._is_power(key)]
-        spreads = prior_spreads(every_function, base, data.balance, powers)
+        powers = [key for key in place if every_band and self._is_power(key)]
+        spreads = prior_spreads(every_band, base, data.balance, powers)
         self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}
         self.weights |= self.centred
         lengths = segment_lengths(data)
