@@ -68,7 +68,8 @@ def test_a_well_that_no_dictionary_holds_is_learned_as_a_function(searched):
     search, found = searched
     assert found.at_the_noise
     assert min(variant.substeps for variant in search.fitters if variant.functions) == 1  # not those of named terms
-    assert {"V(q1) 1", "damping(q1) 1"} <= found.taken
+    assert "damping(q1) 1" in found.taken
+    assert any(name.startswith("V(q1)") for name in found.taken)
     assert not any(name.startswith(("mass", "friction(v")) for name in found.taken)
     q = found.problem.data.q
     x = torch.linspace(float(q.quantile(0.02)), float(q.quantile(0.98)), 101, dtype=q.dtype)[:, None]
@@ -187,19 +188,19 @@ def test_a_mass_that_turns_is_learned():
     assert "mass(q1) 1" in found.taken
 
 
-def test_a_damper_that_saturates_is_learned_as_friction_by_speed():
+def test_a_damper_that_no_dictionary_holds_is_learned_as_friction_by_speed():
     # fails if no function of the speed is offered, its waves are those of another speed, or its sign is wrong
-    data = recorded(lambda q, v: -q - 0.5 * q**3 - 0.3 * np.tanh(4 * v), STARTS, angle=False)
+    data = recorded(lambda q, v: -q - 0.5 * q**3 - 0.1 * v - 0.2 * np.sin(5 * v), STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     found = ended(search)
     assert found.at_the_noise
-    assert "friction(v1) 1" in found.taken
+    assert any(name.startswith("friction(v1)") for name in found.taken)
     v = torch.linspace(-0.8, 0.8, 81, dtype=torch.float64)[:, None]
     drag = found.fitter.model.drag
     with torch.no_grad():
         found.problem.parameters.set(found.theta)
         learned = drag.terms(0 * v, v)[0] @ drag.coefficient + float(found.fitter.model.damping.rate) * v[:, 0]
-    assert float((learned - 0.3 * (4 * v[:, 0]).tanh()).square().mean().sqrt()) < 0.03
+    assert float((learned - 0.1 * v[:, 0] - 0.2 * (5 * v[:, 0]).sin()).square().mean().sqrt()) < 0.03
 
 
 def plane(angles=(False, False), units=("m", "m")):
