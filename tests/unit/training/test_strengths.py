@@ -13,7 +13,7 @@ class Fits:
     def __init__(self, losses=()):
         self.losses, self.asked = list(losses), []
 
-    def fit(self, taken, values, length, before, most):
+    def fit(self, taken, values, length, before, most):  # noqa: ARG002
         self.asked.append((set(before.taken - taken), most))
         loss = self.losses.pop(0) if self.losses else before.score.losses.sum().item()
         return None if loss is None else trial(self, taken, loss)
