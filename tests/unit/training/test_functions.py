@@ -188,11 +188,19 @@ def test_a_mass_that_turns_is_learned():
     assert "mass(q1) 1" in found.taken
 
 
+def without_named_terms(search):
+    """The model of functions that a search finds beside the simplest model."""
+    named = search.fitter(Variant(2))
+    first = named.fit(named.simple, {}, named.lengths[0], None)
+    assert first is not None
+    return search.with_functions(first)
+
+
 def test_a_damper_that_no_dictionary_holds_is_learned_as_friction_by_speed():
     # fails if no function of the speed is offered, its waves are those of another speed, or its sign is wrong
     data = recorded(lambda q, v: -q - 0.5 * q**3 - 0.1 * v - 0.2 * np.sin(5 * v), STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    found = ended(search)
+    found = without_named_terms(search)
     assert found.at_the_noise
     assert any(name.startswith("friction(v1)") for name in found.taken)
     v = torch.linspace(-0.8, 0.8, 81, dtype=torch.float64)[:, None]
@@ -280,10 +288,7 @@ def test_a_potential_of_both_coordinates_is_learned(monkeypatch):
     q = q + NOISE * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
     data = Trajectories.of(t.repeat(4), q, (161,) * 4)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    named = search.fitter(Variant(2))
-    first = named.fit(named.simple, {}, named.lengths[0], None)
-    assert first is not None
-    found = search.with_functions(first)
+    found = without_named_terms(search)
     assert "V(q1, q2) 1" in found.taken
     assert found.whole
     assert found.rms < 1.2 * found.fitter.precision
