@@ -65,7 +65,7 @@ MODELS = {
     "features of speed, coupled friction": config(
         2, features=("cos(q1 - q2) v1 v2", "q2 v1", "q2^3"), level="forced", coupled=True
     ),
-    "drag": config(1, (False,), level="forced", drag=("|v1| v1", "q1^2 v1", "v1^3")),
+    "drag": config(1, (False,), level="forced", drag=("|v1| v1", "q1^2 v1", "v1^3", "sin(2.5 v1)")),
     "dry friction of position": config(
         2,
         (False, True),
@@ -74,7 +74,10 @@ MODELS = {
         drag=("q1^2 sgn(v1)", "|v1| v1", "cos(q2) sgn(v1)", "sin(q2) sgn(v2)"),
     ),
     "dampers and air": config(
-        2, (False, False), level="forced", drag=("(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v")
+        2,
+        (False, False),
+        level="forced",
+        drag=("(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v", "cos(0.8 (v1 - v2))"),
     ),
     "drag of position, order four": config(
         2, (False, True), level="forced", drag=("q1^2 |v2| v2", "v1^2"), order=4, potential_width=0, coulomb=True

@@ -4,12 +4,12 @@ The text of one is a product: a power or a wave of a position if any, |v|, and a
 is a joint's own, or the one of two joints from one another, which a damper between them brakes:
 
     |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
-    cos(q1) v1     sin(2.5 q2) v1
+    cos(q1) v1     sin(2.5 q2) v1     sin(2.5 v1)     cos(0.8 (v1 - v2))
 
-`load 2` is a constant force on coordinate 2: on an angle no potential has it. `|v1|` is what viscous friction has more
-in one direction than in the other. `|v| v` brakes a body that moves in a
-plane or in space as air does: |v| is the length of the whole velocity. Dry friction changes with the position, or with
-the load that a position puts on a bearing, by
+Dampers that saturate or act on one side are sums of waves of a speed. `load 2` is a constant force on coordinate 2: on
+an angle no potential has it. `|v1|` is what viscous friction has more in one direction than in the other. `|v| v`
+brakes a body that moves in a plane or in space as air does: |v| is the length of the whole velocity. Dry friction
+changes with the position, or with the load that a position puts on a bearing, by
 
     q1^2 sgn(v1)        cos(q1) sgn(v1)        sin(q2) sgn(v1)
 """
@@ -35,6 +35,7 @@ _TEXT = re.compile(
     rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
     r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)|\|v(?P<even>\d+)\|"
 )
+_OF_SPEED = re.compile(rf"(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))\)")
 _DRY = re.compile(rf"{_AT} sgn\(v(?P<v>\d+)\)")
 AIR = "|v| v"
 
@@ -43,7 +44,8 @@ AIR = "|v| v"
 class DragFeature:
     """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of, which brakes the coordinate `on`, and drives `of`.
 
-    If `dry` q_at^a sgn(v); a `wave`, cos or sin, of rate · q_at stands in the place of its power.
+    If `dry` q_at^a sgn(v); a `wave`, cos or sin, of rate · q_at stands in the place of its power, or
+    `of_speed` one of rate · v alone.
     """
 
     on: int
@@ -56,6 +58,7 @@ class DragFeature:
     dry: bool = False
     wave: str = ""
     rate: float = 1.0
+    of_speed: bool = False
 
     @property
     def even(self) -> bool:
@@ -64,11 +67,25 @@ class DragFeature:
 
     def position(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the factor that depends on q_at, and its slope."""
-        if self.wave:
-            x = q * self.rate
-            value, slope = (x.cos(), -x.sin()) if self.wave == "cos" else (x.sin(), x.cos())
-            return value, slope * self.rate
-        return _power(q, self.a), _power(q, self.a - 1) * self.a
+        return self._wave(q) if self.wave and not self.of_speed else (_power(q, self.a), _power(q, self.a - 1) * self.a)
+
+    def speed(self, v: Tensor, width: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the factor that depends on v, and its slope; dry friction has this width, or is 0."""
+        if self.of_speed:
+            return self._wave(v)
+        if self.dry:
+            rate = 0.0 if width is None else 1 / width
+            grip = (v * rate).tanh()
+            return grip, (1.0 - grip * grip) * rate
+        own = v.abs() if self.b else torch.ones_like(v)
+        slope = v.sign() if self.even else own * _power(v, self.c - 1) * (self.b + self.c)
+        return own * _power(v, self.c), slope
+
+    def _wave(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the wave of rate · x, and its slope."""
+        x = x * self.rate
+        value, slope = (x.cos(), -x.sin()) if self.wave == "cos" else (x.sin(), x.cos())
+        return value, slope * self.rate
 
 
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
@@ -82,6 +99,8 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
         return DragFeature(0, 0, 0, 1, 1, air=True)
     if (dry := _DRY.fullmatch(plain)) is not None:
         return _parse_dry(text, dry.groupdict(), angles)
+    if (of_speed := _OF_SPEED.fullmatch(plain)) is not None:
+        return _parse_wave(text, of_speed.groupdict(), len(angles))
     return _parse_power(text, plain, angles)
 
 
@@ -90,7 +109,8 @@ def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
     match, n = _TEXT.fullmatch(plain), len(angles)
     if match is None:
         raise InputError(
-            f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'load 1' or 'cos(q1) sgn(v1)'"
+            f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1' or "
+            "'cos(q1) sgn(v1)'"
         )
     found = match.groupdict()
     speed = found["v"] or found["apart"]
@@ -105,6 +125,19 @@ def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
     })  # fmt: skip
     b = int(found["size"] is not None or found["even"] is not None)
     return DragFeature(on - 1, at - 1, a, b, c, of[0] - 1 if of else None, wave=wave, rate=rate)
+
+
+def _parse_wave(text: str, found: dict[str, str | None], n: int) -> DragFeature:
+    """A wave of a speed."""
+    on, *of = (int(digits) for digits in re.findall(r"\d+", found["v"] or found["apart"] or ""))
+    refuse({
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, *of)),
+        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
+    })  # fmt: skip
+    rate = float(found["rate"] or 1)
+    return DragFeature(
+        on - 1, on - 1, 0, 0, 0, of[0] - 1 if of else None, wave=found["wave"] or "", rate=rate, of_speed=True
+    )
 
 
 def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) -> DragFeature:
@@ -165,16 +198,8 @@ class Drag(nn.Module):
         x, y = q @ self.at.T, v @ self.on.T
         columns = []
         for g, f in enumerate(self.features):
-            at, speed = x[..., g], y[..., g]
-            position, slope = f.position(at)
-            if f.dry:
-                rate = 0.0 if widths is None else 1 / widths[f.on]
-                grip = (speed * rate).tanh()
-                bend = (1.0 - grip * grip) * rate
-            else:
-                own = speed.abs() if f.b else torch.ones_like(speed)
-                bend = speed.sign() if f.even else own * _power(speed, f.c - 1) * (f.b + f.c)
-                grip = own * _power(speed, f.c)
+            position, slope = f.position(x[..., g])
+            grip, bend = f.speed(y[..., g], None if widths is None else widths[f.on])
             columns.append((position * grip, slope * grip, position * bend))
         value, by_q, by_v = (torch.stack(x, -1) for x in zip(*columns, strict=True))
         return value, by_q, by_v

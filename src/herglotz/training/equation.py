@@ -161,7 +161,7 @@ def _functions(lines: Iterable[Line]) -> list[str]:
     found = []
     for line in lines:
         match = WAVE.fullmatch(line.what)
-        of = "" if match is None else ", ".join(dict.fromkeys(re.findall(r"[^\W\d]\w*", match["form"])))
+        of = "" if match is None else ", ".join(dict.fromkeys(re.findall(r"[^\W\d]\w*′?", match["form"])))
         found.append((line.left, of, "" if match is None else match["speeds"]) if of else None)
     counts, names = Counter(found), {}
     for key in found:

@@ -32,7 +32,9 @@ def drag_in_words(f: DragFeature, i: int, names: Sequence[str], sign: str = "") 
     speed = f"{names[f.on]}′" if f.of is None else f"({names[f.on]}′ − {names[f.of]}′)"
     position, size = [raised(names[f.at], f.a)] if f.a else [], [f"|{speed.strip('()')}|"] if f.b else []
     if f.wave:
-        position = [f"{f.wave}({'' if f.rate == 1 else f'{plain(f.rate)} '}{names[f.at]})"]
+        own = "" if f.rate == 1 else f"{plain(f.rate)} "
+        form = names[f.at] if not f.of_speed else speed if f.of is None else speed[1:-1].replace("− ", f"− {own}")
+        position = [f"{f.wave}({own}{form})"]
     if f.dry:
         return f"{position[0]} {sign}"
     return " ".join([*position, *size, *([raised(speed, f.c)] if f.c else [])])

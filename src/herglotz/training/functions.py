@@ -1,10 +1,12 @@
-"""Functions of the coordinates that no named term says, as sums of waves with a Gaussian prior.
+"""Functions of coordinates and speeds that no named term says, as sums of waves with a Gaussian prior.
 
 A Gaussian process on an interval is a sum of the waves that vanish at its ends, each with a coefficient of its own
 (Solin & Särkkä 2020, Hilbert-space methods for reduced-rank Gaussian process regression): smooth functions need the
 longest waves alone. The interval is `REACH` times as long as what was recorded, so that its ends lie outside. On an
-angle they are whole waves, which are periodic. They join a model in bands, the longest waves first: the search takes as
-many as held-out time asks for, and every wave is a named term, which is stepped, printed and exported like any other.
+angle they are whole waves, which are periodic; of a speed, and in the plane, waves whose period is the interval. What
+data do not tell of a function its prior holds at 0, so that all waves join a model together. Octaves of a function are
+bands, each with a strength of its own. Every wave is a named term, which is stepped, printed and exported like any
+other.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations, combinations_with_replacement, groupby
 from typing import NamedTuple
 
 import torch
@@ -22,68 +24,75 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.models.features import parse
 from herglotz.training.baseline import Baseline
-from herglotz.training.dictionary import WAVES
 from herglotz.training.named_terms import NamedTerms, own_terms
 
 REACH = 1.5  # times the recorded interval
-POTENTIAL = (8, 16, 32, 48)  # the waves that bands of a potential end with; of several lengths the first two
-MASS = (4, 8)  # of the mass of one coordinate
-DAMPING = (2, 4)  # of damping: pairs of cos and sin
+POTENTIAL, OF_MANY = 47, 15  # waves of the potential of one length, of each of several lengths; harmonics of an angle
+PLANE = 80  # of a potential of two lengths: pairs of cos and sin
+MASS = 7  # of the mass of one coordinate
+DAMPING = 3  # of damping by position: pairs of cos and sin
+FRICTION = 7  # of friction by speed: pairs of cos and sin
+
+OWN = re.compile(r"(cos|sin)\(q\d+\)")  # of an angle: what the baseline has
 
 
 class Band(NamedTuple):
-    """Waves that join a model together."""
+    """Waves of a function that join a model together, with one strength."""
 
-    function: str  # V(q1), damping(q1), mass(q1)
-    name: str  # the same with the numbers of the waves
+    name: str  # V(q1) 1, damping(q1) 1, mass(q1) 2, friction(v1) 1
     texts: tuple[str, ...]
     rates: tuple[float, ...]  # of each wave, per unit of its coordinate
-    longest: float  # that of the longest wave of the function
+    longest: float  # rate of the longest wave of the function
+
+    @property
+    def brakes(self) -> bool:
+        """Whether it is a force beside L."""
+        return self.name.startswith(("damping", "friction"))
 
 
-def bands(data: Trajectories) -> list[Band]:
+def bands(data: Trajectories, base: Baseline) -> list[Band]:
     """All functions that these coordinates may be given beside their named terms."""
-    found: list[Band] = []
+    found: dict[str, list[tuple[str, float]]] = {}
     several = data.dof > 1
     for i, angle in enumerate(data.angles):
-        own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], POTENTIAL[-1])
-        named = (1 if several else WAVES) if angle else 0  # its first waves are named terms
-        ends = (named + POTENTIAL[0], POTENTIAL[1]) if angle else POTENTIAL[: 2 if several else None]
-        found += _split(f"V(q{i + 1})", own, ends, 2 if angle else 1, named)
+        own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], OF_MANY if several else POTENTIAL)
+        found[f"V(q{i + 1})"] = own
         around = own if angle else _pairs(data, i)
-        found += _split(f"damping(q{i + 1})", [(f"{x} v{i + 1}", k) for x, k in around], DAMPING, 2)
+        found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * DAMPING]]
+        found[f"friction(v{i + 1})"] = _of_speed(f"v{i + 1}", base.speed[i])
         if not several:
-            found += _split("mass(q1)", [(f"{x} v1^2", k) for x, k in own], MASS, 2 if angle else 1)
+            found["mass(q1)"] = [(f"{x} v1^2", k) for x, k in own[: 2 * MASS if angle else MASS]]
         elif angle:
             for a, b in combinations_with_replacement(range(1, data.dof + 1), 2):
-                moving = [(f"{x} v{a} v{b}", k) for x, k in own]
-                found += _split(f"mass(q{i + 1}) of v{a} v{b}", moving, (2,), 2, 1)
+                found[f"mass(q{i + 1}) of v{a} v{b}"] = [(f"{x} v{a} v{b}", k) for x, k in own[2:4]]
     for i, j in combinations(range(data.dof), 2):
         if data.angles[i] or data.angles[j]:
             continue
-        between = _waves(data, [(j, 1.0), (i, -1.0)], POTENTIAL[1])
-        found += _split(f"V(q{j + 1} - q{i + 1})", between, POTENTIAL[:2], 1)
-    return found
+        found[f"V(q{j + 1} - q{i + 1})"] = _waves(data, [(j, 1.0), (i, -1.0)], OF_MANY)
+        found[f"friction(v{j + 1} - v{i + 1})"] = _of_speed(f"(v{j + 1} - v{i + 1})", base.speed[i] + base.speed[j])
+        if data.dof == 2 and data.units[i] == data.units[j]:
+            found[f"V(q{i + 1}, q{j + 1})"] = _plane(data, i, j)
+    return [band for name, waves in found.items() for band in _octaves(name, waves)]
 
 
 def terms_with(every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
-    """The terms with all waves of these bands, which take the place of powers in the potential but the lowest."""
+    """The terms with all waves of these functions, which take the place of powers in the potential but the lowest."""
     own = own_terms(angles)
     kept = [
         text for text in terms.features
         if "v" in text or text in own or parse(text, angles)[0].function in ("cos", "sin")
     ]  # fmt: skip
-    texts = [text for band in every for text in band.texts]
-    drag = tuple(text for band in every if band.function.startswith("damping") for text in band.texts)
-    still = NamedTerms(tuple(text for text in texts if text not in drag), drag)
+    waves = {brakes: [text for own in every if own.brakes == brakes for text in own.texts] for brakes in (False, True)}
+    still = NamedTerms(tuple(waves[False]), tuple(waves[True]))
     return replace(terms, features=tuple(kept)).joined(still)
 
 
 def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
-    """Prior deviations, by what a number is: forces, masses and rates of the motion's own size, and continuous.
+    """Prior deviations, by what a number is: forces and rates of the motion's own size, and half the mass.
 
-    Deviations fall with the number of the wave: of a potential that is a Matérn process of ν = 3/2. The lowest
-    `powers`, whose place waves could take, are known to the same size.
+    They fall with the rate k of the wave as those of a Matérn process of ν = 3/2 do, as k^−2 on a line and k^−2.5 in
+    the plane. A mass that is rougher or larger is negative somewhere in a fit of short segments. The lowest `powers`,
+    whose place waves could take, are known to the same size.
     """
     found: dict[str, float] = {}
     force = max(v * v / x for v, x in zip(base.speed, base.scale, strict=True))
@@ -92,26 +101,26 @@ def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers
         stem, _, at = key.partition("[")
         scale = base.scale[int(at.rstrip("]") or 0)]
         found[key] = force * {"potential.stiffness": 1 / scale, "q1^2": 0.5 / scale}.get(stem, 1.0)
-    for band in every:
-        for text, k in zip(band.texts, band.rates, strict=True):
+    for own in every:
+        for text, k in zip(own.texts, own.rates, strict=True):
             speeds = [int(x) - 1 for x in re.findall(r"v(\d+)", text)]
             mass = float((balance[0] / balance[speeds]).prod()) if len(speeds) == 2 else 1.0
-            size = {"V": force / k, "mass": mass, "damping": rate}[band.function.split("(")[0]]
-            found[text] = size * band.longest / k
+            sizes = {"V": force / own.longest, "mass": mass / 2, "damping": rate, "friction": force}
+            found[text] = sizes[own.name.split("(")[0]] * (own.longest / k) ** (2.5 if "," in own.name else 2.0)
     return found
 
 
-def _split(
-    name: str, waves: list[tuple[str, float]], ends: tuple[int, ...], each: int, first: int = 0
-) -> Iterator[Band]:
-    """Waves, `each` of one number, in bands that end with these numbers; the `first` numbers are left out."""
-    longest = min(k for _, k in waves[first * each :])
-    for end in ends:
-        part = waves[first * each : end * each]
-        if part:
-            texts, rates = zip(*part, strict=True)
-            yield Band(name, f"{name}, waves {first + 1}-{end}", texts, rates, longest)
-        first = end
+def _octaves(name: str, waves: list[tuple[str, float]]) -> Iterator[Band]:
+    """The waves of a function in octaves of their rates, the first two together.
+
+    An angle's own cos and sin are named terms.
+    """
+    longest = min(k for _, k in waves)
+    rest = [(text, k) for text, k in waves if not OWN.fullmatch(text)]
+    octave = lambda wave: max(2, math.floor(round(wave[1] / longest, 6)).bit_length())  # noqa: E731
+    for number, (_, part) in enumerate(groupby(rest, octave), 1):
+        texts, rates = zip(*part, strict=True)
+        yield Band(f"{name} {number}", texts, rates, longest)
 
 
 def _interval(data: Trajectories, form: list[tuple[int, float]]) -> tuple[float, float]:
@@ -135,9 +144,29 @@ def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> lis
 
 def _pairs(data: Trajectories, i: int) -> list[tuple[str, float]]:
     """Waves of one coordinate whose period is its interval."""
-    half = _interval(data, [(i, 1.0)])[1]
-    rates = [j * _short(math.pi / half) for j in range(1, DAMPING[-1] + 1)]
-    return [(f"{f}({k:.10g} q{i + 1})", k) for k in rates for f in ("cos", "sin")]
+    return _periodic(f"q{i + 1}", _interval(data, [(i, 1.0)])[1], DAMPING)
+
+
+def _of_speed(speed: str, largest: float) -> list[tuple[str, float]]:
+    """Waves of a speed, a number or a difference, whose period is its interval."""
+    return _periodic(speed, REACH * largest, FRICTION)
+
+
+def _periodic(x: str, half: float, count: int) -> list[tuple[str, float]]:
+    """Pairs of cos and sin of a number whose period is its interval."""
+    rates = [j * _short(math.pi / half) for j in range(1, count + 1)]
+    return [(f"{f}({k:.10g} {x})", k) for k in rates for f in ("cos", "sin")]
+
+
+def _plane(data: Trajectories, i: int, j: int) -> list[tuple[str, float]]:
+    """Plane waves of two coordinates that are periodic on the rectangle of their intervals, the longest ones first."""
+    a, b = (_short(math.pi / _interval(data, [(at, 1.0)])[1]) for at in (i, j))
+    every = ((math.hypot(m * a, n * b), m * a, n * b) for m in range(PLANE) for n in range(-PLANE, PLANE))
+    found = []
+    for k, x, y in sorted(wave for wave in every if wave[1] > 0 or wave[2] > 0)[:PLANE]:
+        parts = [f"{abs(w):.10g} q{at + 1}" for w, at in ((x, i), (y, j)) if w]
+        found += [(f"{f}({(' - ' if y < 0 else ' + ').join(parts)})", k) for f in ("cos", "sin")]
+    return found
 
 
 def _short(x: float) -> float:
@@ -147,5 +176,5 @@ def _short(x: float) -> float:
 
 def _harmonics(i: int) -> list[tuple[str, float]]:
     """Waves of whole multiples of an angle."""
-    every = range(1, POTENTIAL[1] + 1)
+    every = range(1, OF_MANY + 1)
     return [(f"{f}({'' if k == 1 else k}q{i + 1})", float(k)) for k in every for f in ("cos", "sin")]

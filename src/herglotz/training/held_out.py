@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from herglotz.data import Trajectories
 from herglotz.training.problems.shooting import ShootingProblem
@@ -115,13 +116,15 @@ def _factors(equations: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Of a curvature that is none the factor is NaN.
     """
     P = equations.shape[1]
-    there, i = index < P, index.clamp(max=P - 1)
-    A = equations[:, i[:, :, None], i[:, None, :]] * there[:, :, None] * there[:, None, :]
+    A = equations[..., :P]
     size = A.diagonal(dim1=-2, dim2=-1)
     size = torch.where(size > 0, size, 1.0).sqrt()
-    A = A / size[..., None] / size[..., None, :] + torch.diag_embed(torch.where(there, RIDGE, 1.0))
-    factor, info = torch.linalg.cholesky_ex(A.nan_to_num(nan=-1.0))
-    return torch.where((info == 0)[..., None, None], factor, torch.nan), size, i.expand(len(A), *i.shape)
+    A = pad((A / size[..., None] / size[..., None, :]).nan_to_num(nan=-1.0), (0, 1, 0, 1))  # P is no number
+    A, there = A[:, index[:, :, None], index[:, None, :]], index < P
+    A.diagonal(dim1=-2, dim2=-1).add_(torch.where(there, RIDGE, 1.0))
+    factor, info = torch.linalg.cholesky_ex(A)
+    factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
+    return factor, pad(size, (0, 1), value=1.0)[:, index], index.clamp(max=P - 1).expand(len(A), *index.shape)
 
 
 def blocks(data: Trajectories) -> Tensor:

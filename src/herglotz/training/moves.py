@@ -51,7 +51,7 @@ class Moves:
         """Of models with these sets of offers."""
         sets = list(sets)
         new = [own for own in dict.fromkeys(sets) if own not in self.known]
-        curvatures = BLOCKS * (1 + max(map(len, new), default=0)) ** 2
+        curvatures = BLOCKS * max((len(self.fitter.numbers(own)) for own in new), default=0) ** 2
         many = max(1, MEMORY // max(curvatures, self.fitter.data.q.numel()))
         for k in range(0, len(new), many):
             part = new[k : k + many]

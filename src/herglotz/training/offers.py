@@ -44,7 +44,7 @@ def offers_of(
     inputs are `terms` of others, which the simplest model is without.
     """
     numbers, always, found, simple = ParameterVector(model).numbers, [], [], set()
-    waves = {text: band.name for band in bands for text in band.texts}
+    waves = {text for own in bands for text in own.texts}
     m, n = model.inputs, model.dof
     of_terms = {f"{INPUTS}[{i * m + j}]" for i in range(n) for j in range(m - terms, m)}
     own = own_terms(model.config.angles)  # of one coordinate: its spring and tilt
@@ -54,6 +54,8 @@ def offers_of(
             always.append(number)
         elif key in waves:
             continue
+        elif bands and (stem in SIMPLE[:2] or key in own):  # what holds a motion beyond the data, where waves are 0
+            always.append(number)
         elif stem not in SHAPES.values() and not (stem == "friction.viscous" and model.dof == 1):  # that is the rate
             shape = number.replace(stem, SHAPES.get(stem, stem))
             on = key.replace(stem, ON[stem]) if stem in ON else ""
@@ -61,7 +63,7 @@ def offers_of(
             if (stem in SIMPLE and number not in of_terms) or key in own:
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
-    found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]
+    found += [Offer(own.name, tuple(place[text] for text in own.texts)) for own in bands]
     return tuple(always), found, frozenset(simple)
 
 

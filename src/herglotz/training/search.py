@@ -21,6 +21,7 @@ from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.functions import bands
+from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import DRY, candidates, special, started
@@ -29,6 +30,7 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import differing_zeros
+from herglotz.training.strengths import likeliest, needed, of_terms
 from herglotz.training.task import LEAST_GRIP, build_model
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
 
@@ -121,20 +123,20 @@ class Search:
 
     @inside()
     def with_functions(self, best: Trial) -> Trial:
-        """A model of functions of the coordinates in the place of one of named terms, where held-out time asks for it.
-
-        It is built up as any other, from the simplest model with the functions among its offers.
-        """
+        """A model of functions, all at once and without masses first, where held-out time asks for it."""
         if best.at_the_noise or self.config.translations:
             return best
         part(MORE_TERMS)
-        fitter = self.fitter(Variant(self.order, functions=tuple(bands(self.over))))
-        other = self.climbed(fitter, fitter.simple, {})
-        if other is not None and not other.taken & {band.name for band in fitter.variant.functions}:
-            plain = self.fitter(replace(other.fitter.variant, functions=()))
-            other = plain.fit(other.taken, other.values, other.length, other, 2 * ITERATIONS)
-        better = self.better(best, other) or best
-        return best if other is None else self.braking(self.finalist(better, (best, other)))
+        fitter = self.fitter(Variant(self.order, functions=tuple(bands(self.over, self.base))))
+        if len(fitter.start) > MAX_PARAMETERS:  # no kernel holds them
+            return best
+        every, masses = {*fitter.simple, *fitter.functions}, {x for x in fitter.functions if x.startswith("mass")}
+        other = self.climbed(fitter, every - masses, {}, joining=False)
+        if masses and not (other and other.at_the_noise):
+            other = self.better(other, self.climbed(fitter, every, {}, joining=False))
+        if other is not None and not other.taken & set(fitter.functions):
+            other = of_terms(other, self.fitter(replace(other.fitter.variant, functions=())), 2 * ITERATIONS)
+        return best if other is None else self.braking(self.finalist(self.better(best, other) or best, (best, other)))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
         """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
@@ -168,15 +170,15 @@ class Search:
         values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
         return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
 
-    def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
+    def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float], joining=True) -> Trial | None:
         """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
         while trial is not None:
             trial = self.finer(trial)
-            while not trial.whole and (more := self.moved(trial)) is not None:
+            while joining and not trial.whole and (more := self.moved(trial)) is not None:
                 trial = self.finer(more)
             if (longer := trial.fitter.longer(trial)) is None:
-                return self.settled(trial)
+                return self.settled(needed(likeliest(trial, 2 * self.most), 2 * self.most))
             trial = longer
         return None
 
@@ -200,9 +202,7 @@ class Search:
         seen = {trial.taken}
         while (other := self.moved(trial, seen, whole=True, swapped=swapped)) is not None:
             seen.add(other.taken)
-            if other.sizes:  # functions have a prior, whose strength follows from the fit
-                other = other.fitter.fit(other.taken, other.values, other.length, other, 2 * self.most) or other
-            trial = self.finer(other.fitter.grow(other))
+            trial = self.finer(other.fitter.grow(likeliest(other, 2 * self.most)))
         return trial
 
     def moved(

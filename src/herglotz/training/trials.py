@@ -25,7 +25,7 @@ from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
 from herglotz.training.named_terms import DRY, candidates, settings_of, started, turns_one_way
-from herglotz.training.offers import offers_of, without_offers
+from herglotz.training.offers import ALWAYS, offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
@@ -202,12 +202,10 @@ class Fitter:
         self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
         own, self.weights = prior_of(self.model, base, None), {}
         place = {key: name for name, key in self.keys.items()}
-        self.functions: dict[str, list[str]] = {}  # the numbers of the waves of each
-        for band in every_band:
-            self.functions.setdefault(band.function, []).extend(place[text] for text in band.texts)
+        self.functions = {own.name: [place[text] for text in own.texts] for own in every_band}  # numbers of waves
         for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
             self.weights[every.numbers[i]] = spread**-2
-        powers = [key for key in place if every_band and self._is_power(key)]
+        powers = [self.keys[name] for name in self.always if every_band and not name.startswith(ALWAYS)]
         spreads = prior_spreads(every_band, base, data.balance, powers)
         self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}
         self.weights |= self.centred
@@ -219,10 +217,6 @@ class Fitter:
         known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
         self.known = self.smooth, self.precision, self.spread = known  # of the data, whatever the variant
         self.compared: list[Compared] = []
-
-    def _is_power(self, key: str) -> bool:
-        """Whether a number is that of the lowest powers or waves of a potential, which every simplest model has."""
-        return key in self.simple and not key.startswith("friction")
 
     def prior(self, names: Collection[str], scales: Mapping[str, float] | None = None) -> Gaussian:
         """Of these numbers, in the order of the model; with `scales` of the variances of functions."""

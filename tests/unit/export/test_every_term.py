@@ -43,7 +43,7 @@ CASES: dict[str, tuple[str, Setting]] = {
     }),
     "powers and functions": ("l", {
         "level": "forced", "alike": True,
-        "drag": ("|v1| v1", "q1 v1", "q1^2 v1", "sin(0.7 q1) v1", "cos(1.4 q1) v1"),
+        "drag": ("|v1| v1", "q1 v1", "q1^2 v1", "sin(0.7 q1) v1", "cos(1.4 q1) v1", "sin(0.9 v1)", "cos(1.8 v1)"),
         "features": ("q1", *(f"q1^{k}" for k in range(2, 7)), "sin(1.3 q1 + 0.4)", "cos(2.6 q1 - 1) v1^2",
                      "cos(q1 + 1) - cos(2 q1 - 0.5)"),
     }),
@@ -60,7 +60,7 @@ CASES: dict[str, tuple[str, Setting]] = {
     }),
     "lengths": ("ll", {
         "level": "forced", "diagonal": True, "coulomb": True, "sticking": True, "features": ("lengths", "q1 v1^2 v2"),
-        "drag": ("|v| v", "(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 v2", "(v1 - v2)^3", "|v2|"),
+        "drag": ("|v| v", "(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 v2", "(v1 - v2)^3", "|v2|", "sin(0.8 (v1 - v2))"),
     }),
     "one distance": ("ll", {"level": "conservative", "alike": True, "order": 4, "features": ("r^-1",)}),
     "one field": ("ll", {"features": ("q1 v2 - q2 v1",), "known": ("0.3 q1^2",)}),
@@ -208,7 +208,7 @@ def kinds(config: ModelConfig) -> Iterator[tuple]:
             yield "feature", x.function, x.power < 0, len(x.velocities), len(set(x.velocities))
     for text in config.drag:
         f = parse_drag(text, config.angles)
-        yield "drag", f.dry, f.wave, f.air, f.a > 0, f.b, min(f.c, 2), f.of is None
+        yield "drag", f.dry, f.wave, f.of_speed, f.air, f.a > 0, f.b, min(f.c, 2), f.of is None
 
 
 def recordings() -> Iterator[Trajectories]:

@@ -14,7 +14,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.features import parse
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.functions import REACH, bands
+from herglotz.training.functions import FRICTION, PLANE, REACH, bands, prior_spreads
 from herglotz.training.moves import Moves
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.shooting import ShootingProblem
@@ -63,14 +63,14 @@ def searched():
 
 
 def test_a_well_that_no_dictionary_holds_is_learned_as_a_function(searched):
-    # fails if functions are not offered, their prior is that of another size, or a band is missing: the force is then
+    # fails if functions are not offered, or their prior is that of another size: the force is then
     # off by a tenth and more
     search, found = searched
     assert found.at_the_noise
     assert min(variant.substeps for variant in search.fitters if variant.functions) == 1  # not those of named terms
+    assert "damping(q1) 1" in found.taken
     assert any(name.startswith("V(q1)") for name in found.taken)
-    assert any(name.startswith("damping(q1)") for name in found.taken)
-    assert not any(name.startswith("mass(q1)") for name in found.taken)
+    assert not any(name.startswith(("mass", "friction(v")) for name in found.taken)
     q = found.problem.data.q
     x = torch.linspace(float(q.quantile(0.02)), float(q.quantile(0.98)), 101, dtype=q.dtype)[:, None]
     with torch.no_grad():
@@ -115,7 +115,7 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
 def test_waves_of_a_part_are_those_of_all(monkeypatch):
     # fails if the waves that a search finds in a part of a long recording have another interval in the whole of it
     asked = []
-    monkeypatch.setattr("herglotz.training.search.bands", lambda data: asked.append(data) or bands(data))
+    monkeypatch.setattr("herglotz.training.search.bands", lambda data, base: asked.append(data) or bands(data, base))
     monkeypatch.setattr("herglotz.training.search.PART", 170)
     data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
@@ -127,9 +127,9 @@ def test_waves_of_a_part_are_those_of_all(monkeypatch):
     assert all(over is data for over in asked)
     of = next(variant for variant in search.part.fitters if variant.functions)
     assert {variant.functions for variant in search.part.fitters} == {(), of.functions}
-    assert of.functions == tuple(bands(data))
+    assert of.functions == tuple(bands(data, search.base))
     fitter = search.part.fitter(of)
-    found = fitter.fit({*fitter.simple, "V(q1), waves 1-8"}, {}, fitter.lengths[0], None)
+    found = fitter.fit({*fitter.simple, "V(q1) 1", "V(q1) 2"}, {}, fitter.lengths[0], None)
     assert found is not None
     whole = search.again(found)
     assert whole is not None
@@ -150,9 +150,9 @@ def test_waves_vanish_beyond_what_was_recorded():
     # fails if the interval or the phases of waves are those of other data
     q = torch.tensor([[5.0], [5.4], [5.1], [5.3]], dtype=torch.float64).repeat(10, 1)
     data = Trajectories.of(0.1 * torch.arange(40, dtype=torch.float64), q)
-    found = [(band, text) for band in bands(data) if band.function == "V(q1)" for text in band.texts]
+    found = [text for own in bands(data, estimate_baseline(data)) if own.name.startswith("V(q1)") for text in own.texts]
     half = REACH * 0.2
-    for k, (_, text) in enumerate(found, 1):
+    for k, text in enumerate(found, 1):
         (product,) = parse(text, (False,))
         assert product.form[0] == pytest.approx(math.pi * k / (2 * half), rel=1e-6)
         for end in (5.2 - half, 5.2 + half):
@@ -163,13 +163,15 @@ def test_waves_vanish_beyond_what_was_recorded():
 def test_waves_of_angles_are_periodic():
     # fails if a wave of an angle is not a whole one: after a turn it would be another force
     q = torch.linspace(0, 9, 60, dtype=torch.float64)[:, None]
-    every = bands(Trajectories.of(0.1 * torch.arange(60, dtype=torch.float64), q, angles=(True,)))
-    assert {band.function for band in every} == {"V(q1)", "damping(q1)", "mass(q1)"}
-    for band in every:
-        for text in band.texts:
-            if band.function == "damping(q1)":
+    data = Trajectories.of(0.1 * torch.arange(60, dtype=torch.float64), q, angles=(True,))
+    every = bands(data, estimate_baseline(data))
+    assert {own.name[:-2] for own in every} == {"V(q1)", "damping(q1)", "mass(q1)", "friction(v1)"}
+    assert not {"cos(q1)", "sin(q1)"} & {text for own in every for text in own.texts}
+    for own in every:
+        for text in own.texts:
+            if own.name.startswith("damping"):
                 assert parse_drag(text, (True,)).rate % 1 == 0
-            else:
+            elif not own.name.startswith("friction"):
                 assert all(product.form[0] % 1 == 0 for product in parse(text, (True,)))
 
 
@@ -183,7 +185,113 @@ def test_a_mass_that_turns_is_learned():
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     found = ended(search)
     assert found.at_the_noise
-    assert any(name.startswith("mass(q1)") for name in found.taken)
+    assert "mass(q1) 1" in found.taken
+
+
+def without_named_terms(search):
+    """The model of functions that a search finds beside the simplest model."""
+    named = search.fitter(Variant(2))
+    first = named.fit(named.simple, {}, named.lengths[0], None)
+    assert first is not None
+    return search.with_functions(first)
+
+
+def test_a_damper_that_no_dictionary_holds_is_learned_as_friction_by_speed():
+    # fails if no function of the speed is offered, its waves are those of another speed, or its sign is wrong
+    data = recorded(lambda q, v: -q - 0.5 * q**3 - 0.1 * v - 0.2 * np.sin(5 * v), STARTS, angle=False)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    found = without_named_terms(search)
+    assert found.at_the_noise
+    assert any(name.startswith("friction(v1)") for name in found.taken)
+    v = torch.linspace(-0.8, 0.8, 81, dtype=torch.float64)[:, None]
+    drag = found.fitter.model.drag
+    with torch.no_grad():
+        found.problem.parameters.set(found.theta)
+        learned = drag.terms(0 * v, v)[0] @ drag.coefficient + float(found.fitter.model.damping.rate) * v[:, 0]
+    assert float((learned - 0.1 * v[:, 0] - 0.2 * (5 * v[:, 0]).sin()).square().mean().sqrt()) < 0.03
+
+
+def plane(angles=(False, False), units=("m", "m")):
+    """Motion of two coordinates over a rectangle."""
+    t = 0.1 * torch.arange(200, dtype=torch.float64)
+    return Trajectories.of(t, torch.stack([t.sin(), 2 + 3 * (1.7 * t).cos()], 1), angles=angles, units=units)
+
+
+def test_waves_of_the_plane_are_periodic_on_the_rectangle_and_the_longest_come_first():
+    # fails if a direction is missing, both signs of a wave are offered, or the rectangle is that of other data
+    data = plane()
+    own = [own for own in bands(data, estimate_baseline(data)) if own.name.startswith("V(q1, q2)")]
+    texts, rates = ([x for band in own for x in band[k]] for k in (1, 2))
+    assert len(texts) == 2 * PLANE
+    assert rates == sorted(rates)
+    assert [max(band.rates) / band.longest < 2 ** (k + 2) for k, band in enumerate(own)] == [True] * len(own)
+    low, high = (x.tolist() for x in (data.q.amin(0), data.q.amax(0)))
+    size = [REACH * (b - a) for a, b in zip(low, high, strict=True)]
+    (forms, phases) = zip(*((p.form, p.phase) for text in texts for p in parse(text, (False, False))), strict=True)
+    assert not any(phases)
+    turns = [tuple(round(w * s / (2 * math.pi), 4) for w, s in zip(form, size, strict=True)) for form in forms]
+    assert all(number % 1 == 0 for turn in turns for number in turn)
+    assert len(set(turns)) == PLANE
+    assert not set(turns) & {(-a, -b) for a, b in turns}
+    assert {(0.0, 1.0), (1.0, 0.0), (1.0, 3.0), (1.0, -3.0)} <= set(turns)
+    assert rates == pytest.approx([math.hypot(*form) for form in forms])
+
+
+@pytest.mark.parametrize(("angles", "units"), [((False, True), ("m", "rad")), ((False, False), ("m", "V"))])
+def test_positions_of_different_kinds_have_no_potential_of_both(angles, units):
+    # fails if the number of a wave is the root of a sum of squares in different units
+    data = plane(angles, units)
+    assert not any(own.name.startswith("V(q1, q2)") for own in bands(data, estimate_baseline(data)))
+
+
+def test_prior_deviations_fall_as_those_of_a_matern_process_in_so_many_dimensions():
+    # fails if a potential of two coordinates is as rough as a wave of one: S(k) is k^-4 on a line and k^-5 in the plane
+    data = plane()
+    base = estimate_baseline(data)
+    every = bands(data, base)
+    spreads = prior_spreads(every, base, data.balance, [])
+    for name, power in (("V(q1)", -2.0), ("V(q1, q2)", -2.5), ("damping(q1)", -2.0), ("friction(v1)", -2.0)):
+        own = [own for own in every if own.name.startswith(name + " ")]
+        ratio = spreads[own[-1].texts[-1]] / spreads[own[0].texts[0]]
+        assert ratio == pytest.approx((own[-1].rates[-1] / own[0].rates[0]) ** power), name
+
+
+def test_friction_by_speed_is_periodic_beyond_what_was_recorded():
+    # fails if the interval is not that of the largest speed, or of a difference that of one of its speeds
+    data = plane()
+    base = estimate_baseline(data)
+    every = bands(data, base)
+    for name, largest in (("friction(v2)", base.speed[1]), ("friction(v2 - v1)", sum(base.speed))):
+        texts = [text for own in every if own.name.startswith(name) for text in own.texts]
+        assert len(texts) == 2 * FRICTION
+        features = [parse_drag(text, data.angles) for text in texts]
+        assert all(f.of_speed and f.on == 1 and (f.of == 0) == ("-" in name) for f in features)
+        assert features[0].rate == pytest.approx(math.pi / (REACH * largest), rel=1e-6)
+
+
+def test_a_potential_of_both_coordinates_is_learned(monkeypatch):
+    # fails if waves of the plane are not offered: no sum of functions of one coordinate has the force of this bump
+    monkeypatch.setattr("herglotz.training.functions.PLANE", 12)
+    monkeypatch.setattr("herglotz.training.functions.OF_MANY", 4)
+    t = H * torch.arange(161, dtype=torch.float64)
+    x, out = np.array([[1.0, -0.7, 0.5, -0.2], [0.2, 0.6, -0.9, 0.8], [0, 0.4, 0.6, -0.9], [0.7, 0.3, 0, 0.2]]), []
+
+    def rate(x):
+        bump = 1.2 * np.exp(-2 * (x[0] * x[0] + x[1] * x[1] - x[0] * x[1]))
+        return np.stack([*x[2:], -x[0] + bump * (2 * x[0] - x[1]), -x[1] + bump * (2 * x[1] - x[0])])
+
+    for _ in t:
+        out.append(x[:2].copy())
+        for _ in range(8):
+            x = runge_kutta.step(rate, x, H / 8)
+    q = torch.tensor(np.array(out)).permute(2, 0, 1).reshape(-1, 2)
+    q = q + NOISE * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+    data = Trajectories.of(t.repeat(4), q, (161,) * 4)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    found = without_named_terms(search)
+    assert "V(q1, q2) 1" in found.taken
+    assert found.whole
+    assert found.rms < 1.2 * found.fitter.precision
 
 
 def test_no_functions_where_named_terms_are_at_the_noise():
@@ -201,8 +309,8 @@ def test_no_functions_where_named_terms_are_at_the_noise():
 def test_joints_whose_masses_have_second_waves_have_these_offers():
     # fails if the mass of a rotating pendulum, sin² of its angle, is no offer
     q = torch.rand(60, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    every = bands(Trajectories.of(0.1 * torch.arange(60, dtype=torch.float64), q, angles=(True, True)))
-    found = {text for band in every for text in band.texts}
+    data = Trajectories.of(0.1 * torch.arange(60, dtype=torch.float64), q, angles=(True, True))
+    found = {text for own in bands(data, estimate_baseline(data)) for text in own.texts}
     assert {"cos(2q2) v1 v1", "sin(2q1) v1 v2", "cos(2q1) v2 v2"} <= found
 
 

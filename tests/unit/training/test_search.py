@@ -17,7 +17,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.found_model import settings
 from herglotz.training.held_out import HeldOut, blocks
 from herglotz.training.look import look
-from herglotz.training.moves import Moves
+from herglotz.training.moves import BLOCKS, MEMORY, Moves
 from herglotz.training.offers import Offer
 from herglotz.training.score import Score
 from herglotz.training.search import Search
@@ -318,12 +318,27 @@ def test_of_many_offers_some_leave_at_once_but_not_those_that_stand_for_one_anot
             every = zip(sets, lost, strict=True)
             return [Score(torch.full((10,), 2.0 * none), 400, len(own), len(own), 1.0) for own, none in every]
 
-    fitter = SimpleNamespace(offered=32, offers=[Offer(name, (name,)) for name in names], data=FEW)
+    fitter = SimpleNamespace(offered=32, offers=[Offer(name, (name,)) for name in names], data=FEW, numbers=list)
     moves = Pairs(cast(Any, SimpleNamespace(fitter=fitter)))
     fewest = moves.leaving(frozenset(names))[0]
     assert len(fewest) == 16
     assert all(len(fewest & {f"a{i}", f"b{i}"}) == 1 for i in range(16))
     assert len(asked) < 16 * 24  # of one after the other
+
+
+def test_offers_of_many_numbers_are_compared_in_parts():
+    # fails if memory is counted by offers, of which one may be a hundred waves: 12 GB of curvatures then
+    asked = []
+
+    class Parts(Moves):
+        def foretold(self, sets):
+            asked.append(len(sets))
+            return [Score(torch.zeros(10), 400, len(own), len(own), 1.0) for own in sets]
+
+    fitter = SimpleNamespace(offered=9, offers=[], data=FEW, numbers=lambda own: range(300 * len(own)))
+    Parts(cast(Any, SimpleNamespace(fitter=fitter))).scores([frozenset({str(i)}) for i in range(40)])
+    assert sum(asked) == 40
+    assert max(asked) * BLOCKS * 300**2 <= MEMORY
 
 
 def test_an_excess_comes_and_goes_with_what_it_is_of():
@@ -338,7 +353,9 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
             return [Score(torch.full((10,), none), 400, len(own), len(own), 1.0) for own, none in every]
 
     def moves(*offers):
-        return Friction(cast(Any, SimpleNamespace(fitter=SimpleNamespace(offered=3, offers=offers, data=FEW))))
+        return Friction(
+            cast(Any, SimpleNamespace(fitter=SimpleNamespace(offered=3, offers=offers, data=FEW, numbers=list)))
+        )
 
     free = Offer("free", ("free",))
     assert moves(dry, excess, free).joining(frozenset()) == [{"dry", "excess"}]

@@ -1,0 +1,55 @@
+"""The strength of functions and the bands that a model needs: which fits are asked for, and which stay."""
+
+from types import SimpleNamespace
+
+import torch
+
+from herglotz.training.strengths import likeliest, needed
+
+
+class Fits:
+    """A fitter whose fits miss held-out blocks by given losses, and the sets that were asked for."""
+
+    def __init__(self, losses=()):
+        self.losses, self.asked = list(losses), []
+
+    def fit(self, taken, values, length, before, most):  # noqa: ARG002
+        self.asked.append((set(before.taken - taken), most))
+        loss = self.losses.pop(0) if self.losses else before.score.losses.sum().item()
+        return None if loss is None else trial(self, taken, loss)
+
+
+def trial(fits, taken, loss=0.0):
+    sizes = {name: size for name, size in (("a", 1.0), ("b", 0.1), ("c", 0.5)) if name in taken}
+    return SimpleNamespace(
+        fitter=fits, taken=frozenset(taken), values={}, length=5, sizes=sizes,
+        score=SimpleNamespace(losses=torch.tensor([loss])),
+        replaces=lambda other: "c" not in other.taken,
+    )  # fmt: skip
+
+
+def test_strengths_follow_the_fit_as_long_as_held_out_blocks_are_missed_by_less():
+    # fails if one fit is made, a worse one is taken, or a fit without a path ends the search
+    fits = Fits([3.0, 2.0, 2.5])
+    found = likeliest(trial(fits, "abc", 4.0), 7)
+    assert found.score.losses.tolist() == [2.0]
+    assert fits.asked == [(set(), 7)] * 3
+    first = trial(Fits([None]), "abc", 4.0)
+    assert likeliest(first, 7) is first
+
+
+def test_a_model_without_functions_is_not_fitted_again():
+    # fails if a search of named terms alone makes more fits than before
+    fits = Fits([1.0])
+    first = trial(fits, "xy", 4.0)
+    assert likeliest(first, 7) is first
+    assert needed(first, 7) is first
+    assert fits.asked == []
+
+
+def test_bands_that_are_not_worth_their_price_leave_the_weakest_first():
+    # fails if a band that is worth its price leaves, one that is not stays, or the strongest is tried first
+    fits = Fits()
+    found = needed(trial(fits, "abcx", 4.0), 7)
+    assert found.taken == {"c", "x"}
+    assert [gone for gone, _ in fits.asked if gone] == [{"b"}, {"c"}, {"a"}]
