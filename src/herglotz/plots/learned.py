@@ -66,7 +66,8 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
                 v, low, high = _range(speeds[:, i])
                 _panel(axes[2, i], v, _curves(posterior, _friction(run, i, v)), (low, high))
                 axes[2, i].set(xlabel=with_unit(f"velocity of {run.data.names[i]}", momentum))
-                axes[2, i].set_ylabel(with_unit("friction", force))
+                at = " at s = 0" if run.model.config.dissipation else ""
+                axes[2, i].set_ylabel(with_unit(f"friction{at}", force))
             for (j, k), color in zip(entries, SERIES, strict=False):
                 _panel(axes[-1, i], x, _curves(posterior, _mass(run, i, x, (j, k))), (low, high), color)
                 axes[-1, i].set_ylabel("mass")

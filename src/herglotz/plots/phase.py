@@ -140,4 +140,5 @@ def _title(run: Run) -> str:
     if rate is None or not getattr(damping, "constant", False):
         return "States and flow of the learned model"
     unit = "" if run.data.time_unit in ("", "1") else f" per {run.data.time_unit}"
-    return f"States decay along the learned flow: γ = {rate.item():.3g}{unit}"
+    at = " at s = 0" if run.model.config.dissipation else ""
+    return f"States decay along the learned flow: γ = {rate.item():.3g}{unit}{at}"

@@ -123,17 +123,17 @@ class Search:
 
     @inside()
     def with_functions(self, best: Trial) -> Trial:
-        """A model of functions, all at once and without masses first, where held-out time asks for it."""
+        """A model of functions, joining one by one or all at once, without masses and with them, if it is better."""
         if best.at_the_noise or self.config.translations:
             return best
         part(MORE_TERMS)
         fitter = self.fitter(Variant(self.order, functions=tuple(bands(self.over, self.base))))
         if len(fitter.start) > MAX_PARAMETERS:  # no kernel holds them
             return best
-        every, masses = {*fitter.simple, *fitter.functions}, {x for x in fitter.functions if x.startswith("mass")}
-        other = self.climbed(fitter, every - masses, {}, joining=False)
-        if masses and not (other and other.at_the_noise):
-            other = self.better(other, self.climbed(fitter, every, {}, joining=False))
+        every, other = frozenset({*fitter.simple, *fitter.functions}), self.climbed(fitter, fitter.simple, {})
+        for taken in dict.fromkeys((frozenset(x for x in every if not x.startswith("mass")), every)):
+            if other is None or not other.at_the_noise:
+                other = self.better(other, self.climbed(fitter, taken, {}, joining=False))
         if other is not None and not other.taken & set(fitter.functions):
             other = of_terms(other, self.fitter(replace(other.fitter.variant, functions=())), 2 * ITERATIONS)
         return best if other is None else self.braking(self.finalist(self.better(best, other) or best, (best, other)))
