@@ -123,7 +123,7 @@ class Search:
 
     @inside()
     def with_functions(self, best: Trial) -> Trial:
-        """A model of functions, joining one by one or all at once, without masses and with them, if it is better."""
+        """A model of functions that join one by one or, where some do, all at once, without masses and with them."""
         if best.at_the_noise or self.config.translations:
             return best
         part(MORE_TERMS)
@@ -132,7 +132,7 @@ class Search:
             return best
         every, other = frozenset({*fitter.simple, *fitter.functions}), self.climbed(fitter, fitter.simple, {})
         for taken in dict.fromkeys((frozenset(x for x in every if not x.startswith("mass")), every)):
-            if other is None or not other.at_the_noise:
+            if other is None or not (other.whole and (other.at_the_noise or not other.taken & set(fitter.functions))):
                 other = self.better(other, self.climbed(fitter, taken, {}, joining=False))
         if other is not None and not other.taken & set(fitter.functions):
             other = of_terms(other, self.fitter(replace(other.fitter.variant, functions=())), 2 * ITERATIONS)
