@@ -35,7 +35,7 @@ def problem(level, activation, mass, batch):
         (True, False), scale=sizes, speed=sizes, stiffness=sizes, tilt=(0.0, 0.0), potential_width=3,
         correction_width=3, activation=activation, mass_width=mass, **LEVELS[level],
     )  # fmt: skip
-    model = ContactLagrangian(config)
+    model: Any = ContactLagrangian(config)
     with torch.no_grad():
         randomise(model, 0.05, seed=3)
         if model.friction is not None:

@@ -33,7 +33,8 @@ def problem(case):
     """A model of an angle and a length whose every parameter is random, three states, h and inputs."""
     options = {"potential_width": 3, "damping_width": 3, **CASES[case]}
     config = ModelConfig((True, False), scale=ONES, speed=ONES, stiffness=ONES, tilt=(0.0, 0.0), **options)
-    model, make = ContactLagrangian(config), torch.Generator().manual_seed(3)
+    make = torch.Generator().manual_seed(3)
+    model: Any = ContactLagrangian(config)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)

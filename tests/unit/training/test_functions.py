@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -204,10 +205,11 @@ def test_a_damper_that_no_dictionary_holds_is_learned_as_friction_by_speed():
     assert found.at_the_noise
     assert any(name.startswith("friction(v1)") for name in found.taken)
     v = torch.linspace(-0.8, 0.8, 81, dtype=torch.float64)[:, None]
-    drag = found.fitter.model.drag
+    model: Any = found.fitter.model
+    drag = model.drag
     with torch.no_grad():
         found.problem.parameters.set(found.theta)
-        learned = drag.terms(0 * v, v)[0] @ drag.coefficient + float(found.fitter.model.damping.rate) * v[:, 0]
+        learned = drag.terms(0 * v, v)[0] @ drag.coefficient + float(model.damping.rate) * v[:, 0]
     assert float((learned - 0.1 * v[:, 0] - 0.2 * (5 * v[:, 0]).sin()).square().mean().sqrt()) < 0.03
 
 
@@ -221,7 +223,7 @@ def test_waves_of_the_plane_are_periodic_on_the_rectangle_and_the_longest_come_f
     # fails if a direction is missing, both signs of a wave are offered, or the rectangle is that of other data
     data = plane()
     own = [own for own in bands(data, estimate_baseline(data)) if own.name.startswith("V(q1, q2)")]
-    texts, rates = ([x for band in own for x in band[k]] for k in (1, 2))
+    texts, rates = [x for band in own for x in band.texts], [x for band in own for x in band.rates]
     assert len(texts) == 2 * PLANE
     assert rates == sorted(rates)
     assert [max(band.rates) / band.longest < 2 ** (k + 2) for k, band in enumerate(own)] == [True] * len(own)

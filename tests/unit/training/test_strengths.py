@@ -1,6 +1,7 @@
 """The strength of functions and the bands that a model needs: which fits are asked for, and which stay."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 
@@ -19,7 +20,7 @@ class Fits:
         return None if loss is None else trial(self, taken, loss)
 
 
-def trial(fits, taken, loss=0.0):
+def trial(fits, taken, loss=0.0) -> Any:
     sizes = {name: size for name, size in (("a", 1.0), ("b", 0.1), ("c", 0.5)) if name in taken}
     return SimpleNamespace(
         fitter=fits, taken=frozenset(taken), values={}, length=5, sizes=sizes,
