@@ -75,14 +75,13 @@ class ActionPowers(nn.Module):
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.powers = [POWERS[name] for name in config.dissipation]
+        # One order of the flows, however the powers are named: another one makes another step.
+        self.order = sorted(range(len(self.powers)), key=self.powers.__getitem__)
         self.coefficient = nn.Parameter(torch.zeros(len(self.powers), dtype=torch.float64))
 
     def forward(self, s0: Jet, gained: Jet, offsets: Jet | None, h: Tensor, *, backward: bool = False) -> Jet:  # noqa: ARG002
         """Return the gain of s after half a step of every power, from the gain before; increments do not cancel."""
-        order = sorted(
-            range(len(self.powers)), key=lambda j: self.powers[j], reverse=backward
-        )  # however they are named
-        for j in order:
+        for j in reversed(self.order) if backward else self.order:
             gained = gained + power_increment(s0 + gained, self.powers[j], self.coefficient[j] * h / 2)
         return gained
 

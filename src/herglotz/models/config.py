@@ -131,6 +131,8 @@ class ModelConfig:
             "a model without a baseline needs a correction network; set correction_width > 0":
                 not self.baseline and not self.correction_width,
             "a model without a baseline has no mass; set mass_width=0": not self.baseline and self.mass_width,
+            "a model without a baseline has no powers of s; leave dissipation out":
+                not self.baseline and self.dissipation,
             **{f"{name} needs one number a coordinate ({n}), got {getattr(self, name)}": len(getattr(self, name)) != n
                for name in ("scale", "speed", "stiffness", "tilt")},
             f"the full level needs action_width >= 1, got {self.action_width}; or take level='affine'":

@@ -252,16 +252,16 @@ class ContactLagrangian(nn.Module):
         return Phase(q0, q1, h, order, self.config, delta)
 
     def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
-        terms, by_work = self.terms(phase), self.action is not None
-        terms = self._driven(terms, phase, u) if by_work and u is not None else terms
-        return self._assembled(terms, phase, s0, self._forces(phase, None if by_work else u))
+        terms, friction = self.terms(phase), self.friction
+        if self.action is not None and friction is not None and u is not None:
+            terms, u = self._driven(terms, phase, friction.applied(u)), None
+        return self._assembled(terms, phase, s0, self._forces(phase, u))
 
-    def _driven(self, t: Terms, phase: Phase, u: Tensor) -> Terms:
-        """The terms with the potential −f·q of the force f of inputs: s gathers their work."""
-        assert self.friction is not None
+    def _driven(self, t: Terms, phase: Phase, f: Tensor) -> Terms:
+        """The terms with the potential −f·q of the force f (..., n) of inputs: s gathers their work."""
         assert t.V0 is not None
         assert t.V1 is not None
-        f, n, order = self.friction.applied(u), self.dof, phase.order
+        n, order = self.dof, phase.order
         before, after = ((coordinates(q, order) * f).sum() for q in (phase.q0, phase.q1))
         return replace(t, V0=t.V0 - before.embed(2 * n, 0), V1=t.V1 - after.embed(2 * n, n))
 

@@ -113,9 +113,19 @@ def test_derivatives_of_the_forces_are_those_of_their_values():
         ({"level": "linear", "dissipation": ("s^2",)}, "not 'linear'"),
         ({"level": "forced", "dissipation": ("s^2",), "coulomb": True, "sticking": True}, "leave sticking"),
         ({"level": "full", "dissipation": ("s^2",), "order": 4, "potential_width": 0}, "order 4"),
+        ({"level": "full", "dissipation": ("s^2",), "baseline": False, "correction_width": 3}, "no powers of s"),
     ],
 )
 def test_what_no_model_has_is_refused(settings, words):
     # fails if a setting that nothing reads is taken without a word
     with pytest.raises(InputError, match=words):
         ModelConfig(**settings)
+
+
+@pytest.mark.parametrize("settings", [{}, {"dissipation": ("s^2",)}])
+def test_inputs_of_a_model_without_inputs_do_nothing(settings):
+    # fails if the full level, which has none, meets what it is given with an assertion: the other levels leave it out
+    model = ContactLagrangian(ModelConfig(level="full", **settings))
+    x = torch.ones(2, 1, dtype=torch.float64)
+    given, without = (model.partials(x, 1.1 * x, x[:, 0], 0.1, 1, u) for u in (x, None))
+    torch.testing.assert_close(given.D1, without.D1)

@@ -219,6 +219,18 @@ def plane(angles=(False, False), units=("m", "m")):
     return Trajectories.of(t, torch.stack([t.sin(), 2 + 3 * (1.7 * t).cos()], 1), angles=angles, units=units)
 
 
+def test_springs_and_tilts_stay_beside_functions():
+    # fails if they may leave: nothing holds a motion beyond what was recorded then, where waves are 0
+    data = plane()
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    fitter = search.fitter(Variant(2, functions=tuple(bands(data, search.base))))
+    springs = {f"potential.{kind}[{i}]" for kind in ("stiffness", "tilt") for i in (0, 1)}
+    assert springs <= set(fitter.always)
+    assert springs <= set(fitter.centred)  # whose place waves could take: they have a prior as these
+    plain = search.fitter(Variant(2))
+    assert springs <= {offer.name for offer in plain.offers}
+
+
 def test_waves_of_the_plane_are_periodic_on_the_rectangle_and_the_longest_come_first():
     # fails if a direction is missing, both signs of a wave are offered, or the rectangle is that of other data
     data = plane()

@@ -7,9 +7,12 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import part_of
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
-from herglotz.training import Prior, ShootingProblem
+from herglotz.training import FitConfig, Prior, ShootingProblem
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
 from herglotz.training.problems.grid import segment_grid, segment_lengths
+from herglotz.training.search import Search
+from herglotz.training.trials import Variant
 
 
 def line(lengths):
@@ -51,6 +54,20 @@ def test_a_part_of_fast_samples_is_every_mth_of_all():
     assert part_of(few, 1400) is few
     many = line([90] * 100)
     assert part_of(many, 1000).typical_step == pytest.approx(0.1)
+
+
+def test_model_steps_are_about_as_long_in_a_part_and_in_all():
+    # fails if samples far apart are crossed in as many steps as there are samples between, or all samples in as many
+    # steps as the part needed between two of its own
+    t = 0.02 * torch.arange(9000, dtype=torch.float64)
+    noise = 1e-3 * torch.randn(9000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = Trajectories.of(t, t.sin() + noise)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    m = search.part.longer
+    assert m == pytest.approx(4)
+    assert search.part.base.max_step == pytest.approx(m * search.base.max_step)
+    assert search.part.base.model_step == pytest.approx(m * search.base.model_step)
+    assert [Variant(2, substeps=n).crossing(1 / m).substeps for n in (1, 4, 8)] == [1, 1, 2]
 
 
 def test_held_out_time_at_the_start_is_predicted_from_its_start():
