@@ -220,6 +220,8 @@ class FitConfig:
                 forces and self.level not in ("forced", "auto"),
             f"dissipation is of L in s; set level='full' or 'forced', not '{self.level}'":
                 self.dissipation and self.level not in ("full", "forced", "auto"),
+            "set-valued friction stands in no model with powers of s; leave sticking or dissipation out":
+                self.dissipation and self.sticking,
             "input_map is given but use_inputs is False; leave one of them out":
                 self.input_map and not self.use_inputs,
         })  # fmt: skip

@@ -11,6 +11,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import ActionPowers, power_increment
 from herglotz.models.jet import Jet
 from herglotz.stepping import Stepper
+from herglotz.training import FitConfig
 
 GAMMA, BETA, DELTA = 0.2, 0.15, 0.05
 
@@ -120,6 +121,9 @@ def test_what_no_model_has_is_refused(settings, words):
     # fails if a setting that nothing reads is taken without a word
     with pytest.raises(InputError, match=words):
         ModelConfig(**settings)
+    if settings.get("sticking") or settings["level"] == "linear":  # before any data are read
+        with pytest.raises(InputError, match=words):
+            FitConfig(**settings)
 
 
 @pytest.mark.parametrize("settings", [{}, {"dissipation": ("s^2",)}])
