@@ -70,7 +70,7 @@ def test_the_law_is_found_in_noise(seed):
 
 def test_inputs_do_work_in_s():
     # fails if the work of inputs is left out of s′, in the model or in the text
-    run = fit(recorded(2, 0.002, 7, driven=True), progress=False)
+    run = fit(recorded(3, 0.002, 7, driven=True), progress=False)
     assert run.model.config.dissipation == ("s^2",)
     beta, deviation = beta_of(run)
     assert abs(beta - BETA) < 4 * deviation < 0.2 * BETA
