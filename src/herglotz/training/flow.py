@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -127,9 +128,8 @@ class CompiledFlow:
         if workers < 2:
             yield from map(together, jobs)
             return
-        with ThreadPoolExecutor(workers) as pool:
-            for k in range(0, len(jobs), workers):
-                yield from pool.map(together, jobs[k : k + workers])
+        for k in range(0, len(jobs), workers):
+            yield from _pool(workers).map(together, jobs[k : k + workers])
 
     def _jobs(self, width: int) -> list[list[Piece]]:
         """Runs of segments that do not wait for one another, each with enough samples to be worth a thread."""
@@ -174,6 +174,16 @@ class CompiledFlow:
             place = self.place[segment : segment + 1] + (at - begin)
             yield Piece(segment, segment + 1, torch.tensor([at, to]), place, starts, samples, offset)
             offset += samples
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """So many threads, which stay: to start them anew takes as long as a sweep of a short recording."""
+    return ThreadPoolExecutor(workers)
+
+
+if hasattr(os, "register_at_fork"):  # a child has no threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def motion(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:

@@ -24,33 +24,47 @@ class Questions:
         self.wanted, self.holds = wanted, holds  # the search of all data, and the holds of inputs that may be tried
         self.hold, self.input_terms = "", ()
         # The search of the part, its sensors' zeros taken off where these differ; the model; the zeros.
-        self.read: Search
-        self.best: Trial | None
-        self.differ: tuple[Tensor, Tensor] | None
-        self.read, self.best, self.differ = wanted.part.with_zeros(_searched(wanted.part))
+        self.read: Search = wanted.part
+        self.best: Trial | None = wanted.part.first
+        self.differ: tuple[Tensor, Tensor] | None = None
+        asked = False
+        if self.best is None or not self.best.at_the_noise:
+            self.best = wanted.part.full  # which lacks no term that zeros, or another hold, could stand for
+            asked = self.best is not None and self.best.whole
+            if asked and self.what_data_are():
+                self.read.full = self.best
+        self.best = _searched(self.read)
+        if not asked and self.what_data_are():  # what stood for it has bent the terms
+            self.best = self.read.better(self.best, _searched(self.read))
 
-    def zeros(self) -> None:
-        """Terms anew where zeros differ, then zeros with the better terms: what made up for zeros has bent them."""
-        if self.differ is None:
-            return
-        best, part = self.read.better(self.best, _searched(self.read)), self.wanted.part
-        once_more = part.with_zeros(best and part.again(best), sure=True)
-        self.read, self.best, self.differ = (self.read, best, self.differ) if once_more[1] is None else once_more
+    def what_data_are(self) -> bool:
+        """Whether the model asks for zeros of sensors or another hold of the inputs, which are taken then."""
+        return any([self.zeros(), self.how_inputs_hold()])
 
-    def how_inputs_hold(self) -> None:
-        """Another hold of the inputs where the model asks for one, and terms anew."""
-        if self.best is None or self.wanted.part.longer > 1 or not (hold := self.read.held(self.best, self.holds)):
-            return
-        other, self.hold = lambda search: search.of(replace(search.data, hold=hold)), hold
-        self.wanted, self.read = other(self.wanted), other(self.read)
-        self.best = self.read.better(self.read.again(self.best), _searched(self.read))
+    def zeros(self) -> bool:
+        """Zeros of sensors that differ between recordings, where the model asks for some and none are known."""
+        if self.best is None or self.differ is not None:
+            return False
+        self.read, self.best, self.differ = self.read.with_zeros(self.best)
+        return self.differ is not None
+
+    def how_inputs_hold(self) -> bool:
+        """Another hold of the inputs, where the model asks for one and none was taken."""
+        if self.best is None or self.hold or self.wanted.part.longer > 1:
+            return False
+        if not (hold := self.read.held(self.best, self.holds)):
+            return False
+        self.wanted, self.read = (x.of(replace(x.data, hold=hold)) for x in (self.wanted, self.read))
+        self.hold, self.best = hold, self.read.again(self.best)
+        return True
 
     def how_inputs_act(self) -> None:
         """Terms anew with squares, sizes and rates of the inputs, where the model asks for some."""
-        if self.best is not None and (terms := self.read.input_terms(self.best)):
-            self.input_terms = terms
-            self.wanted, self.read = self.wanted.driven_by(terms), self.read.driven_by(terms)
-            self.best = _searched(self.read) or self.best
+        if self.best is None or not (terms := self.read.input_terms(self.best)):
+            return
+        read = self.read.driven_by(terms)
+        if (found := _searched(read)) is not None and found.replaces(self.best):
+            self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.training.held_out import BLOCKS, HeldOut
+from herglotz.training.held_out import BLOCKS, HeldOut, blocks
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
-ROUNDS = 20  # of the scale of Student's t
+ROUNDS, SETTLED = 20, 1e-6  # of the scale of Student's t, and the relative change that ends them
 WORST = 1e3  # the loss of a residual that is no number
 
 
@@ -66,6 +66,17 @@ def scores(
     return [Score(own, count, numbers, chosen, error) for own, numbers, chosen, error in rest]
 
 
+def fitted_score(
+    problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float, zeros: int = 0
+) -> Score:
+    """The score by the residuals of the fit itself, block by block, of models that are alike but for a few numbers.
+
+    What leaving out a block does to a model of many numbers, to first order, says more of these than of the few.
+    """
+    (losses,), (rms,) = _losses(problem.misfit(path)[None], blocks(problem.data), floor)
+    return Score(losses, problem.data.q.numel(), numbers, choices, float(rms), zeros)
+
+
 def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float) -> Score:
     """The score over the samples that a fit has not used, which a free run over whole trajectories foretells."""
     unseen = ~problem.used
@@ -95,6 +106,8 @@ def _scale(r: Tensor) -> Tensor:
     tiny = torch.finfo(r.dtype).tiny
     s = squared.median(1, keepdim=True).values.clamp_min(tiny)
     for _ in range(ROUNDS):
-        weight = 1 / (v + squared / s)
+        weight, before = 1 / (v + squared / s), s
         s = ((weight * squared).sum(1, keepdim=True) / weight.sum(1, keepdim=True)).clamp_min(tiny)
+        if bool(((s - before).abs() <= SETTLED * s).all()):
+            break
     return s.sqrt()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 from torch import Tensor
 
@@ -16,22 +17,19 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import all_input_terms, with_input_terms
 from herglotz.data.roughness import part_of
 from herglotz.data.sensors import measured
-from herglotz.data.smoothing import local_polynomials
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
-from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
-from herglotz.training.named_terms import DRY, candidates, special, started
+from herglotz.training.named_terms import DRY
 from herglotz.training.offers import INPUTS, standing
-from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import differing_zeros
 from herglotz.training.strengths import likeliest, needed, of_terms
-from herglotz.training.task import LEAST_GRIP, build_model
+from herglotz.training.task import LEAST_GRIP
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
@@ -72,23 +70,34 @@ class Search:
             self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom, like)
         return self.fitters[variant]
 
+    @cached_property
     def first(self) -> Trial | None:
-        """The model that the simplest one grows into."""
+        """The better one of the models that the simplest grows into, where offers join on the way and where none do.
+
+        Where inputs follow from the state, terms that join over short segments make up for one another.
+        """
+        part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
-        return self.climbed(fitter, fitter.simple, {})
+        best, plain = self.climbed(fitter, fitter.simple, {}), self.grown(fitter, fitter.simple)
+        if plain is not None and (best is None or plain.length >= best.length):
+            best = self.better(best, self.settled(plain))
+        return best
+
+    @cached_property
+    def full(self) -> Trial | None:
+        """The model of the whole dictionary over the longest segments that it follows."""
+        fitter = self.fitter(Variant(self.order))
+        found = self.grown(fitter, [offer.name for offer in fitter.offers])
+        return found and (self.again(found, anew=True) or found)
 
     @inside()
-    def run(self, first: Trial | None = None) -> Trial | None:
+    def run(self) -> Trial | None:
         """The model that held-out time asks for; None where not even the shortest segments can be followed."""
-        part(FIRST_TERMS)
-        fitter, best = self.fitter(Variant(self.order)), first or self.first()
+        best = self.first
         part(MORE_TERMS)
         ends = [best]
-        if (start := self.linear_start(fitter)) is not None:
-            ends.append(self.climbed(fitter, *start))
-            best = self.better(best, ends[-1])
-        if (plain := self.grown(fitter)) is not None and (best is None or plain.length >= best.length):
-            ends.append(self.settled(plain))
+        if not (best and best.at_the_noise) and (full := self.full) and (best is None or full.length >= best.length):
+            ends.append(self.settled(full, swapped=True))
             best = self.better(best, ends[-1])
         if best is None:
             return None
@@ -110,9 +119,12 @@ class Search:
         read, best, zeros = self.with_zeros(found and self.again(found), sure=differ)
         return read, best and read.settled(best), zeros
 
-    def again(self, found: Trial) -> Trial | None:
-        """The model of a trial fitted to these data, from its values; None where it does not follow them."""
-        if found.fitter.data is self.data:
+    def again(self, found: Trial, *, anew: bool = False) -> Trial | None:
+        """The model of a trial fitted to these data, from its values; None where it does not follow them.
+
+        A fit to the same data stays, unless it is asked for `anew`: many numbers take more iterations than few.
+        """
+        if found.fitter.data is self.data and not anew:
             return found
         fitter = self.fitter(found.fitter.variant.crossing(self.data.typical_step / found.fitter.data.typical_step))
         if found.fitter.data.lengths == self.data.lengths:
@@ -158,18 +170,6 @@ class Search:
                 winner, least = end, found
         return winner
 
-    def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
-        """Offers and values that one linear problem of smoothed accelerations gives; None where it gives none."""
-        local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
-        every = every.only(set(every.names) - set(special(self.data)))
-        start = None if local is None else start_of(self.data, self.base, every, local)
-        if start is None:
-            return None
-        base = started(self.base, self.data, start.values, fitter.settings)
-        numbers = ParameterVector(build_model(base, fitter.settings, "none"))
-        values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
-        return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
-
     def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float], joining=True) -> Trial | None:
         """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
@@ -182,12 +182,9 @@ class Search:
             trial = longer
         return None
 
-    def grown(self, fitter: Fitter) -> Trial | None:
-        """The simplest model over the longest segments that it follows as it is.
-
-        Where inputs follow from the state, terms that join over short segments make up for one another.
-        """
-        trial = fitter.fit(fitter.simple, {}, fitter.lengths[0], None, 2 * ITERATIONS)
+    def grown(self, fitter: Fitter, taken: Iterable[str]) -> Trial | None:
+        """A model as it is over the longest segments that it follows."""
+        trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
         return None if trial is None else self.finer(fitter.grow(self.finer(trial)))
 
     def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
@@ -246,10 +243,9 @@ class Search:
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
         line = Search(data, base, self.config, outliers=self.freedom is not None)
-        first = line.first()
-        if trial is not None and trial.whole and (first is None or trial.replaces(first)):
+        if trial is not None and trial.whole and (line.first is None or trial.replaces(line.first)):
             return False  # the motion is followed as it is, and no worse model is worth a search
-        other = line.run(first)
+        other = line.run()
         if other is None or trial is None or not other.replaces(trial):
             return other is not None and trial is None
         ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
@@ -277,7 +273,7 @@ class Search:
             return self, best, None
         read = self.of(measured(self.data, differ[0].flatten().tolist()))
         other, more = read.again(best), (len(self.data) - 1) * self.data.dof
-        if other is None or not (sure or other.with_zeros(more).gain(best) > 0):
+        if other is None or not (sure or other.fits_better(best, more)):
             return self, best, None
         return read, other, differ
 
@@ -286,7 +282,7 @@ class Search:
         best, found = trial, ""
         for hold in [] if trial.at_the_noise else holds:
             other = self.of(replace(self.data, hold=hold)).again(trial)
-            if other is not None and other.replaces(best):
+            if other is not None and other.fits_better(best):
                 best, found = other, hold
         return found
 

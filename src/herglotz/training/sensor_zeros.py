@@ -1,8 +1,8 @@
 """Sensors whose zeros differ from recording to recording: y = q + z. The recording of most samples is the reference.
 
 A model cannot follow such recordings together, though each of them alone. Parameters, states and zeros are fitted
-together from 0 (`problems.zeros`), and are taken where the score of held-out blocks asks for them: zeros are numbers of
-a model like any other. A model that is held says what a new recording reads at 0 (`zeros_of_one`).
+together from 0 (`problems.zeros`), and are taken where the fit with them is worth so many numbers more
+(`score.fitted_score`). A model that is held says what a new recording reads at 0 (`zeros_of_one`).
 """
 
 from __future__ import annotations
@@ -85,10 +85,10 @@ def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
 def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor] | None:
     """Zeros (B, n) that recordings have beside the reference, and deviations, where the fit of a problem ends at x.
 
-    None where zeros lead nowhere.
+    None where zeros lead nowhere, or none of them is clearly there.
     """
     found = fitted(WithZeros(problem), x)
-    if found is None:
+    if found is None or not bool(clearly(found).z.any()):
         return None
     rows = [b for b in range(len(problem.data)) if b != reference_of(problem.data)]
     z, deviations = (x.new_zeros(len(problem.data), problem.n) for _ in range(2))

@@ -134,12 +134,11 @@ def search(
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
     asked = Questions(wanted, holds)
-    asked.zeros()
     if asked.read.better_on_a_line(asked.best):  # whose search, with inputs and sizes of its own, finds the terms again
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if asked.best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
-    for question in (asked.how_inputs_hold, asked.how_inputs_act, asked.functions, asked.all_data):
+    for question in (asked.how_inputs_act, asked.functions, asked.all_data):
         question()
     found, differ = asked.best, asked.differ
     if found is None:

@@ -31,7 +31,7 @@ from herglotz.training.problems.grid import segment_grid, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.robust import scale_of
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.score import Score, free_run_score, scores
+from herglotz.training.score import Score, fitted_score, free_run_score, scores
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import EXACT, build_model, with_sticking
@@ -148,11 +148,14 @@ class Trial:
             return math.inf if self.length > simple.length else -math.inf
         return self.score.gain(simple.score, max(self.fitter.offered, simple.fitter.offered))
 
-    def with_zeros(self, count: int) -> Trial:
-        """The same, scored as a model with so many zeros of sensors beside its numbers."""
-        other = replace(self)
-        other.__dict__["score"] = replace(self.score, zeros=count)
-        return other
+    def fits_better(self, simple: Trial, zeros: int = 0) -> bool:
+        """Whether it replaces a model that has the same offers, with so many zeros of sensors beside its numbers."""
+        if self.length != simple.length:
+            return self.length > simple.length
+        floor, count = self.fitter.floor, len(self.taken)
+        its = fitted_score(simple.problem, simple.path, simple.problem.P, count, floor)
+        own = fitted_score(self.problem, self.path, self.problem.P, count, floor, zeros)
+        return own.replaces(its, self.fitter.offered)
 
     @property
     def prior(self) -> Gaussian:

@@ -10,59 +10,16 @@ import pytest
 import torch
 
 from herglotz.data import simulate
-from herglotz.data.smoothing import local_polynomials
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, trajectory_fit
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.linear_start import LinearFit
-from herglotz.training.linear_terms import SINGULAR, LinearStart, LinearTerms, start_of
-from herglotz.training.named_terms import MOVING, NamedTerms, candidates
 from herglotz.training.search import Search
 from herglotz.training.structure import search
 from herglotz.training.trajectory_fit import TrajectoryFit
 
-CART = ("mass", "mass", "mass", MOVING)  # a cart, a pole, and a mass of both that turns with the pole's angle
-
-
-@pytest.mark.parametrize("coupling", [0.5, 0.99, -1.5])
-def test_masses_of_a_start_are_regular_at_all_samples(coupling):
-    # fails if a pole that smoothing couples to its cart as strongly as to itself stays so: no step is solved there
-    cos = torch.cos(torch.linspace(0, 2, 50, dtype=torch.float64))
-    M = torch.zeros(50, 2, 2, 4, dtype=torch.float64)
-    M[:, 0, 0, 0] = M[:, 1, 1, 2] = 1.0
-    M[:, 0, 1, 3] = M[:, 1, 0, 3] = cos
-    terms: Any = object.__new__(LinearTerms)
-    terms.fit = LinearFit(torch.zeros(50, 2, 4), -M / 0.1, CART)
-    x = torch.tensor([1.0, 0.0, 1e-6, coupling * 1e-3], dtype=torch.float64)
-    left = terms._regular(x)
-    d = torch.tensor([1.0, 1e-3], dtype=torch.float64)
-    assert float(torch.linalg.eigvalsh((M @ left) / d[:, None] / d).min()) > SINGULAR
-    assert torch.equal(left[:3], x[:3])
-    assert torch.equal(left, x) is (coupling == 0.5)
-
-
-@pytest.mark.parametrize(("errors", "first"), [((1.0, 0.99), 0), ((1.0, 0.5), 1), ((1e-12, 1e-300), 1)])
-def test_the_likeliest_family_is_first(errors, first):
-    # fails if the least error decides: nine candidates more lower that of noise always. ½ · 9 · log 100 is worth 19 %
-    terms: Any = object.__new__(LinearTerms)
-    terms.count = 100
-    starts = [LinearStart(NamedTerms(), {}, error, size) for error, size in zip(errors, (10, 19), strict=True)]
-    assert terms.likeliest(starts) == first
-    assert terms.likeliest([]) == 0
-
 
 def stub(**values) -> Any:
     return SimpleNamespace(**values)
-
-
-def test_masses_that_are_no_cause_of_a_singular_start_stay():
-    # fails if masses that turn with angles are taken off where the constant ones are singular
-    M = torch.zeros(5, 2, 2, 4, dtype=torch.float64)
-    M[:, 0, 0, 0], M[:, 1, 1, 2], M[:, 0, 1, 1], M[:, 1, 0, 1] = 1.0, 1.0, 1.0, 1.0
-    terms: Any = object.__new__(LinearTerms)
-    terms.fit = LinearFit(torch.zeros(5, 2, 4), -M, CART)
-    x = torch.tensor([1.0, 1.0, 1.0, 0.3], dtype=torch.float64)
-    assert torch.equal(terms._regular(x), x)
 
 
 @pytest.mark.parametrize("network", [None, "network"])
@@ -90,17 +47,6 @@ def test_student_loses_no_data_that_least_squares_follow(monkeypatch, robust, ke
     assert found[1] is {"plain": plain, "robust": last}[kept]
 
 
-def test_every_start_is_made_regular(monkeypatch):
-    # fails if masses that are nearly singular go into a fit
-    data = simulate(scene("cart_pole"), trajectories=2, steps=60, h=0.05, seed=0).unwrapped()
-    seen = []
-    monkeypatch.setattr(LinearTerms, "_regular", lambda self, x: (seen.append(x), x)[1])  # noqa: ARG005
-    local = local_polynomials(data)
-    assert local is not None
-    assert start_of(data, estimate_baseline(data), candidates(data), local) is not None
-    assert seen
-
-
 def test_least_squares_stay_where_no_robust_fit_is_found(monkeypatch):
     # fails if a fit that follows the data is dropped because its shortest segments cannot be fitted again
     plain: Any = stub(misfit=torch.ones(4, 1), follows=lambda _: True)
@@ -123,6 +69,13 @@ class Asked:
         self.data, self.base, self.config, self.told, self.seen, self.name = data, base, config, told, seen, name
         self.fitters, self.longer = {}, told.get("longer", 1.0)
         self.part = self if name != "whole" or not told.get("long") else self.of(data, "part")
+        self.first, self.full = self.model("simple", 0.3, noise=bool(told.get("easy"))), None
+        if not told.get("hard"):  # else the whole dictionary follows nothing
+            self.full = self.model("full", 0.2)
+
+    def model(self, name, rms, noise=False):
+        replaces = lambda _: not self.told.get("worse")  # noqa: E731
+        return SimpleNamespace(names=[name], rms=rms, whole=True, at=self.name, at_the_noise=noise, replaces=replaces)
 
     def of(self, data, name=None):
         assert self.data.source != DRIVEN or data.source == DRIVEN  # columns of inputs are not lost on the way
@@ -135,7 +88,7 @@ class Asked:
     def run(self):
         rms = self.told.get("rms", (0.1, 0.1))[sum(question == "run" for _, question in self.seen)]
         self.seen.append((self.name, "run"))
-        return SimpleNamespace(names=["cos(q1)"], rms=rms, whole=True, at=self.name, at_the_noise=True)
+        return self.model("cos(q1)", rms, noise=True)
 
     def again(self, found):
         return None if self.told.get("lost") else found
@@ -189,14 +142,14 @@ def asked(monkeypatch):
 
 
 def test_the_zeros_of_a_part_are_those_of_all(asked):
-    # fails if all data are asked again whether recordings differ, if terms that were found without zeros stay, or if
-    # terms on a line are not asked for where zeros are
+    # fails if all data are asked again whether recordings differ, if terms are searched before the zeros that the whole
+    # dictionary asks for are known, or if terms on a line are not asked for where zeros are
     zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
     found, seen = asked(long=True, zeros=zeros)
     assert found.zeros == pytest.approx((0.0, 0.1))
     assert seen == [
-        ("part", "run"), ("part", "zeros"), ("part'", "run"), ("part'", "line"), ("part'", "hold of cos(q1)"),
-        ("part'", "terms"), ("part'", "functions"), ("whole", "of_part, True"),
+        ("part", "zeros"), ("part'", "hold of full"), ("part'", "run"), ("part'", "line"), ("part'", "terms"),
+        ("part'", "functions"), ("whole", "of_part, True"),
     ]  # fmt: skip
     on_a_line, seen = asked(zeros=zeros, line=True)
     assert not on_a_line.turning
@@ -212,24 +165,42 @@ def test_a_model_that_is_lost_on_the_way_is_not_the_end(asked):
     assert "f1" in found.reason
 
 
-def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(asked):
-    # fails if a hold that the first model does not ask for is given up; if another one is asked for twice; if terms
-    # found with the wrong hold stay
-    found, seen = asked(**{"functions": True, "hold of f1": "first"})
-    assert found.hold == "first"
-    assert [question for _, question in seen if "hold" in question] == ["hold of cos(q1)", "hold of f1"]
-    assert seen[-1] == ("whole'", "zeros")
-    found, seen = asked(**{"functions": True, "hold of cos(q1)": "smooth"})
-    assert found.hold == "smooth"
-    found, seen = asked(**{"hold of cos(q1)": "smooth"})
+def test_terms_are_asked_where_the_whole_dictionary_follows_nothing(asked):
+    # fails if zeros or a hold are not asked for then, or terms stay that were found without
+    zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
+    found, seen = asked(hard=True, zeros=zeros)
+    assert found.zeros == pytest.approx((0.0, 0.1))
+    runs = [("whole", "run"), ("whole", "zeros"), ("whole'", "hold of cos(q1)"), ("whole'", "run")]
+    assert [x for x in seen if x in runs] == runs
+    found, seen = asked(**{"hard": True, "hold of cos(q1)": "smooth"})
     assert found.hold == "smooth"
     assert [name for name, question in seen if question == "run"] == ["whole", "whole'"]
 
 
+def test_no_zeros_are_asked_of_the_dictionary_where_terms_are_at_the_noise(asked):
+    # fails if the whole dictionary is fitted to data that the simplest terms explain
+    _, seen = asked(easy=True)
+    assert seen[:3] == [("whole", "run"), ("whole", "zeros"), ("whole", "hold of cos(q1)")]
+
+
+def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(asked):
+    # fails if a hold that the first model does not ask for is given up; if another one is asked for twice; if terms
+    # are searched with the wrong hold
+    found, seen = asked(**{"functions": True, "hold of f1": "first"})
+    assert found.hold == "first"
+    assert [question for _, question in seen if "hold" in question] == ["hold of full", "hold of f1"]
+    assert seen[-1] == ("whole'", "zeros")
+    found, seen = asked(**{"functions": True, "hold of full": "smooth"})
+    assert found.hold == "smooth"
+    found, seen = asked(**{"hold of full": "smooth"})
+    assert found.hold == "smooth"
+    assert [name for name, question in seen if question == "run"] == ["whole'"]
+
+
 def test_terms_anew_that_are_worse_are_not_taken(asked):
-    # fails if what zeros or a hold ask for is taken, whether it is better or not
+    # fails if what zeros, a hold or terms of inputs ask for is taken, whether it is better or not
     zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
-    for told in ({"zeros": zeros}, {"hold of cos(q1)": "smooth"}):
+    for told in ({"zeros": zeros, "hard": True}, {"hold of cos(q1)": "smooth", "hard": True}, {"terms": ("u^2",)}):
         assert [asked(worse=worse, rms=(0.1, 0.2), **told)[0].sigma for worse in (False, True)] == [0.2, 0.1]
 
 
@@ -246,7 +217,7 @@ def test_terms_of_inputs_are_those_of_all_data(asked):
     found, seen = asked(long=True, terms=("u^2",))
     assert found.input_terms == ("u^2",)
     assert seen[-5:] == [
-        ("part", "terms"), ("whole", "driven by u^2"), ("part", "driven by u^2"), ("part'", "run"),
+        ("part", "terms"), ("part", "driven by u^2"), ("part'", "run"), ("whole", "driven by u^2"),
         ("part'", "functions"),
     ]  # fmt: skip
 
@@ -268,7 +239,7 @@ def test_a_line_is_searched_where_its_first_model_may_be_better(whole, worse, se
     def made(*_, **__):
         first = SimpleNamespace(length=20)
         other = SimpleNamespace(replaces=lambda _: False)
-        return SimpleNamespace(first=lambda: first, run=lambda given: seen.append(given is first) or other)
+        return SimpleNamespace(first=first, run=lambda: seen.append(True) or other)
 
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=2)
     own = Search(data, estimate_baseline(data), FitConfig().resolved(data))
