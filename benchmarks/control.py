@@ -1,10 +1,10 @@
 """The exported step in control: `python benchmarks/control.py [--quick] [--only PART ...] [--out FOLDER]`.
 
 `nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
-as the file for CasADi and as CasADi's own expressions. `loop`: `examples/real_time_iteration/rti.c` in closed loop with
-the true plant from random starts. `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time;
-what is compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and
-control.md.
+as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `loop`: `rti.c` of
+`examples/real_time_iteration` in closed loop with the true plant from random starts. `jacobian`: a step with its
+Jacobian over a step, in C. One thread, processor time; what is compared is timed in turn within each repeat, and a
+ratio is one of a single repeat. Writes control.json and control.md.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ def built(source: Path, *more: str) -> Path:
 
 
 def repeated(step: ca.Function) -> ca.Function:
-    """(x, u) → x after an interval, by single steps."""
+    """(x, u) → x after an interval, by single steps; of N columns."""
     x, u = ca.MX.sym("x", 5), ca.MX.sym("u")
     end = x
     for _ in range(STEPS):
         end = step(end, u, H)
-    return ca.Function("ahead", [x, u], [end])
+    return ca.Function("ahead", [x, u], [end]).map(N)
 
 
 def problem(ahead: ca.Function, **options: Any) -> tuple[dict[str, ca.MX], dict[str, Any]]:
@@ -62,7 +62,7 @@ def problem(ahead: ca.Function, **options: Any) -> tuple[dict[str, ca.MX], dict[
     distance = ca.DM(WEIGHT).T @ (X - UPRIGHT) ** 2
     cost = ca.sum2(distance) + LAST * distance[-1] + FORCE_WEIGHT * ca.sumsqr(U)
     unknowns = ca.veccat(X, U)
-    gaps = ca.veccat(X[:, 0] - start, ahead.map(N)(X[:, :-1], U) - X[:, 1:])
+    gaps = ca.veccat(X[:, 0] - start, ahead(X[:, :-1], U) - X[:, 1:])
     scale, multipliers = ca.MX.sym("scale"), ca.MX.sym("multipliers", gaps.shape[0])
     hessian = ca.triu(scale * ca.hessian(cost, unknowns)[0])
     options["hess_lag"] = ca.Function("hess_lag", [unknowns, start, scale, multipliers], [hessian])
@@ -100,11 +100,13 @@ def solve(solver: ca.Function) -> tuple[float, float, float]:
 
 def nlp(quick: bool, folder: Path) -> list[Row]:
     """The whole solution and its functions, ours and others in turn."""
-    library = str(built(export_casadi(model(), folder / "cart.c", h=H)))
+    library = str(built(export_casadi(model(), folder / "cart.c", h=H), f"-Dcart_HORIZON={N}"))
     hold, x, u = ca.external("cart_hold", library), ca.MX.sym("x", 5), ca.MX.sym("u")
+    shoot, X, U = ca.external("cart_shoot", library), ca.MX.sym("X", 5, N), ca.MX.sym("U", 1, N)
     own = sx_steps()
     forms = {
-        "ours": solver(ca.Function("ahead", [x, u], [hold(x, u, INTERVAL)])),
+        "ours": solver(ca.Function("ahead", [X, U], [shoot(X, U, INTERVAL)])),
+        "ours, 50 calls of a hold": solver(ca.Function("ahead", [x, u], [hold(x, u, INTERVAL)]).map(N)),
         "ours, 8 calls of a step": solver(repeated(ca.external("cart_step", library))),
         "SX, fast_newton": solver(repeated(own["rootfinder"])),
         "SX, Newton unrolled": solver(repeated(own["unrolled"])),
