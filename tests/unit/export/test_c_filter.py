@@ -124,11 +124,15 @@ int smooth(long steps, double h, const double *std, const double *noises, const 
 """
 
 
+def library_of(model, folder, dtype="float64"):
+    path = folder / "stepper.h"
+    export_c(model, path, h=H, name="arm", parameters=NAMES, extras=["filter"], dtype=dtype)
+    return build(path.read_text(), LOOPS.replace("double", "arm_real"))
+
+
 @pytest.fixture(scope="module")
 def library(double_pendulum, tmp_path_factory):
-    path = tmp_path_factory.mktemp("filter") / "stepper.h"
-    export_c(double_pendulum, path, h=H, name="arm", parameters=NAMES, extras=["filter"])
-    return build(path.read_text(), LOOPS)
+    return library_of(double_pendulum, tmp_path_factory.mktemp("filter"))
 
 
 @pytest.fixture(scope="module")
@@ -184,19 +188,37 @@ def test_it_is_its_twin_in_python(followed, double_pendulum):
     assert (belief.theta - torch.tensor(values_of(double_pendulum, NAMES)).double()).abs().max() > 1e-4
 
 
+def smoothed(library, start, y, lag):
+    """What `smooth` writes, in the type of y."""
+    real = ctypes.c_float if y.dtype == torch.float32 else ctypes.c_double
+    steps, n, F = len(y), 2, 6
+    noises = torch.tensor([x for row in NOISE for x in row], dtype=y.dtype)
+    sizes = ((lag + 1, F), (lag + 1, F, F), (lag + 1, n), (steps,))
+    outputs = [torch.full(size, torch.nan, dtype=y.dtype) for size in sizes]
+    lists = [x.to(y.dtype) for x in (STD, noises, start, y)]
+    counts = (ctypes.c_long(steps), real(H))
+    assert library.smooth(*counts, *map(address, lists), ctypes.c_int(lag), *map(address, outputs)) == 0
+    return outputs
+
+
+def test_the_smoother_in_float(library, followed, double_pendulum, tmp_path):
+    # fails if a number of the smoother is a double in a header of floats, or its covariance loses the digits of a float
+    start, out = followed(1, 60, STD)
+    y = out[4][0]
+    single = smoothed(library_of(double_pendulum, tmp_path, "float32"), start, y.float(), 5)
+    (found, covariance, *_), (found_low, covariance_low, *_) = smoothed(library, start, y, 5), single
+    root = covariance.diagonal(dim1=1, dim2=2).sqrt()
+    # In standard deviations: 3e-6 and 2e-6 off.
+    assert ((found_low.double() - found).abs() / root).max() <= 1e-5
+    assert ((covariance_low.double() - covariance).abs() / (root[:, :, None] * root[:, None])).max() <= 1e-5
+
+
 def test_the_smoother_is_its_twin_in_python(library, followed, double_pendulum):
     # fails if the ring of C loses or swaps samples, a sample that is missing moves the lag, or the blocks that C keeps
     # are not those of the filter of a longer state, which the twin is
     start, out = followed(1, 17, STD)
-    y, n, F, lag = out[4][0], 2, 6, 5
-    noises = torch.tensor([x for row in NOISE for x in row], dtype=torch.float64)
-    sizes = ((F,), (F, F), (n,))
-    found, covariance, speed = (torch.full((lag + 1, *size), torch.nan, dtype=torch.float64) for size in sizes)
-    surprise = torch.full((17,), torch.nan, dtype=torch.float64)
-    lists = (address(x) for x in (STD, noises, start, y))
-    counts = (ctypes.c_long(17), ctypes.c_double(H))
-    outputs = map(address, (found, covariance, speed, surprise))
-    assert library.smooth(*counts, *lists, ctypes.c_int(lag), *outputs) == 0
+    y, lag = out[4][0], 5
+    found, covariance, speed, surprise = smoothed(library, start, y, lag)
     kalman = KalmanFilter(double_pendulum, NOISE, NAMES)
     belief, surprises = kalman.start(State(start[:2], start[2:], start.new_zeros(())), STD), []
     for k in range(17):
