@@ -111,7 +111,8 @@ def export_run(
     described |= asked
     if "filter" in extras:
         still = (0.0,) * len(described_parameters(run.model, parameters))
-        metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}
+        noise = noise_of(run, still)._asdict()
+        metadata["noise"] = {key: x if isinstance(x, float) else list(x) for key, x in noise.items()}
     WRITERS[kind](run.model, path, **described)
     return path
 
