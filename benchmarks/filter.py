@@ -28,8 +28,7 @@ import torch
 from herglotz import fit
 from herglotz.codegen.c_compiler import build
 from herglotz.data import load
-from herglotz.export import export_c
-from herglotz.export.filtering import ADAPTATION, noise_of
+from herglotz.export import export_c, noise_of
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import chosen, combined, values_of, with_values
 
@@ -221,34 +220,24 @@ def measured(folder: Path) -> dict[str, Any]:
     run = fit(data.select(TRAIN), train_fraction=1.0, progress=False)
     parts = [data.select([b]) for b in range(len(data))]
     fine = [x.q.double().numpy() for x in parts]
-    train, test = [fine[b] for b in TRAIN], [q for b, q in enumerate(fine) if b not in TRAIN]
+    test = [q for b, q in enumerate(fine) if b not in TRAIN]
     h = data.typical_step
-    # Of a band-limited motion sixth differences are noise, whose variance they multiply by 924.
-    sensor = np.sqrt(np.mean([np.mean(np.diff(q, 6, axis=0) ** 2, 0) for q in train], 0) / 924)
-    model, steps, fitted = run.model.double(), round(STRIDE * h / run.h), np.array(noise_of(run).momentum)
+    model, steps, noise = run.model.double(), round(STRIDE * h / run.h), noise_of(run)
+    sensor = np.array(noise.position)
 
-    def followed(q: Array, momentum: Array, adaptation: float = 0.0) -> Followed:
+    def followed(q: Array, adaptation: float) -> Followed:
         y, v = q[::STRIDE], (q[1] - q[0]) / h
         p = model.velocity_derivatives(torch.tensor(q[:1]), torch.tensor(v)[None], torch.zeros(1).double())[0][0]
         start = np.concatenate([y[0], p.detach().numpy()])
         std = [*sensor, 0.1, 0.1, *([0.0] * model.s_enters_motion)]
-        return Followed(model, STRIDE * h, steps, y, [*sensor, *momentum], std, start=start, adaptation=adaptation)
+        return Followed(model, STRIDE * h, steps, y, [*sensor, *noise.momentum], std, start=start,
+                        adaptation=adaptation)  # fmt: skip
 
-    def nis(windows: Sequence[Array], momentum: Array, adaptation: float = 0.0) -> list[Array]:
-        return [followed(q, momentum, adaptation).surprise[10:] for q in windows]
-
-    # The noise of forces is the one number that is tuned: so that NIS is n on the windows that trained.
-    low, high = -3.0, 3.0
-    for _ in range(20):
-        middle = (low + high) / 2
-        wrong = np.concatenate(nis(train, 10**middle * fitted)).mean() > 2
-        low, high = (middle, high) if wrong else (low, middle)
-    momentum = 10**high * fitted
-    fixed, learned = nis(test, momentum), nis(test, momentum, ADAPTATION)
+    fixed, learned = ([followed(q, x).surprise[10:] for q in test] for x in (0.0, noise.adaptation))
     found = np.concatenate(learned)
     truth = [reference(q, h)[::STRIDE] for q in test]
     late = slice(10, -2)
-    ours = np.concatenate([(followed(q, momentum).v - v)[late] for q, v in zip(test, truth, strict=True)])
+    ours = np.concatenate([(followed(q, noise.adaptation).v - v)[late] for q, v in zip(test, truth, strict=True)])
     rivals: dict[float, Array] = {}
     for jerk in 10.0 ** np.arange(1.0, 6.01, 0.25):
         misses = []
@@ -262,7 +251,7 @@ def measured(folder: Path) -> dict[str, Any]:
     width = 1.96 * 2 / math.sqrt(len(found))
     return {
         "sensor, rad": sensor.round(7).tolist(),
-        "noise of forces over the fit's": float(10**high),
+        "forces, a root second": np.round(noise.momentum, 4).tolist(),
         "mean NIS of 2": float(found.mean()),
         "of a window": [f(float(x.mean()) for x in learned) for f in (min, max)],
         "with the noise of all windows": float(np.concatenate(fixed).mean()),

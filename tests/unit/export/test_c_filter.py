@@ -16,7 +16,7 @@ import herglotz as hz
 from herglotz.codegen.c_compiler import build
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.export import export_c
+from herglotz.export import export_c, noise_of
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of
 from herglotz.stepping import State, Stepper
@@ -457,3 +457,29 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     for lag in (-1, len(kept)):
         with pytest.raises(InputError, match=f"lag must be 0 to {len(kept) - 1}.*got {lag}"):
             hz.filter(run, data, lag=lag)
+
+
+def test_the_noise_of_a_fit_is_that_of_its_recording():
+    # fails if the levels are those that the fit assumed (a tenth of the noise of readings, and next to no forces), the
+    # spread of the start is not that of the filter, or an input does not act
+    config = ModelConfig((True,), "forced", (1.0,), (2.0,), (4.0,), (0.0,), rate=0.0, potential_width=0, inputs=1,
+                         input_map=(1.0,))  # fmt: skip
+    model, make = ContactLagrangian(config).requires_grad_(False), torch.Generator().manual_seed(0)
+    stepper, u = Stepper(model), torch.randn(600, 1, generator=make, dtype=torch.float64)
+    state = State(*(torch.zeros(size, dtype=torch.float64) for size in ((1, 1), (1, 1), (1,))))
+    q = []
+    for k in range(600):
+        q.append(state.q[0])
+        state = stepper.step(state, H, u=u[k : k + 1]).state
+        state = state._replace(p=state.p + 0.3 * H**0.5 * torch.randn(1, 1, generator=make, dtype=torch.float64))
+    y = torch.stack(q) + 0.02 * torch.randn(600, 1, generator=make, dtype=torch.float64)
+    t = (torch.arange(600) * H).double()
+    data = Trajectories.of(t, y, (600,), u=u, names=("a",), units=("rad",), angles=(True,))
+    span = (H * (1 - 1e-7), H * (1 + 1e-7))
+    run: Any = SimpleNamespace(
+        model=model, metrics={"sigma": 0.002}, data=data, h=H, h_range=span, arrival=data.arrival,
+        config=SimpleNamespace(frequencies=()),
+    )  # fmt: skip
+    found = noise_of(run)
+    assert found.position[0] == pytest.approx(0.02, rel=0.2)
+    assert found.momentum[0] == pytest.approx(0.3, rel=0.2)
