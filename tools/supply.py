@@ -106,7 +106,8 @@ def lock() -> str:
     wanted = project()
     extras = wanted["optional-dependencies"]
     # pip cannot give a hash for the package's own folder: its requirements instead
-    lines = [*wanted["build"], *wanted["dependencies"], *extras["dev"], *extras["export"], *extras["control"]]
+    lines = [*wanted["build"], *wanted["dependencies"], *extras["dev"]]
+    lines += [*extras["export"], *extras["control"], *extras["gymnasium"]]
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         ours = ("--report", str(report), "--constraint", str(ROOT / "constraints.txt"))

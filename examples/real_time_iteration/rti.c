@@ -1,11 +1,14 @@
 /* Model predictive control around a file that `herglotz export --format casadi --name model` wrote, by one iteration a
    sample, without a library and without allocation.
 
-     minimise  sum_k |x_k - X|^2_Q + |u_k|^2_R  +  |x_N - X|^2_E   over  x_{k+1} = model_hold(x_k, u_k, H),  |u_k| <= U
+     minimise  sum_k |x_k - X|^2_Q + |u_k|^2_R  +  |x_N - X|^2_E   over  x_{k+1} = model_hold(x_k, u_k, H),  |u_k| <= U,
+               |x_k| <= B
 
    `rti_prepare` runs before the sample is there: Jacobians of all intervals, and a Riccati recursion whose problem at
    each interval keeps the bounds by an active set (differential dynamic programming with control limits: Tassa, Mansard and
-   Todorov, ICRA 2014; Gauss-Newton, as a step has first derivatives). `rti_feedback` takes the measured state, runs the
+   Todorov, ICRA 2014; Gauss-Newton, as a step has first derivatives). Bounds of states are a logarithmic barrier that goes
+   on as a parabola from where `near` of the way to the bound is left (Hauser and Saccon, CDC 2006; Feller and Ebenbauer,
+   IEEE Trans. Autom. Control 62, 2017), so that a motion beyond a bound has a cost, too, and leads back. `rti_feedback` takes the measured state, runs the
    law through the model, and gives the input. Compile with: cc -O3 -march=native rti.c -lm (or -shared -fPIC). */
 
 #include <math.h>
@@ -24,11 +27,27 @@ enum { N = RTI_N, NX = model_SIZE, NU = model_c_M };
 typedef struct {
   double H;                                 /* length of an interval */
   double X[NX], Q[NX], E[NX], R[NU], U[NU]; /* the aim, the weights and the bounds; set before the first call */
+  double B[NX], barrier, near;              /* bounds of states, 0 for none; the barrier's weight, and where it goes on */
   double x[N + 1][NX], u[N][NU];            /* the motion; x[0] and u are set before the first call */
   double K[N][NU][NX], k[N][NU];            /* the law du = k + K dx */
   double damping;                           /* Levenberg and Marquardt's, in units of R; 0 at first */
   double cost;
 } rti;
+
+/* The barrier of |x| <= bound, with its slope and curvature by x. */
+static double barrier(const rti *o, double x, double bound, double *slope, double *curvature) {
+  double value = 0.0;
+  int side;
+  *slope = *curvature = 0.0;
+  for (side = -1; bound > 0.0 && side <= 1; side += 2) {
+    const double d = 1.0 - side * x / bound, z = (d - 2.0 * o->near) / o->near;
+    const int inside = d > o->near;
+    value += o->barrier * (inside ? -log(d) : 0.5 * (z * z - 1.0) - log(o->near));
+    *slope += o->barrier * side / bound * (inside ? 1.0 / d : -z / o->near);
+    *curvature += o->barrier / (bound * bound) * (inside ? 1.0 / (d * d) : 1.0 / (o->near * o->near));
+  }
+  return value;
+}
 
 static double within(double x, double limit) { return x > limit ? limit : x < -limit ? -limit : x; }
 
@@ -40,12 +59,14 @@ static int interval(const rti *o, const double *x, const double *u, double *x1) 
 
 /* The motion from a state: u + part k + K dx within the bounds, and what it costs; not a number where it ends early. */
 static double follow(const rti *o, const double start[NX], double part, double x[N + 1][NX], double u[N][NU]) {
-  double cost = 0.0;
+  double cost = 0.0, slope, curvature;
   int k, i, j;
   memcpy(x[0], start, sizeof x[0]);
   for (k = 0; k <= N; k++) {
-    for (i = 0; i < NX; i++)
+    for (i = 0; i < NX; i++) {
       cost += (k < N ? o->Q[i] : o->E[i]) * (x[k][i] - o->X[i]) * (x[k][i] - o->X[i]);
+      cost += barrier(o, x[k][i], o->B[i], &slope, &curvature);
+    }
     if (k == N) return cost;
     for (i = 0; i < NU; i++) {
       double to = o->u[k][i] + part * o->k[k][i];
@@ -121,10 +142,12 @@ static int law(double M[NU][NU], double F[NU][NX], double f[NU], const double u[
 int rti_prepare(rti *o) {
   double P[NX][NX] = {{0.0}}, p[NX], PA[NX][NX], PB[NX][NU], M[NU][NU], F[NU][NX], f[NU];
   double A[NX * NX], B[NX * NU], by_h[NX], *slopes[3] = {A, B, by_h}; /* column by column */
+  double slope, curvature;
   int k, i, j, l;
   for (i = 0; i < NX; i++) {
-    P[i][i] = 2.0 * o->E[i];
-    p[i] = 2.0 * o->E[i] * (o->x[N][i] - o->X[i]);
+    barrier(o, o->x[N][i], o->B[i], &slope, &curvature);
+    P[i][i] = 2.0 * o->E[i] + curvature;
+    p[i] = 2.0 * o->E[i] * (o->x[N][i] - o->X[i]) + slope;
   }
   for (k = N - 1; k >= 0; k--) {
     const double *arg[4] = {o->x[k], o->u[k], &o->H, o->x[k + 1]};
@@ -147,10 +170,12 @@ int rti_prepare(rti *o) {
     }
     if (law(M, F, f, o->u[k], o->U, o->k[k], o->K[k])) return 1;
     for (i = 0; i < NX; i++) { /* the value at dx: of the law, bounds included */
-      double slope = 2.0 * o->Q[i] * (o->x[k][i] - o->X[i]), row[NX];
+      double row[NX];
+      barrier(o, o->x[k][i], o->B[i], &slope, &curvature);
+      slope += 2.0 * o->Q[i] * (o->x[k][i] - o->X[i]);
       for (l = 0; l < NX; l++) slope += A[i * NX + l] * p[l];
       for (j = 0; j < NX; j++) {
-        row[j] = i == j ? 2.0 * o->Q[i] : 0.0;
+        row[j] = i == j ? 2.0 * o->Q[i] + curvature : 0.0;
         for (l = 0; l < NX; l++) row[j] += A[i * NX + l] * PA[l][j];
         for (l = 0; l < NU; l++) row[j] += F[l][i] * o->K[k][l][j];
       }
@@ -169,7 +194,7 @@ int rti_feedback(rti *o, const double measured[NX], double input[NU]) {
   double x[N + 1][NX], u[N][NU], part = 1.0;
   const double without = follow(o, measured, 0.0, x, u);
   for (; part > 1e-3; part /= 2.0)
-    if ((o->cost = follow(o, measured, part, x, u)) < without || without != without) break;
+    if ((o->cost = follow(o, measured, part, x, u)) <= without * (1.0 + 1e-13) || without != without) break;
   if (part > 1e-3) o->damping /= 10.0;
   else {
     o->cost = follow(o, measured, 0.0, x, u);

@@ -28,8 +28,8 @@ from herglotz.stepping.state import check_h
 from herglotz.training import Run
 
 try:
-    import gymnasium  # pyright: ignore[reportMissingImports]
-    from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
+    import gymnasium
+    from gymnasium.vector.utils import batch_space
 except ImportError:
     raise ImportError("VectorEnv needs gymnasium; install it: pip install 'herglotz[gymnasium]'") from None
 
@@ -135,7 +135,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         n, unbounded = stepper.dof, np.full(stepper.dof, np.inf)
         box = lambda a, b: gymnasium.spaces.Box(a.astype(dtype), b.astype(dtype), dtype=self.dtype.type)  # noqa: E731
         self.single_observation_space = box(np.r_[low, -unbounded], np.r_[high, unbounded])
-        self.single_action_space = box(*_input_bounds(stepper, input_low, input_high))
+        self.single_action_space = inputs = box(*_input_bounds(stepper, input_low, input_high))
+        self._input_low, self._input_high = inputs.low, inputs.high
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -217,8 +218,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if actions.shape != self._u.shape or actions.dtype.kind not in "fiu":
             given = f"{actions.dtype} of shape {actions.shape}"
             raise InputError(f"actions must be numbers of shape {self._u.shape}, got {given}")
-        np.maximum(actions, self.single_action_space.low, out=self._u, casting="same_kind")
-        np.minimum(self._u, self.single_action_space.high, out=self._u, casting="same_kind")
+        np.maximum(actions, self._input_low, out=self._u, casting="same_kind")
+        np.minimum(self._u, self._input_high, out=self._u, casting="same_kind")
         if (wrong := np.isnan(self._u)).any():
             raise InputError(f"actions: NaN for environment {int(wrong.any(1).argmax())}; give finite numbers")
 

@@ -1,14 +1,11 @@
-"""The environments of `hz.VectorEnv`; of gymnasium as much stands in here as they need where it is not installed."""
+"""The environments of `hz.VectorEnv`."""
 
-import enum
 import importlib
-import importlib.util
 import shutil
 import sys
-import types
-from importlib.machinery import ModuleSpec
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -19,66 +16,9 @@ from herglotz.export import compile_c, export_c, load_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
 
-INSTALLED = importlib.util.find_spec("gymnasium") is not None
 pytestmark = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
 H, B = 0.05, 7
 BOX = {"q_low": [-1.0], "q_high": [2.0], "p_low": [-3.0], "p_high": [3.0], "s_low": [-1e-3], "s_high": [1e-3]}
-
-
-class Box:
-    """Stands in for gymnasium.spaces.Box."""
-
-    def __init__(self, low, high, dtype):
-        self.low, self.high, self.dtype, self.shape = low, high, np.dtype(dtype), low.shape
-
-    def contains(self, x):
-        within = (x >= self.low) & (x <= self.high)
-        return bool(np.can_cast(x.dtype, self.dtype) and x.shape == self.shape and within.all())
-
-
-class Base:
-    """Stands in for gymnasium.vector.VectorEnv."""
-
-    def reset(self, *, seed=None):
-        if seed is not None or not hasattr(self, "np_random"):
-            self.np_random = np.random.default_rng(seed)
-
-
-class Mode(enum.Enum):
-    """Stands in for gymnasium.vector.AutoresetMode."""
-
-    NEXT_STEP = "NextStep"
-    SAME_STEP = "SameStep"
-    DISABLED = "Disabled"
-
-
-def batch_space(one, count):
-    low, high = (np.repeat(end[None], count, 0) for end in (one.low, one.high))
-    return Box(low, high, one.dtype)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _gymnasium():
-    """The environment's module with gymnasium, or with what stands in."""
-    if INSTALLED:
-        yield
-        return
-    names = ("gymnasium", "gymnasium.vector", "gymnasium.vector.utils", "gymnasium.spaces")
-    whole, vector, utils, spaces = found = [types.ModuleType(name) for name in names]
-    contents: dict[Any, dict[str, Any]] = {
-        whole: {"vector": vector, "spaces": spaces},
-        vector: {"VectorEnv": Base, "AutoresetMode": Mode, "utils": utils},
-        utils: {"batch_space": batch_space},
-        spaces: {"Box": Box},
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        for module in found:
-            module.__spec__ = ModuleSpec(module.__name__, None)  # torch asks for it
-            vars(module).update(contents[module])
-            patch.setitem(sys.modules, module.__name__, module)
-        patch.delitem(sys.modules, "herglotz.environment", raising=False)
-        yield
-        sys.modules.pop("herglotz.environment", None)
 
 
 def pendulum(angle=True, **options):
@@ -405,12 +345,9 @@ def test_a_missing_package_is_named(monkeypatch):  # fails if a newcomer sees a 
         importlib.import_module("herglotz.environment")
 
 
-@pytest.mark.skipif(not INSTALLED, reason="gymnasium is an extra")
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_it_is_an_environment_of_gymnasium(stepper, mode):
     # fails if wrappers of gymnasium do not work with it: spaces, metadata, infos, the count of steps of an episode
-    import gymnasium  # pyright: ignore[reportMissingImports]
-
     env = made(stepper, autoreset_mode=mode, max_episode_steps=5, dtype="float32")
     assert isinstance(env, gymnasium.vector.VectorEnv)
     assert env.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode(mode)

@@ -92,10 +92,6 @@ def test_notebooks_are_written_without_the_site(tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_a_tutorial_runs(tmp_path, monkeypatch, path):  # fails if a script no longer does what its page shows
-    if "import casadi" in path.read_text(encoding="utf-8"):
-        pytest.importorskip("casadi", reason="casadi is not installed (extra: control)")
-    if "VectorEnv" in path.read_text(encoding="utf-8"):
-        pytest.importorskip("gymnasium", reason="gymnasium is not installed (extra: gymnasium)")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tools.pages.PAGES", tmp_path)
     shown = page(path.stem)

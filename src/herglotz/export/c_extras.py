@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from herglotz.errors import InputError
-from herglotz.export.c_numbers import numbers
+from herglotz.export.c_numbers import number, numbers
 from herglotz.export.metadata import EXTRAS
 
 FILES = {"adjoint": ("adjoint",), "filter": ("filter", "smoother")}  # of `export/runtime`
@@ -30,6 +30,7 @@ def extras_source(entries: Mapping[str, Any], file: Callable[[str], str]) -> lis
             rows = [noise["position"], noise["momentum"]]
             rows += [noise["theta"]] if entries.get("parameters") else []
             values = ", ".join(f"{{{numbers(row, entries['dtype'])}}}" for row in rows)
+            values += f", {number(noise['adaptation'], entries['dtype'])}"
             found.append(
                 f"/* The noise that the fit found. */\nstatic const hz_noise hz_noise_of_fit = {{{values}}};\n"
             )

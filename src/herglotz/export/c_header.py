@@ -204,7 +204,9 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     if entries["dof"] <= MAX_WIDE:
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
     parts += [as_scalars(emitted.slopes), api]
-    parts += [as_scalars(emitted.momentum), shown(runtime("velocity.h"))] if velocities else []
+    if velocities:
+        parts += [as_scalars(emitted.momentum), shown(runtime("velocity.h"))]
+        parts += ["#ifdef hz_BATCHED", as_lanes(emitted.momentum), "#endif", as_lanes(shown(runtime("velocities.h")))]
     parts += [*extras_source(entries, lambda x: shown(runtime(x))), "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), entries["dtype"]))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")

@@ -21,9 +21,9 @@ def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None 
     """Write the step as one C file that `casadi.external` loads once it is compiled.
 
     The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`; NAME_hold, the
-    same over a time h of as few equal steps as are no longer than the typical one; and up to 8 coordinates their
-    Jacobians. Without inputs there is no u. A step that does not exist is an error of CasADi. docs/control.md has an
-    example.
+    same over a time h of as few equal steps as are no longer than the typical one; NAME_shoot, that of all intervals
+    of a horizon at once, where it is compiled with -DNAME_HORIZON=COUNT; and up to 8 coordinates their Jacobians.
+    Without inputs there is no u. A step that does not exist is an error of CasADi. docs/control.md has an example.
 
     Parameters
     ----------
@@ -31,11 +31,14 @@ def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None 
         As of `export_c`, without parameters and extras; the name of the file should end in `.c`. What is returned and
         raised is as there.
     """
-    functions = [
+    one, held = "1.0", "hz_steps_of(h, (double)hz_h)"
+    step, hold, shoot = (
         runtime("casadi_function.c").replace("NAME_FN", f"NAME_{function}").replace("FN_STEPS(h)", steps)
-        for function, steps in (("step", "1.0"), ("hold", "hz_steps_of(h, (double)hz_h)"))
-    ]
-    return _wrapped(model, Path(path), name, "".join((runtime("hold.h"), runtime("casadi.c"), *functions)), settings)
+        .replace("FN_COUNT", count)
+        for function, steps, count in (("step", one, "1"), ("hold", held, "1"), ("shoot", held, "NAME_HORIZON"))
+    )  # fmt: skip
+    parts = (runtime("hold.h"), runtime("casadi.c"), step, hold, "\n#ifdef NAME_HORIZON", shoot, "#endif\n")
+    return _wrapped(model, Path(path), name, "".join(parts), settings)
 
 
 def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None = None, **settings: Any) -> Path:

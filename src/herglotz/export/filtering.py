@@ -17,15 +17,12 @@ from herglotz.errors import InputError
 from herglotz.export.c_compile import compile_c
 from herglotz.export.c_header import MAX_DERIVATIVES
 from herglotz.export.exported import ExportedStepper
-from herglotz.mechanics import legendre_minus
+from herglotz.export.noise import input_at, momentum_at, noise_of, parts_of
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 from herglotz.stepping.filter import Belief, KalmanFilter, Noise
-from herglotz.stepping.linearise import forward_slopes
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.predict import BELIEVED, of_the_run
-from herglotz.training.problems.grid import segment_grid
-from herglotz.training.problems.smoothing import SmoothingProblem
+from herglotz.training.predict import of_the_run
 
 
 @dataclass(frozen=True)
@@ -40,19 +37,6 @@ class Filtered:
     covariance: Tensor  # (N, F, F) of q, p, s where the motion depends on it, and θ
     covariance_of_v: Tensor  # (N, n, n)
     surprise: Tensor  # (N,) squared innovation over its variance, n on average; NaN at the first of a trajectory
-
-
-def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
-    """The noise of positions that the fit found, and of the forces that it lets a smoothed motion leave the model by.
-
-    `theta` are the standard deviations of numbers that wander. Raise InputError if the fit found no noise.
-    """
-    problem, h = _problem(run), run.h
-    n = problem.n
-    momentum = problem.process * problem.mass * problem.deviations * problem.speed / problem.scale / math.sqrt(h)
-    if not bool((problem.deviations[:n] > 0).all()):
-        raise InputError("the run's metrics have no noise (sigma) > 0; give noise to the filter")
-    return Noise(problem.deviations.tolist(), momentum.tolist(), theta)
 
 
 def filter(
@@ -134,10 +118,10 @@ def _carried(
     kalman: KalmanFilter, model: ContactLagrangian, data: Trajectories, belief: Belief, row: int, h: float, most: float
 ) -> Belief:
     """What is known at a row before its sample, by as few equal steps as are no longer than `most`."""
-    parts = max(1, math.ceil(h / most - 1e-6))
+    parts = parts_of(h, most)
     for k in range(parts):
         part = torch.tensor((k + 0.5) / parts, dtype=torch.float64)
-        belief = kalman.predict(belief, h / parts, _input(model, data, row - 1, part))
+        belief = kalman.predict(belief, h / parts, input_at(model, data, row - 1, part))
     return belief
 
 
@@ -156,6 +140,7 @@ def _told(
     steps: list[float],
 ) -> Filtered:  # fmt: skip
     states, thetas, covariances = (torch.stack(x) for x in zip(*(_flat(belief) for belief in beliefs), strict=True))
+    scales = data.t.new_tensor([float(belief.scale) for belief in beliefs])
     n = kalman.n
     state = State(states[:, :n], states[:, n:-1], states[:, -1])
     u = data.u if model.inputs else None
@@ -166,9 +151,9 @@ def _told(
         ]
         v, spread = (torch.stack(x) for x in zip(*found, strict=True))
     else:
-        v, spread = kalman.velocity(Belief(state, thetas, covariances), data.t.new_tensor(steps), u)
+        v, spread = kalman.velocity(Belief(state, thetas, covariances, scale=scales), data.t.new_tensor(steps), u)
     surprise = data.t.new_tensor(surprises)
-    return Filtered(data.t, state, v, thetas, kalman.names, covariances, spread, surprise)
+    return Filtered(data.t, state, v, thetas, kalman.names, scales[:, None, None] * covariances, spread, surprise)
 
 
 def _flat(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
@@ -176,37 +161,10 @@ def _flat(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
     return torch.cat([q, p, s[None]]), belief.theta, belief.covariance
 
 
-def _input(model: ContactLagrangian, data: Trajectories, row: int, part: Tensor) -> Tensor | None:
-    """The input (m,) at this part of the recorded step that starts at a row."""
-    if not model.inputs:
-        return None
-    u = data.inputs_of_steps(torch.tensor([row]), part[None])
-    assert u is not None  # `of_the_run` has checked
-    return u[0]
-
-
 def _started(kalman: KalmanFilter, data: Trajectories, row: int, std: Tensor) -> Belief:
     """At the first sample, with the momentum that FL⁻ gives the first two: its noise is m √2 σ/h."""
-    n, model = kalman.n, kalman.model
-    q0, q1, h = data.q[row], data.q[row + 1], data.t[row + 1] - data.t[row]
-    u = _input(model, data, row, torch.tensor(0.5, dtype=torch.float64))
-    zero = torch.zeros((), dtype=torch.float64)
-
-    def momentum(q1: Tensor) -> Tensor:
-        return legendre_minus(model if u is None else model.at(u), q0, q1, zero, h)[1]
-
-    with torch.no_grad():
-        p = momentum(q1)
-        by_q1 = forward_slopes(momentum, q1)
+    n, q0, zero = kalman.n, data.q[row], torch.zeros((), dtype=torch.float64)
+    p, by_q1 = momentum_at(kalman.model, data, row)
     own = q0.new_tensor(kalman.noise.position)
     spread = torch.cat([own, 2**0.5 * (by_q1.square() @ own.square()).sqrt(), zero.expand(kalman.kept - 2 * n), std])
     return kalman.start(State(q0, p, zero), spread)
-
-
-def _problem(run: FittedRun) -> SmoothingProblem:
-    """The smoothing of the run's own data, for the noise that it assumes."""
-    data, config, high = run.data.unwrapped(), run.model.config, run.h_range[1]
-    turn = run.h * max(v / x for v, x in zip(config.speed, config.scale, strict=True))
-    process = run.metrics.get("process") or BELIEVED * min(1.0, turn) ** 0.5
-    sigma = run.metrics.get("sigma") or 0.0
-    return SmoothingProblem(run.model, data, segment_grid(data, data.samples, high), sigma=sigma, process=process)

@@ -88,7 +88,7 @@ class Metadata(_Needed, total=False):
     columns: list[tuple[str, str, str]]  # name, role, unit
     name: str
     extras: list[str]  # of `EXTRAS`
-    noise: dict[str, list[float]]  # of a filter: standard deviations of position, momentum and theta
+    noise: dict[str, Any]  # of a filter: standard deviations of position, momentum and theta, and adaptation
     parameters: dict[str, tuple[float, float | None, float | None]]  # set at run time: default, low, high
     between: dict[str, dict[str, float]]  # those of them that move several numbers: the values of these at 1
 

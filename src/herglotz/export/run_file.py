@@ -13,11 +13,11 @@ import torch
 from herglotz.errors import InputError, refuse
 from herglotz.export.c_header import export_c
 from herglotz.export.c_wrappers import export_acados, export_casadi
-from herglotz.export.filtering import noise_of
 from herglotz.export.fmu import export_fmu
 from herglotz.export.lower.aoti import export_aoti
 from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
+from herglotz.export.noise import noise_of
 from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.training import Run
 from herglotz.training.summary import model_card
@@ -111,7 +111,8 @@ def export_run(
     described |= asked
     if "filter" in extras:
         still = (0.0,) * len(described_parameters(run.model, parameters))
-        metadata["noise"] = {key: list(row) for key, row in noise_of(run, still)._asdict().items()}
+        noise = noise_of(run, still)._asdict()
+        metadata["noise"] = {key: x if isinstance(x, float) else list(x) for key, x in noise.items()}
     WRITERS[kind](run.model, path, **described)
     return path
 

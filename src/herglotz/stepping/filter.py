@@ -10,11 +10,16 @@ so that q and p get their share of each other. Positions y = q + e are taken in 
 
     S = P_ii + σ_i²,    x ← x + P_i (y_i − q_i)/S,    P ← P − P_i P_iᵀ/S.
 
-A fixed-lag smoother is the same filter of a longer state: x and copies of x at the last samples, which steps leave as
-they are and positions move by their covariance. `export/runtime/smoother.h` keeps only the blocks of it that change.
+What a model misses is seldom as large in one motion as in another: the common scale κ of all variances is learned,
+
+    w ← (1 − a) w + 1,    κ ← κ + (r − 1) κ/w,        r = Σ (y_i − q_i)²/(κ S_i n),
+
+which changes no estimate (a = 0: it is not learned). A fixed-lag smoother is the same filter of a longer state: x and
+copies of x at the last samples, which steps leave as they are and positions move by their covariance.
+`export/runtime/smoother.h` keeps only the blocks of it that change.
 
 Source: A. Gelb (ed.), Applied optimal estimation (1974), sections 4.2 and 6.1; B. D. O. Anderson & J. B. Moore, Optimal
-filtering (1979), section 7.3.
+filtering (1979), section 7.3; M. West & J. Harrison, Bayesian forecasting and dynamic models (1997), section 10.8.
 """
 
 from __future__ import annotations
@@ -40,6 +45,7 @@ class Noise(NamedTuple):
     position: Sequence[float]  # (n,) of a measured position
     momentum: Sequence[float]  # (n,) of what unknown forces add to p
     theta: Sequence[float] = ()  # (K,) of how far the numbers wander
+    adaptation: float = 0.0  # of the common scale of all variances, of which 1/adaptation updates tell; 0: as given
 
 
 class Belief(NamedTuple):
@@ -47,8 +53,11 @@ class Belief(NamedTuple):
 
     state: State  # (n,), (n,), ()
     theta: Tensor  # (K,)
-    covariance: Tensor  # (F, F) of q, p, s where the motion depends on it, and θ; (F + FL, F + FL) with earlier samples
+    # (F, F) of q, p, s where the motion depends on it, and θ, over the scale; (F + FL, F + FL) with earlier samples
+    covariance: Tensor
     earlier: Tensor | None = None  # (L, F) the same numbers at these, the newest first
+    scale: Tensor | float = 1.0  # of all variances, () or (B,)
+    weight: float = 1.0  # updates that have told the scale
 
 
 class KalmanFilter:
@@ -87,6 +96,8 @@ class KalmanFilter:
             low = 0.0 if name != "position" else math.ulp(0.0)
             if len(row) != size or not all(low <= x < math.inf for x in row):
                 raise InputError(f"noise.{name} needs {size} finite standard deviations, got {list(row)}")
+        if not 0 <= noise.adaptation < 1:
+            raise InputError(f"noise.adaptation must be at least 0 and below 1, got {noise.adaptation:g}")
         own = bounds or {}
         span = [own.get(name, (None, None)) for name in self.names]
         self.low = torch.tensor([-math.inf if a is None else a for a, _ in span], dtype=torch.float64)
@@ -135,7 +146,7 @@ class KalmanFilter:
             raise InputError(f"back must be 0 to {count}, the samples that are remembered, got {back}")
         own = slice(back * self.size, (back + 1) * self.size)
         x = self._row(belief) if belief.earlier is None or not back else belief.earlier[back - 1]
-        return Belief(*self._parts(x, belief.state.s), belief.covariance[own, own])
+        return Belief(*self._parts(x, belief.state.s), belief.covariance[own, own], scale=belief.scale)
 
     def update(self, belief: Belief, y: Tensor) -> tuple[Belief, float]:
         """The belief with measured positions y (n,) taken in, and the squared innovation over its variance, summed.
@@ -157,8 +168,12 @@ class KalmanFilter:
             P[i] = P[:, i] = gain * own  # without cancellation
         rows = x.reshape(-1, self.size)
         rows[:, self.kept :] = torch.minimum(torch.maximum(rows[:, self.kept :], self.low), self.high)
-        earlier = None if belief.earlier is None else rows[1:]
-        return Belief(*self._parts(rows[0], belief.state.s), P, earlier), surprise
+        earlier, scale, weight = None if belief.earlier is None else rows[1:], float(belief.scale), belief.weight
+        surprise /= scale
+        if self.noise.adaptation > 0:
+            weight = (1 - self.noise.adaptation) * weight + 1
+            scale += (surprise / self.n - 1) / weight * scale
+        return Belief(*self._parts(rows[0], belief.state.s), P, earlier, scale, weight), surprise
 
     def _row(self, belief: Belief) -> Tensor:
         """The numbers (F,) of the filter's state."""
@@ -186,7 +201,7 @@ class KalmanFilter:
             G[..., :kept] += by[..., None, None] * own
             if found.by_parameters is not None:
                 G[..., kept:] += by[..., None, None] * found.by_parameters[..., :n, :]
-        return v, G @ P @ G.mT
+        return v, torch.as_tensor(belief.scale, dtype=P.dtype)[..., None, None] * (G @ P @ G.mT)
 
     def _stepped(self, belief: Belief, h: Tensor | float, u: Tensor | None) -> Linearised:
         values = dict(zip(self.names, belief.theta.tolist(), strict=True)) if self.names else {}

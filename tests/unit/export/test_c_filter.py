@@ -16,7 +16,7 @@ import herglotz as hz
 from herglotz.codegen.c_compiler import build
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.export import export_c
+from herglotz.export import export_c, noise_of
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of
 from herglotz.stepping import State, Stepper
@@ -25,6 +25,13 @@ from herglotz.stepping.filter import KalmanFilter, Noise
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="neither gcc nor clang in the PATH")
 H, NAMES = 0.05, ["friction.viscous[0]", "friction.viscous[1]"]
 NOISE = Noise([0.01, 0.02], [0.2, 0.15], [0.01, 0.01])
+LEARNED = NOISE._replace(adaptation=0.05)
+
+
+def flat(noise):
+    return [*noise.position, *noise.momentum, *noise.theta, noise.adaptation]
+
+
 # Moves a motion with random forces and noise of the sensors, given as standard normal numbers, and follows it.
 LOOPS = """
 #include "stepper.h"
@@ -40,6 +47,7 @@ int follow(long runs, long steps, double h, const double *std, const double *noi
     noise.momentum[i] = noises[arm_N + i];
   }
   for (i = 0; i < arm_P; i++) noise.theta[i] = noises[2 * arm_N + i];
+  noise.adaptation = noises[2 * arm_N + arm_P];
   for (b = 0; b < runs; b++) {
     arm_filter filter;
     arm_state x = arm_start, guess = arm_start;
@@ -100,6 +108,7 @@ int smooth(long steps, double h, const double *std, const double *noises, const 
     x.p[i] = start[arm_N + i];
   }
   for (i = 0; i < arm_P; i++) noise.theta[i] = noises[2 * arm_N + i];
+  noise.adaptation = noises[2 * arm_N + arm_P];
   status = arm_filter_start(&filter, &x, 0, std) | arm_smoother_start(&smoother, &filter, past, lag);
   for (k = 0; k < steps; k++) {
     status |= arm_smoother_predict(&smoother, h, &noise);
@@ -124,11 +133,15 @@ int smooth(long steps, double h, const double *std, const double *noises, const 
 """
 
 
+def library_of(model, folder, dtype="float64"):
+    path = folder / "stepper.h"
+    export_c(model, path, h=H, name="arm", parameters=NAMES, extras=["filter"], dtype=dtype)
+    return build(path.read_text(), LOOPS.replace("double", "arm_real"))
+
+
 @pytest.fixture(scope="module")
 def library(double_pendulum, tmp_path_factory):
-    path = tmp_path_factory.mktemp("filter") / "stepper.h"
-    export_c(double_pendulum, path, h=H, name="arm", parameters=NAMES, extras=["filter"])
-    return build(path.read_text(), LOOPS)
+    return library_of(double_pendulum, tmp_path_factory.mktemp("filter"))
 
 
 @pytest.fixture(scope="module")
@@ -150,13 +163,12 @@ def double_pendulum():
 def followed(library):
     """A function that simulates and follows: everything that `follow` writes."""
 
-    def run(runs, steps, std, noise=NOISE, seed=0):
+    def run(runs, steps, std, noise=NOISE, seed=0, true=1.0):
+        """Its noise is `true` times what the filter is given."""
         n, K, F = 2, 2, 6
         make = torch.Generator().manual_seed(seed)
-        normal = torch.randn(runs * (2 * n + K + steps * (3 * n + K)), generator=make, dtype=torch.float64)
-        noises, start = (
-            torch.tensor(x, dtype=torch.float64) for x in ([x for row in noise for x in row], [0.8, -0.5, 0, 0])
-        )
+        normal = true * torch.randn(runs * (2 * n + K + steps * (3 * n + K)), generator=make, dtype=torch.float64)
+        noises, start = (torch.tensor(x, dtype=torch.float64) for x in (flat(noise), [0.8, -0.5, 0, 0]))
         sizes = ((2 * n + K,), (F, F), (n,), (n, n), (n,), (n,))
         out = [torch.full((runs, steps, *size), torch.nan, dtype=torch.float64) for size in sizes]
         counts = (ctypes.c_long(runs), ctypes.c_long(steps), ctypes.c_double(H))
@@ -171,8 +183,8 @@ STD = torch.tensor([0.05, 0.05, 0.3, 0.3, 0.1, 0.1], dtype=torch.float64)
 
 def test_it_is_its_twin_in_python(followed, double_pendulum):
     # fails if one of them has another gain, noise, order of q, p and θ, or forgets to carry θ's covariance along
-    start, (error, covariance, speed, spread, y, _) = followed(1, 12, STD)
-    kalman = KalmanFilter(double_pendulum, NOISE, NAMES)
+    start, (error, covariance, speed, spread, y, _) = followed(1, 12, STD, LEARNED)
+    kalman = KalmanFilter(double_pendulum, LEARNED, NAMES)
     belief = kalman.start(State(start[:2], start[2:], start.new_zeros(())), STD)
     for k in range(12):
         belief, _ = kalman.update(kalman.predict(belief, H), y[0, k])
@@ -184,20 +196,38 @@ def test_it_is_its_twin_in_python(followed, double_pendulum):
     assert (belief.theta - torch.tensor(values_of(double_pendulum, NAMES)).double()).abs().max() > 1e-4
 
 
+def smoothed(library, start, y, lag):
+    """What `smooth` writes, in the type of y."""
+    real = ctypes.c_float if y.dtype == torch.float32 else ctypes.c_double
+    steps, n, F = len(y), 2, 6
+    noises = torch.tensor(flat(LEARNED), dtype=y.dtype)
+    sizes = ((lag + 1, F), (lag + 1, F, F), (lag + 1, n), (steps,))
+    outputs = [torch.full(size, torch.nan, dtype=y.dtype) for size in sizes]
+    lists = [x.to(y.dtype) for x in (STD, noises, start, y)]
+    counts = (ctypes.c_long(steps), real(H))
+    assert library.smooth(*counts, *map(address, lists), ctypes.c_int(lag), *map(address, outputs)) == 0
+    return outputs
+
+
+def test_the_smoother_in_float(library, followed, double_pendulum, tmp_path):
+    # fails if a number of the smoother is a double in a header of floats, or its covariance loses the digits of a float
+    start, out = followed(1, 60, STD)
+    y = out[4][0]
+    single = smoothed(library_of(double_pendulum, tmp_path, "float32"), start, y.float(), 5)
+    (found, covariance, *_), (found_low, covariance_low, *_) = smoothed(library, start, y, 5), single
+    root = covariance.diagonal(dim1=1, dim2=2).sqrt()
+    # In standard deviations: 3e-6 and 2e-6 off.
+    assert ((found_low.double() - found).abs() / root).max() <= 1e-5
+    assert ((covariance_low.double() - covariance).abs() / (root[:, :, None] * root[:, None])).max() <= 1e-5
+
+
 def test_the_smoother_is_its_twin_in_python(library, followed, double_pendulum):
     # fails if the ring of C loses or swaps samples, a sample that is missing moves the lag, or the blocks that C keeps
     # are not those of the filter of a longer state, which the twin is
     start, out = followed(1, 17, STD)
-    y, n, F, lag = out[4][0], 2, 6, 5
-    noises = torch.tensor([x for row in NOISE for x in row], dtype=torch.float64)
-    sizes = ((F,), (F, F), (n,))
-    found, covariance, speed = (torch.full((lag + 1, *size), torch.nan, dtype=torch.float64) for size in sizes)
-    surprise = torch.full((17,), torch.nan, dtype=torch.float64)
-    lists = (address(x) for x in (STD, noises, start, y))
-    counts = (ctypes.c_long(17), ctypes.c_double(H))
-    outputs = map(address, (found, covariance, speed, surprise))
-    assert library.smooth(*counts, *lists, ctypes.c_int(lag), *outputs) == 0
-    kalman = KalmanFilter(double_pendulum, NOISE, NAMES)
+    y, lag = out[4][0], 5
+    found, covariance, speed, surprise = smoothed(library, start, y, lag)
+    kalman = KalmanFilter(double_pendulum, LEARNED, NAMES)
     belief, surprises = kalman.start(State(start[:2], start[2:], start.new_zeros(())), STD), []
     for k in range(17):
         belief = kalman.predict(belief if k % 3 == 0 and k else kalman.remember(belief, lag), H)
@@ -228,6 +258,18 @@ def test_its_covariance_is_that_of_its_errors(followed):
     miss = speed - v
     own = (miss * torch.linalg.solve(spread, miss)).sum(-1).mean(0)
     assert abs(float(own.mean()) - 2) <= (4 / runs) ** 0.5 * NormalDist().inv_cdf(0.975)
+
+
+def test_the_scale_of_the_noise_is_learned(followed):
+    # fails if the scale is not learned, is that of deviations in place of variances, or moves an estimate: of noise
+    # that is three times what the filter is given, NEES is 9 times too large, and after 75 updates as it should be
+    _, (_, _, speed, spread, *_) = followed(40, 150, STD, seed=2, true=3.0)
+    _, (_, _, same, learned, _, v) = followed(40, 150, STD, LEARNED, seed=2, true=3.0)
+    assert torch.equal(speed, same)
+    miss = (speed - v)[:, 75:]
+    before, after = ((miss * torch.linalg.solve(x[:, 75:], miss)).sum(-1).mean() for x in (spread, learned))
+    assert before > 16
+    assert abs(after - 2) <= 0.3  # 0.16 here; of 40 runs the mean has a standard error of 0.1
 
 
 def accelerations(y, sigma, jerk, h):
@@ -273,7 +315,7 @@ int main(void) {
   const double nan = strtod("nan", 0), y[2] = {0.1, 0.2}, bad[2] = {0.1, nan};
   const double turned[2] = {0.1 + 6.283185307179586, 0.2};
   double std[arm_F] = {0.1, 0.1, 0.1, 0.1, 0.1}, v[2], left, surprise[2];
-  arm_noise noise = {{0.01, 0.01}, {0.1, 0.1}, {0.0}};
+  arm_noise noise = {{0.01, 0.01}, {0.1, 0.1}, {0.0}, 0.0};
   arm_filter f, g;
   arm_past past[2], kept[2];
   arm_smoother s;
@@ -415,3 +457,29 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     for lag in (-1, len(kept)):
         with pytest.raises(InputError, match=f"lag must be 0 to {len(kept) - 1}.*got {lag}"):
             hz.filter(run, data, lag=lag)
+
+
+def test_the_noise_of_a_fit_is_that_of_its_recording():
+    # fails if the levels are those that the fit assumed (a tenth of the noise of readings, and next to no forces), the
+    # spread of the start is not that of the filter, or an input does not act
+    config = ModelConfig((True,), "forced", (1.0,), (2.0,), (4.0,), (0.0,), rate=0.0, potential_width=0, inputs=1,
+                         input_map=(1.0,))  # fmt: skip
+    model, make = ContactLagrangian(config).requires_grad_(False), torch.Generator().manual_seed(0)
+    stepper, u = Stepper(model), torch.randn(600, 1, generator=make, dtype=torch.float64)
+    state = State(*(torch.zeros(size, dtype=torch.float64) for size in ((1, 1), (1, 1), (1,))))
+    q = []
+    for k in range(600):
+        q.append(state.q[0])
+        state = stepper.step(state, H, u=u[k : k + 1]).state
+        state = state._replace(p=state.p + 0.3 * H**0.5 * torch.randn(1, 1, generator=make, dtype=torch.float64))
+    y = torch.stack(q) + 0.02 * torch.randn(600, 1, generator=make, dtype=torch.float64)
+    t = (torch.arange(600) * H).double()
+    data = Trajectories.of(t, y, (600,), u=u, names=("a",), units=("rad",), angles=(True,))
+    span = (H * (1 - 1e-7), H * (1 + 1e-7))
+    run: Any = SimpleNamespace(
+        model=model, metrics={"sigma": 0.002}, data=data, h=H, h_range=span, arrival=data.arrival,
+        config=SimpleNamespace(frequencies=()),
+    )  # fmt: skip
+    found = noise_of(run)
+    assert found.position[0] == pytest.approx(0.02, rel=0.2)
+    assert found.momentum[0] == pytest.approx(0.3, rel=0.2)

@@ -43,6 +43,15 @@ def header_of(model, dtype="float64", box=None, h_range=None, **options):
     return c_source(model, described(model, entries, "model", dtype, None), "stepper.h", **options)
 
 
+def cubic():
+    """K = v²/2 + v³/3, so p = v + v²."""
+    one = (1.0,)
+    model: Any = ContactLagrangian(ModelConfig((False,), "linear", one, one, one, (0.0,), potential_width=0,
+                                          features=("v1^3",))).requires_grad_(False)  # fmt: skip
+    model.kinetic.sum.coefficient.fill_(1 / 3)
+    return model
+
+
 def test_statuses_of_velocities():
     # fails if what is no number is taken, if `out` or v is written nevertheless, or a flag is lost
     box = {f"{x}_{end}": [sign * 2.0] for x in "qps" for end, sign in (("low", -1), ("high", 1))}
@@ -62,10 +71,7 @@ def test_statuses_of_velocities():
 
 def test_where_no_velocity_has_this_momentum():
     # fails if the last guess is taken for a velocity: K = v²/2 + v³/3 has p = v + v², which is nowhere below −1/4
-    one = (1.0,)
-    model: Any = ContactLagrangian(ModelConfig((False,), "linear", one, one, one, (0.0,), potential_width=0,
-                                          features=("v1^3",))).requires_grad_(False)  # fmt: skip
-    model.kinetic.sum.coefficient.fill_(1 / 3)  # pyright: ignore[reportAttributeAccessIssue]
+    model = cubic()
     q, p, s = (
         torch.full((2, 1), 0.3, dtype=torch.float64),
         torch.tensor([[0.75], [-1.0]]).double(),
@@ -134,3 +140,30 @@ def test_a_compiled_model_has_velocities_and_an_old_header_says_what_to_do():
     old = compiled(header_of(model, derivatives=False))
     with pytest.raises(InputError, match="without velocities; export the model again"):
         old.velocity(state, 0.1)
+
+
+@pytest.mark.parametrize("case", ["sticking", "m(q), coupled", "cubic"])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_velocities_side_by_side_are_those_of_each_state(case, dtype):
+    # fails if a register gives another velocity than a state alone, ends before Newton has, takes a state that is not
+    # finite for one with a velocity, or lets it change its neighbours; 19 states: two registers and a part of one
+    model = cubic() if case == "cubic" else with_terms(case)
+    stepper = compiled(header_of(model, dtype))
+    n, real = model.dof, getattr(torch, dtype)
+    q, v, s = (x.contiguous() for x in states_of(n, 19, real))
+    at = stepper.init_qv(q, 0.3 * v, s, h=0.1)
+    p = at.p.clone()
+    p[5] = NAN
+    p[11] = -1e3 if case == "cubic" else p[11]  # no velocity has it
+    states = torch.cat([q, p, s[:, None], torch.ones(19, 1, dtype=real)], 1)
+    seen, status = torch.full((19, 2 * n), 7.0, dtype=real), torch.zeros(19, dtype=torch.int32)
+    ends = torch.full((n,), -100.0, dtype=real), torch.full((n,), 100.0, dtype=real)
+    library, h = stepper.loop, torch.full((1,), 0.1, dtype=real)
+    library.holds(states, h, torch.zeros(19, max(1, model.inputs), dtype=real), 0, *ends, (seen, status))()
+    alone, failed = library.velocity(q, p, s, h.expand(19).contiguous())
+    assert status.tolist() == failed.tolist()
+    good = status == 0
+    assert (~good).nonzero().ravel().tolist() == [5, 11][: 1 + (case == "cubic")]
+    eps = torch.finfo(real).eps  # differences are at most a quarter of it
+    torch.testing.assert_close(seen[good, n:], alone[good], rtol=4 * eps, atol=4 * eps)
+    assert (seen[~good, n:] == 7.0).all()

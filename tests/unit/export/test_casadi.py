@@ -25,11 +25,11 @@ MODELS = {
 }
 
 
-def function(model, folder, **settings):
+def function(model, folder, flags=(), **settings):
     """The model as a function of CasADi, and the file."""
     path = export_casadi(model, folder / "arm.c", h=0.1, **settings)
     library = path.with_suffix(".so")
-    flags = ["-std=c99", "-O0", "-fPIC", "-shared", *WARNINGS]
+    flags = ["-std=c99", "-O0", "-fPIC", "-shared", *WARNINGS, *flags]
     built = subprocess.run([str(CC), *flags, str(path), "-o", str(library), "-lm"], capture_output=True, text=True)
     assert built.returncode == 0, built.stderr[:2000]
     return ca.external("arm_step", str(library)), path
@@ -185,3 +185,29 @@ def test_a_hold_is_the_fewest_steps_that_are_no_longer_than_the_typical_one(name
             hold(x, *u, bad)
         with pytest.raises(RuntimeError):
             hold.jacobian()(x, *u, bad, 0)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_horizon_in_one_call_is_that_of_its_intervals(name, tmp_path):
+    # fails if a column of x, u or x1 is that of another interval, a block of the Jacobian is not in its place, a
+    # register that is half full is lost, or one interval without a step does not fail the call
+    model, count = MODELS[name](), 7
+    _, path = function(model, tmp_path, flags=[f"-Darm_HORIZON={count}"])
+    hold, shoot = (ca.external(f"arm_{each}", str(path.with_suffix(".so"))) for each in ("hold", "shoot"))
+    state, draw = near(model.config.dof, count), np.random.default_rng(0)
+    x = torch.cat([state.q, state.p, state.s[:, None]], 1).numpy().T
+    u = [0.3 * draw.normal(size=(model.inputs, count))] if model.inputs else []
+    assert shoot.size_out(0) == x.shape
+    both = [(f, f(x, *u, 0.31), f.jacobian()(x, *u, 0.31, 0)) for f in (hold.map(count), shoot)]
+    (_, theirs, slopes), (_, ours, blocks) = both
+    assert abs(np.array(ours - theirs)).max() <= 1e-13
+    for a, b in zip(blocks, slopes[: len(blocks)], strict=True):
+        assert a.shape[0] == x.size
+        wanted = np.array(b) if b.shape == a.shape else np.array(b).sum(1, keepdims=True)  # map takes an h for each
+        assert abs(np.array(a) - wanted).max() <= 1e-12 * abs(wanted).max()
+    assert blocks[0].nnz() == x.size * len(x)
+    x[0, 5] = np.inf
+    with pytest.raises(RuntimeError):
+        shoot(x, *u, 0.31)
+    with pytest.raises(RuntimeError):
+        shoot.jacobian()(x, *u, 0.31, 0)

@@ -25,13 +25,16 @@ double = ctypes.c_double
 class Controller(ctypes.Structure):
     _fields_ = [
         ("H", double), ("X", double * NX), ("Q", double * NX), ("E", double * NX), ("R", double * NU),
-        ("U", double * NU), ("x", double * (NX * (N + 1))), ("u", double * (NU * N)), ("K", double * (NU * NX * N)),
+        ("U", double * NU), ("B", double * NX), ("barrier", double), ("near", double),
+        ("x", double * (NX * (N + 1))), ("u", double * (NU * N)), ("K", double * (NU * NX * N)),
         ("k", double * (NU * N)), ("damping", double), ("cost", double),
     ]  # fmt: skip
 
 
-def controller(bounds):
-    it = Controller(H=H)
+def controller(bounds, position=0.0):
+    """Bounds of both inputs, and of the position."""
+    it = Controller(H=H, barrier=20.0, near=0.5)
+    it.B[0] = position
     it.X[:], it.Q[:], it.E[:] = (1.0, 0.0, 0.0), (1.0, 0.1, 0.0), (20.0, 1.0, 0.0)
     it.R[:], it.U[:] = (0.05, 0.02), bounds
     return it
@@ -45,6 +48,10 @@ def cost_of(model, x, u, it):
     for k in range(N + 1):
         now = torch.cat([state.q[0], state.p[0], state.s]).numpy()
         total += np.sum((it.Q if k < N else it.E) * (now - it.X) ** 2)
+        if it.B[0]:
+            for d in (1 - now[0] / it.B[0], 1 + now[0] / it.B[0]):
+                beyond = ((d - 2 * it.near) / it.near) ** 2 / 2 - 0.5 - np.log(it.near)
+                total += it.barrier * (-np.log(d) if d > it.near else beyond)
         if k < N:
             total += np.sum(np.array(it.R) * u[k] ** 2)
             for _ in range(2):
@@ -53,10 +60,15 @@ def cost_of(model, x, u, it):
     return total
 
 
-@pytest.mark.parametrize("bounds", [(50.0, 50.0), (0.7, 0.5)], ids=["free", "bounded"])
-def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, tmp_path):
+BOUNDS = {"free": ((50.0, 50.0), 0.0), "inputs": ((0.7, 0.5), 0.0), "position": ((50.0, 50.0), 0.38)}
+
+
+@pytest.mark.parametrize(("bounds", "position"), BOUNDS.values(), ids=BOUNDS)
+def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, position, tmp_path):
     # fails if a block is transposed, the recursion forgets the cross term, a bound is left, an input that rests on a
-    # bound takes part in the law, or two inputs are solved as if one did not act on the other
+    # bound takes part in the law, two inputs are solved as if one did not act on the other, the barrier's slope is not
+    # that of its value, on either side or beyond the bound, where the motion starts, or an end that no
+    # iteration betters is taken for a failure, which damps the next ones
     model = damped("forced", torch.float64, inputs=2)
     with torch.no_grad():
         model.get_parameter("friction.input_map").copy_(torch.tensor([[1.0, 0.6]]))
@@ -65,7 +77,7 @@ def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, tmp_path):
     command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{tmp_path}", str(RTI), "-o", str(library), "-lm"]
     built = subprocess.run(command, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr[:2000]
-    own, it = ctypes.CDLL(str(library)), controller(bounds)
+    own, it = ctypes.CDLL(str(library)), controller(bounds, position)
     x, first = np.array([-0.4, 0.3, 0.1]), (double * NU)()
     given = (double * NX)(*x)
     assert own.rti_feedback(ctypes.byref(it), given, first) == 0  # the first motion
@@ -79,6 +91,10 @@ def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, tmp_path):
     assert list(first) == u[0].tolist()
     assert (abs(u) <= limit).all()
     assert it.cost == pytest.approx(cost_of(model, x, u, it), rel=1e-10)
+    assert it.damping < 1e-3
+    q = np.array(it.x).reshape(N + 1, NX)[:, 0]
+    assert (abs(q[1:]).max() <= 0.38) == bool(position)  # without the bound it goes farther
+    assert abs(q[0]) > 0.38
     resting = abs(u) == limit
     assert resting.any() == (bounds[0] < 1)
     for k, j in np.ndindex(N, NU):  # the slope of the cost is 0 inside, and points outward at a bound

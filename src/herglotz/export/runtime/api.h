@@ -1,5 +1,12 @@
 /* The functions a user calls. */
 
+/* hz_OUTSIDE_BOX where a state lies outside the box the model was fitted in, or 0. */
+static inline int hz_outside_box(const hz_state *state) {
+  int flags[1] = {0};
+  hz_mark_outside(state, flags);
+  return flags[0];
+}
+
 /* One step of a run: hz_step without its checks of the input, faster by what `track` carries. Start the track again
    whenever anything but this function has changed the state. */
 static inline int hz_advance(hz_state *state, hz_track *track, hz_real h, hz_TAKES_U hz_real *residual) {

@@ -1,8 +1,9 @@
 
 /* CasADi's external functions with x = (q, p, s): x1 = NAME_step(x, u, h) is one step, x1 = NAME_hold(x, u, h) a time h
    of as few equal steps as are no longer than the typical one; jac_NAME_step and jac_NAME_hold are their Jacobians by
-   the implicit-function theorem. Matrices are dense and column by column. All return 0, or 1 where there is no step: CasADi
-   raises an error then, and a line search of an optimiser steps back. */
+   the implicit-function theorem. Compiled with -DNAME_HORIZON=50, NAME_shoot is NAME_hold of 50 columns x and u at once:
+   registers of them go side by side, and its Jacobian has a block for each. Matrices are column by column. All return 0,
+   or 1 where there is no step: CasADi raises an error then, and a line search of an optimiser steps back. */
 
 #ifndef casadi_real
 #define casadi_real double
@@ -23,31 +24,39 @@
 
 enum { NAME_SIZE = 2 * hz_N + 1, NAME_IN = 2 + (hz_INPUTS > 0) };
 
-static const casadi_int NAME_vector[3] = {NAME_SIZE, 1, 1}; /* rows, columns, dense */
-static const casadi_int NAME_scalar[3] = {1, 1, 1};
-#if hz_INPUTS
-static const casadi_int NAME_input[3] = {hz_M, 1, 1};
-#endif
+static const casadi_int NAME_scalar[3] = {1, 1, 1}; /* rows, columns, dense */
 
 /* An argument that is null is 0. */
 static hz_real NAME_entry(const casadi_real *x, int i) { return x ? (hz_real)x[i] : hz_R(0.0); }
 
-static void NAME_read(const casadi_real **arg, hz_state *state, hz_real *u, hz_real *h) {
+/* A number of steps for hz_job; -1, which is no job, where an int does not hold it. */
+static long NAME_whole(double steps) { return steps < 2147483647.0 ? (long)steps : -1; }
+
+/* Column k of the states and inputs. */
+static void NAME_read(const casadi_real **arg, int k, hz_state *state, hz_real *u) {
   int i;
   for (i = 0; i < hz_N; i++) {
-    state->q[i] = NAME_entry(arg[0], i);
-    state->p[i] = NAME_entry(arg[0], hz_N + i);
+    state->q[i] = NAME_entry(arg[0], k * NAME_SIZE + i);
+    state->p[i] = NAME_entry(arg[0], k * NAME_SIZE + hz_N + i);
   }
-  state->s = NAME_entry(arg[0], 2 * hz_N);
+  state->s = NAME_entry(arg[0], k * NAME_SIZE + 2 * hz_N);
   state->sigma = hz_R(1.0);
-  for (i = 0; i < hz_M; i++) u[i] = NAME_entry(arg[1], i);
-  *h = NAME_entry(arg[NAME_IN - 1], 0);
+  for (i = 0; i < hz_M; i++) u[i] = NAME_entry(arg[1], k * hz_M + i);
 }
 
 #if hz_DERIVATIVES
-static const casadi_int NAME_by_x[3] = {NAME_SIZE, NAME_SIZE, 1};
-static const casadi_int NAME_unread[4] = {NAME_SIZE, 1, 0, 0}; /* no entries: x1, which the Jacobian does not read */
-#if hz_INPUTS
-static const casadi_int NAME_by_u[3] = {NAME_SIZE, hz_M, 1};
-#endif
+/* `count` dense blocks on a diagonal, as CasADi has them: rows, columns, where each column begins, the row of each
+   entry. Written whole at each call, the same each time. */
+static const casadi_int *NAME_diagonal(casadi_int count, casadi_int width, casadi_int *pattern) {
+  casadi_int column, i;
+  pattern[0] = NAME_SIZE * count;
+  pattern[1] = width * count;
+  pattern[2] = 0;
+  for (column = 0; column < width * count; column++) {
+    pattern[3 + column] = NAME_SIZE * (column + 1);
+    for (i = 0; i < NAME_SIZE; i++)
+      pattern[3 + width * count + NAME_SIZE * column + i] = NAME_SIZE * (column / width) + i;
+  }
+  return pattern;
+}
 #endif

@@ -1,26 +1,5 @@
 /* What is checked of states, steps and inputs, and the forces of inputs. */
 
-/* hz_OUTSIDE_BOX where a state lies outside the box the model was fitted in, or 0. Angles count modulo a turn, and s only
-   where the motion depends on it: it grows without bound. */
-static inline int hz_outside_box(const hz_state *state) {
-#if hz_BOXED
-  int i;
-  for (i = 0; i < hz_N; i++) {
-    hz_real q = state->q[i];
-    if (hz_is_angle[i]) {
-      const hz_real turn = hz_R(6.28318530717958647693), middle = (hz_q_low[i] + hz_q_high[i]) / hz_R(2.0);
-      q -= turn * hz_floor_of((q - middle) * hz_R(0.15915494309189533577) + hz_R(0.5));
-    }
-    if (!(q >= hz_q_low[i] && q <= hz_q_high[i])) return hz_OUTSIDE_BOX;
-    if (!(state->p[i] >= hz_p_low[i] && state->p[i] <= hz_p_high[i])) return hz_OUTSIDE_BOX;
-  }
-  return !hz_CARRIES_S || (state->s >= hz_s_low && state->s <= hz_s_high) ? 0 : hz_OUTSIDE_BOX;
-#else
-  (void)state;
-  return 0;
-#endif
-}
-
 /* The status of a state before a step h: hz_BAD_INPUT where h is no step, hz_DIVERGED where the state is not finite. */
 static inline int hz_before(const hz_state *state, hz_real h) {
   if (!(hz_finite(h) && h > hz_R(0.0))) return hz_BAD_INPUT;

@@ -10,16 +10,22 @@ typedef struct {
 #if hz_P
   hz_parameters theta;
 #endif /* hz_P */
-  hz_real P[hz_F][hz_F];
+  hz_real P[hz_F][hz_F]; /* the covariance is scale * P */
+  hz_real scale, weight; /* of all variances, and how many updates have told it; 1 at the start */
 } hz_filter;
 
 /* Standard deviations: of a measured position; of the momentum that unknown forces add in a unit of time, growing with
-   its root; and, in the same way, of how far each number of theta wanders. */
+   its root; and, in the same way, of how far each number of theta wanders. What a model misses is seldom as large in
+   one motion as in another: of all variances the common scale is learned, which does not change an estimate. It is the
+   mean of the squared innovations over their variance in all updates, where each later one lessens the weight of the
+   earlier ones by the share `adaptation`, and what is given counts as one (West and Harrison, Bayesian forecasting and
+   dynamic models, 1997, section 10.8). Adaptation 0: deviations are as given; 0.02: as the last 50 updates have them. */
 typedef struct {
   hz_real position[hz_N], momentum[hz_N];
 #if hz_P
   hz_real theta[hz_P];
 #endif /* hz_P */
+  hz_real adaptation;
 } hz_noise;
 
 /* Start at a state with standard deviations `std` of q, p, s where the motion depends on it, and theta, hz_F numbers.
@@ -39,11 +45,12 @@ static inline int hz_filter_start(hz_filter *filter, const hz_state *x, hz_TAKES
 #endif /* hz_P */
   for (i = 0; i < hz_F; i++)
     for (j = 0; j < hz_F; j++) filter->P[i][j] = i == j ? std[i] * std[i] : hz_R(0.0);
+  filter->scale = filter->weight = hz_R(1.0);
   return hz_CONVERGED;
 }
 
 static inline int hz_noise_usable(const hz_noise *noise) {
-  int i, good = 1;
+  int i, good = noise->adaptation >= hz_R(0.0) && noise->adaptation < hz_R(1.0);
   for (i = 0; i < hz_N; i++) {
     good &= hz_finite(noise->position[i]) && noise->position[i] > hz_R(0.0);
     good &= hz_finite(noise->momentum[i]) && noise->momentum[i] >= hz_R(0.0);
@@ -165,6 +172,16 @@ static inline void hz_filter_take(hz_filter *filter, int i, hz_real y, const hz_
   for (j = 0; j < hz_F; j++) filter->P[i][j] = filter->P[j][i] = found->gain[j] * found->own;
 }
 
+/* The squared innovations over their variance, of which `total` is the sum for a scale of 1; then the scale is learned. */
+static inline hz_real hz_filter_scale(hz_filter *filter, hz_real total, const hz_noise *noise) {
+  const hz_real surprise = total / filter->scale;
+  if (noise->adaptation > hz_R(0.0)) {
+    filter->weight = (hz_R(1.0) - noise->adaptation) * filter->weight + hz_R(1.0);
+    filter->scale += (surprise / (hz_real)hz_N - hz_R(1.0)) / filter->weight * filter->scale;
+  }
+  return surprise;
+}
+
 /* Take measured positions y in, one after the other, as their noise is independent; angles count modulo a turn.
    `surprise` (may be null) receives the squared innovation over its variance, summed: hz_N on average. Numbers of theta
    stay within their bounds. hz_BAD_INPUT where y or the noise is not finite; the filter changes on success only. */
@@ -178,6 +195,7 @@ static inline int hz_filter_update(hz_filter *filter, const hz_real y[hz_N], con
     total += found.miss * found.miss / found.variance;
   }
   hz_filter_bound(filter);
+  total = hz_filter_scale(filter, total, noise);
   if (surprise) *surprise = total;
   return hz_CONVERGED;
 }
@@ -214,6 +232,6 @@ static inline int hz_filter_velocity(const hz_filter *filter, hz_real h, hz_TAKE
   for (i = 0; covariance && i < hz_N; i++)
     for (j = 0; j < hz_N; j++)
       for (covariance[i * hz_N + j] = hz_R(0.0), k = 0; k < hz_F; k++)
-        covariance[i * hz_N + j] += half[i][k] * G[j][k];
+        covariance[i * hz_N + j] += filter->scale * half[i][k] * G[j][k];
   return hz_CONVERGED;
 }

@@ -110,6 +110,8 @@ static inline hz_real hz_atanh(hz_real x) {
 
 static inline hz_real hz_choose(hz_real a, hz_real b, hz_real x, hz_real y) { return a > b ? x : y; }
 
+static inline hz_real hz_nearest(hz_real x) { return hz_floor_of(x + hz_R(0.5)); }
+
 /* Registers of numbers, as wide as the processor's, with GCC and clang: what they hold side by side is the units of a
    layer or, in batches, the samples. Another compiler goes number by number, and so does a processor without such
    registers (Cortex-M): there they would only take stack. */
@@ -170,6 +172,13 @@ static inline hz_lanes hz_wide_cut(hz_lanes y, hz_real limit) {
   return hz_select((hz_masks)(y < -most), -most, y);
 }
 
+/* The nearest whole number; what is beyond the whole numbers of a processor is one itself, and of no use as an angle. */
+static inline hz_lanes hz_wide_nearest(hz_lanes x) {
+  const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
+  x = hz_wide_cut(hz_select((hz_masks)(x == x), x, zero), hz_R(hz_SINGLE ? 1e9 : 1e18));
+  return __builtin_convertvector(__builtin_convertvector(x + hz_select((hz_masks)(x < zero), -half, half), hz_masks), hz_lanes);
+}
+
 static inline hz_lanes hz_wide_growth(hz_lanes y) {
   hz_lanes two;
   const hz_lanes e = hz_wide_reduced(hz_wide_cut(y, hz_R(hz_LIMIT)), &two);
@@ -191,30 +200,39 @@ static inline hz_lanes hz_wide_softplus(hz_lanes x) {
   return hz_select((hz_masks)(x > zero), x, zero) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
 }
 
+/* Without a branch for each: GCC makes a tree of it. */
+static inline int hz_any(hz_masks where) {
+  hz_signed_t any = 0;
+  int w;
+  for (w = 0; w < hz_LANES; w++) any |= where[w];
+  return any != 0;
+}
+
 /* y_w = f(x_w) by <math.h> where the other formula does not hold. */
-#define hz_ELSE(holds, function)           \
-  do {                                     \
-    int w;                                 \
-    for (w = 0; w < hz_LANES; w++)         \
-      if (!(holds)) y[w] = function(x[w]); \
+#define hz_ELSE(holds, function)                                                          \
+  do {                                                                                    \
+    const hz_masks where = ~(hz_masks)(holds);                                            \
+    int w;                                                                                \
+    for (w = 0; hz_any(where) && w < hz_LANES; w++)                                      \
+      if (where[w]) y[w] = function(x[w]);                                                \
   } while (0)
 static inline hz_lanes hz_wide_atanh(hz_lanes x) {
   const hz_lanes z = x * x;
   hz_lanes y = x * hz_ARTANH_TERMS(z);
-  hz_ELSE(z[w] <= hz_SERIES, hz_atanh_of);
+  hz_ELSE(z <= hz_spread(hz_SERIES), hz_atanh_of);
   return y;
 }
 
 static inline hz_lanes hz_wide_expm1(hz_lanes x) {
   hz_lanes y = hz_wide_growth(x);
-  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_LIMIT), hz_expm1_of);
+  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_LIMIT)), hz_expm1_of);
   return y;
 }
 
 static inline hz_lanes hz_wide_exp(hz_lanes x) {
   hz_lanes two, y = hz_wide_reduced(hz_wide_cut(x, hz_R(hz_FAR)), &two);
   y = two * y + two;
-  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_FAR), hz_exp_of);
+  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_FAR)), hz_exp_of);
   return y;
 }
 
@@ -239,13 +257,13 @@ static inline hz_lanes hz_wide_wave(hz_lanes x, int quarters) {
 
 static inline hz_lanes hz_wide_sin(hz_lanes x) {
   hz_lanes y = hz_wide_wave(x, 0);
-  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_TURNED), hz_sin);
+  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_TURNED)), hz_sin);
   return y;
 }
 
 static inline hz_lanes hz_wide_cos(hz_lanes x) {
   hz_lanes y = hz_wide_wave(x, 1);
-  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_TURNED), hz_cos);
+  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_TURNED)), hz_cos);
   return y;
 }
 #undef hz_ELSE

@@ -6,24 +6,11 @@ static inline double hz_steps_of(double H, double longest) {
   return steps > 1.0 ? steps : 1.0;
 }
 
-/* `steps` equal steps h under u. The state changes on success only. Returns a status without flags. */
-static inline int hz_hold(hz_state *state, hz_real h, hz_TAKES_U double steps) {
-  hz_state x = *state;
-  hz_track track;
-  hz_real left;
-  double k;
-  int status = hz_before(&x, h);
-  if (!status && hz_BAD_U(u)) status = hz_DIVERGED;
-  if (!status) hz_track_start(&x, &track);
-  for (k = 0.0; !status && k < steps; k += 1.0) status = hz_advance(&x, &track, h, hz_WITH_U(u) &left);
-  if (!status) *state = x;
-  return status;
-}
-
 #if hz_DERIVATIVES
-/* hz_hold with its derivatives: rows are (q, p, s) after the last step, columns (q, p, s) before the first one
-   (by_state), the input (by_input, where the model takes some) and the whole time (by_time). A step maps a derivative d
-   of the state before it to A d, plus its own derivative by what acts in every step. */
+/* `steps` equal steps h under u, with their derivatives: rows are (q, p, s) after the last step, columns (q, p, s)
+   before the first one (by_state), the input (by_input, where the model takes some) and the whole time (by_time). A step
+   maps a derivative d of the state before it to A d, plus its own derivative by what acts in every step. The state
+   changes on success only. Returns a status without flags. */
 static inline int hz_hold_jacobian(hz_state *state, hz_real h, hz_TAKES_U double steps, hz_real *by_state,
     hz_WITH_U(hz_real *by_input) hz_real *by_time) {
   enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + hz_M * hz_INPUTS + 1 };

@@ -114,20 +114,24 @@ void herglotz_holds(long batch, long steps, hz_state *states, const hz_real *h, 
     hz_TAKES_THETA const hz_real *low, const hz_real *high, hz_real *observed, int *statuses) {
   const hz_job job = {steps, 1, h, 0, 0, hz_WITH_U(u) hz_WITH_U(hz_M) hz_WITH_U(0)
                       hz_WITH_THETA(theta) 0, 0, 0, 0, 0, 0};
+  hz_real v[hz_SIDE][hz_N];
+  int status[hz_SIDE], i, w, some;
   long b;
-  int i;
   (void)u;
   for (b = 0; b < batch; b++) states[b].sigma = (hz_real)1.0; /* nobody asks for the product of the factors */
   hz_run_batch(batch, states, &job, statuses);
-  for (b = 0; b < batch; b++, observed += 2 * hz_N) {
-    const int status = hz_velocity(states + b, *h, hz_WITH_THETA(theta) observed + hz_N);
-    if (!(statuses[b] & 15)) statuses[b] |= status & 15;
-    statuses[b] &= 15 | hz_OUTSIDE_BOX;
-    for (i = 0; i < hz_N; i++) {
-      const hz_real turn = (hz_real)6.28318530717958647693, middle = (low[i] + high[i]) / (hz_real)2.0;
-      hz_real q = states[b].q[i];
-      if (hz_is_angle[i]) q -= turn * hz_floor_of((q - middle) * (hz_real)0.15915494309189533577 + (hz_real)0.5);
-      observed[i] = q < low[i] ? low[i] : q > high[i] ? high[i] : q;
+  for (b = 0; b < batch; b += some) {
+    some = hz_velocity_some(states + b, batch - b, *h, hz_WITH_THETA(theta) v, status);
+    for (w = 0; w < some; w++, observed += 2 * hz_N) {
+      if (!(statuses[b + w] & 15)) statuses[b + w] |= status[w];
+      statuses[b + w] &= 15 | hz_OUTSIDE_BOX;
+      for (i = 0; i < hz_N; i++) {
+        const hz_real turn = (hz_real)6.28318530717958647693, middle = (low[i] + high[i]) / (hz_real)2.0;
+        hz_real q = states[b + w].q[i];
+        if (hz_is_angle[i]) q -= turn * hz_floor_of((q - middle) * (hz_real)0.15915494309189533577 + (hz_real)0.5);
+        observed[i] = q < low[i] ? low[i] : q > high[i] ? high[i] : q;
+        if (!status[w]) observed[hz_N + i] = v[w][i];
+      }
     }
   }
 }

@@ -5,6 +5,7 @@
    neither that nor the inputs are checked. */
 static inline void FN_run(hz_state *states, long b, int count, const hz_job *job, int status[FN_WIDTH], int *flags) {
   const long entries = 1 + job->steps / job->every;
+  const int kept = job->q || job->p || job->s || job->sigma;
   FN_state x;
   FN_track track;
   hz_real h[FN_WIDTH], left[FN_WIDTH];
@@ -30,6 +31,12 @@ static inline void FN_run(hz_state *states, long b, int count, const hz_job *job
     }
     if (k > 0) FN_take(&x, &track, h, hz_WITH_U(u) status, left);
     wait--;
+    if (flags) {
+      int outside[FN_WIDTH] = {0};
+      FN_mark_outside(&x, outside);
+      for (w = 0; w < count; w++)
+        if (!status[w]) flags[w] |= outside[w];
+    }
     for (w = 0; w < count; w++) {
       const long at = (b + w) * entries + entry, step = (b + w) * job->steps + k - 1;
       const hz_state *now = (const hz_state *)&x; /* one sample is not copied */
@@ -38,13 +45,11 @@ static inline void FN_run(hz_state *states, long b, int count, const hz_job *job
         job->status[step] = (unsigned char)status[w];
         job->residual[step] = left[w];
       }
-      if (wait && !flags) continue;
+      if (wait || !kept) continue;
       if (FN_WIDTH > 1 || status[w]) {
         now = &one;
         FN_get(&x, w, &one);
       }
-      if (flags && !status[w]) flags[w] |= hz_outside_box(now);
-      if (wait) continue;
       if (status[w]) hz_lose(&one);
       for (i = 0; job->q && i < hz_N; i++) job->q[at * hz_N + i] = now->q[i];
       for (i = 0; job->p && i < hz_N; i++) job->p[at * hz_N + i] = now->p[i];

@@ -97,7 +97,11 @@ static inline int hz_smoother_update(hz_smoother *smoother, const hz_real y[hz_N
     }
   }
   hz_filter_bound(&smoother->now);
-  for (b = 0; b < smoother->count; b++) hz_filter_bound(&smoother->past[b].then);
+  total = hz_filter_scale(&smoother->now, total, noise);
+  for (b = 0; b < smoother->count; b++) {
+    hz_filter_bound(&smoother->past[b].then);
+    smoother->past[b].then.scale = smoother->now.scale;
+  }
   smoother->moved = 0;
   if (surprise) *surprise = total;
   return hz_CONVERGED;

@@ -42,7 +42,6 @@ static inline REAL FN_add(REAL x, REAL change, REAL *low) {
   return FN_choose(SPREAD(hz_R(hz_TINY)), FN_fabs(sum), SPREAD(hz_R(0.0)), sum);
 }
 
-#if !hz_EXPLICIT
 /* J and its factors. One sample exchanges rows by partial pivoting; several do not, and none converges where that
    fails. */
 typedef struct {
@@ -100,6 +99,7 @@ static inline void FN_length(const REAL x[hz_N], hz_real size[FN_WIDTH]) {
     }
 }
 
+#if !hz_EXPLICIT
 /* Solve F(q1) = 0 from the guess in t->move, where the status is 0. A point close to the last one keeps J (its
    contraction is checked), and rounding ends the iteration. A move that does not lessen |F| is taken back, to get J
    where it was an old one, and else halved; of several samples side by side, one that needs this is not solved. */
@@ -256,6 +256,33 @@ static inline void FN_set(FN_state *x, int w, const hz_state *one) {
   }
   FN_LANE(x->s, w) = one->s;
   FN_LANE(x->sigma, w) = one->sigma;
+}
+
+/* hz_OUTSIDE_BOX for each finite state that lies outside the box the model was fitted in. Angles count modulo a turn, and
+   s only where the motion depends on it: it grows without bound. */
+static inline void FN_mark_outside(const FN_state *x, int flags[FN_WIDTH]) {
+#if hz_BOXED
+  const REAL one = SPREAD(hz_R(1.0));
+  REAL outside = SPREAD(hz_R(0.0));
+  int i, w;
+  for (i = 0; i < hz_N; i++) {
+    REAL q = x->q[i];
+    if (hz_is_angle[i]) {
+      const hz_real turn = hz_R(6.28318530717958647693), middle = (hz_q_low[i] + hz_q_high[i]) / hz_R(2.0);
+      q -= turn * FN_nearest((q - middle) * hz_R(0.15915494309189533577));
+    }
+    outside = FN_choose(q, SPREAD(hz_q_high[i]), one, FN_choose(SPREAD(hz_q_low[i]), q, one, outside));
+    outside = FN_choose(x->p[i], SPREAD(hz_p_high[i]), one, FN_choose(SPREAD(hz_p_low[i]), x->p[i], one, outside));
+  }
+#if hz_CARRIES_S
+  outside = FN_choose(x->s, SPREAD(hz_s_high), one, FN_choose(SPREAD(hz_s_low), x->s, one, outside));
+#endif
+  for (w = 0; w < FN_WIDTH; w++)
+    if (FN_LANE(outside, w) > hz_R(0.0)) flags[w] |= hz_OUTSIDE_BOX;
+#else
+  (void)x;
+  (void)flags;
+#endif
 }
 
 #if hz_P

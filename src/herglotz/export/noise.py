@@ -1,0 +1,163 @@
+"""The noise levels of a fit: those under which the filter finds its recording the likeliest."""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+import math
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from herglotz.codegen.c_compiler import build, compiler
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.export.c_header import MAX_DERIVATIVES, export_c, runtime
+from herglotz.export.lower.c_parameters import without_parameters
+from herglotz.mechanics import legendre_minus
+from herglotz.models import ContactLagrangian
+from herglotz.stepping.filter import Noise
+from herglotz.stepping.linearise import forward_slopes
+from herglotz.training.fitted_run import FittedRun
+from herglotz.training.predict import BELIEVED
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.smoothing import SmoothingProblem
+
+# The scale of the noise is that of the last 50 samples. Windows of the measured UW double pendulum have a mean surprise
+# of 1.2 to 2.7 then, where 2 is right, and 0.6 to 3.5 with the same noise in all of them (`benchmarks/filter.py`).
+ADAPTATION = 0.02
+
+
+def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
+    """The noise of positions and of unknown forces under which the filter finds the data of the fit the likeliest.
+
+    They minimise −2 log p = Σ (y_i − q_i)²/S_i + log S_i over the innovations of the run's own samples. Beyond 8
+    coordinates and where there is no C compiler they are what the fit itself assumes.
+
+    Source: A. C. Harvey, Forecasting, structural time series models and the Kalman filter (1989), section 3.4.
+
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    theta
+        Standard deviations of numbers that wander, as they shall be in the noise.
+
+    Returns
+    -------
+    Noise
+        Standard deviations in the units of the data, with a scale that is learned (`adaptation`).
+
+    Raises
+    ------
+    InputError
+        If the fit found no noise.
+    """
+    problem, h = _problem(run), run.h
+    n = problem.n
+    momentum = problem.process * problem.mass * problem.deviations * problem.speed / problem.scale / math.sqrt(h)
+    if not bool((problem.deviations[:n] > 0).all()):
+        raise InputError("the run's metrics have no noise (sigma) > 0; give noise to the filter")
+    levels = torch.cat([problem.deviations.expand(n), momentum.expand(n)]).double()
+    if n <= MAX_DERIVATIVES and _compiles():
+        # From forces that make each momentum anew: the filter follows any motion there, and loses none on the way down.
+        levels[n:] = problem.mass * problem.speed / math.sqrt(h)
+        levels = _descended(_likelihood(run), levels.log()).exp()
+    return Noise(levels[:n].tolist(), levels[n:].tolist(), theta, ADAPTATION)
+
+
+def input_at(model: ContactLagrangian, data: Trajectories, row: int, part: Tensor) -> Tensor | None:
+    """The input (m,) at this part of the recorded step that starts at a row."""
+    if not model.inputs:
+        return None
+    u = data.inputs_of_steps(torch.tensor([row]), part[None])
+    assert u is not None  # `of_the_run` has checked
+    return u[0]
+
+
+def momentum_at(model: ContactLagrangian, data: Trajectories, row: int) -> tuple[Tensor, Tensor]:
+    """The momentum (n,) that FL⁻ gives a sample and the next one, and its derivative (n, n) by the next one."""
+    q0, q1, h = data.q[row], data.q[row + 1], data.t[row + 1] - data.t[row]
+    u = input_at(model, data, row, torch.tensor(0.5, dtype=torch.float64))
+    zero = torch.zeros((), dtype=torch.float64)
+
+    def momentum(q1: Tensor) -> Tensor:
+        return legendre_minus(model if u is None else model.at(u), q0, q1, zero, h)[1]
+
+    with torch.no_grad():
+        return momentum(q1), forward_slopes(momentum, q1)
+
+
+def parts_of(h: float, most: float) -> int:
+    """As few equal steps of a recorded one as are no longer than `most`."""
+    return max(1, math.ceil(h / most - 1e-6))
+
+
+def _compiles() -> bool:
+    try:
+        compiler()
+    except InputError:
+        return False
+    return True
+
+
+def _likelihood(run: FittedRun) -> Callable[[Tensor], float]:
+    """−2 log p of the run's data as a function of the logarithms of the levels (2n,); infinite where a step fails."""
+    model, data = copy.deepcopy(run.model).double(), run.data.unwrapped().to(dtype=torch.float64, device="cpu")
+    with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
+        path = export_c(model, Path(folder, "noise.h"), h=run.h, name="noise", extras=["filter"])
+        header = path.read_text(encoding="utf-8")
+    library = build(header, re.sub(r"\bhz_", "noise_", without_parameters(runtime("innovations.c"))))
+    parts, steps, starts, slopes, inputs = [], [], [], [], list[Tensor]()
+    for first, length in zip(data.offsets, data.lengths, strict=True):
+        p, by_q = momentum_at(model, data, first)
+        starts.append(torch.cat([data.q[first], p]))
+        slopes.append(by_q)
+        parts.append(0)
+        for row in range(first, first + length - 1):
+            h = float(data.t[row + 1] - data.t[row])
+            count = parts_of(h, run.h_range[1])
+            parts.append(count)
+            steps += [h / count] * count
+            acting = (
+                input_at(model, data, row, torch.tensor((k + 0.5) / count, dtype=torch.float64)) for k in range(count)
+            )
+            inputs += [u for u in acting if u is not None]
+    zero = torch.zeros(1, dtype=torch.float64)
+    u = torch.stack(inputs).contiguous() if inputs else zero
+    whole = (torch.tensor(x) for x in (list(data.lengths), parts))
+    lists = [*whole, zero.new_tensor(steps), u, data.q.contiguous(), torch.stack(starts), torch.stack(slopes)]
+
+    def found(levels: Tensor) -> float:
+        deviations, total = levels.exp().contiguous(), torch.zeros_like(zero)
+        pointers = (ctypes.c_void_p(x.data_ptr()) for x in (*lists, deviations, total))
+        failed = library.herglotz_likelihood(ctypes.c_long(len(starts)), *pointers)
+        return math.inf if failed or not math.isfinite(float(total)) else float(total)
+
+    return found
+
+
+def _descended(cost: Callable[[Tensor], float], x: Tensor) -> Tensor:
+    """The least of a function, coordinate by coordinate; to a tenth, as a level needs no more digits."""
+    best, step = cost(x), 1.0
+    while step > 0.1:
+        moved = False
+        for i in reversed(range(len(x))):
+            for move in (-step, step):
+                while (found := cost(other := x + move * torch.eye(len(x), dtype=x.dtype)[i])) < best:
+                    best, x, moved = found, other, True
+        step = step if moved else step / 2
+    return x
+
+
+def _problem(run: FittedRun) -> SmoothingProblem:
+    """The smoothing of the run's own data, for the noise that it assumes."""
+    data, config, high = run.data.unwrapped(), run.model.config, run.h_range[1]
+    turn = run.h * max(v / x for v, x in zip(config.speed, config.scale, strict=True))
+    process = run.metrics.get("process") or BELIEVED * min(1.0, turn) ** 0.5
+    sigma = run.metrics.get("sigma") or 0.0
+    return SmoothingProblem(run.model, data, segment_grid(data, data.samples, high), sigma=sigma, process=process)

@@ -1,0 +1,58 @@
+/* Velocities of several states side by side. */
+
+#if defined(hz_BATCHED) && !hz_STICKING
+/* Of FN_WIDTH states, by Newton from rest; `found` says of each whether it ended, as that of hz_velocity would. */
+static inline void FN_velocity(const FN_state *x, hz_real h, hz_TAKES_THETA REAL v[hz_N], int found[FN_WIDTH]) {
+  FN_factors A;
+  REAL p[hz_N], by_v[hz_N * hz_N], move[hz_N], sum;
+  hz_real scale[FN_WIDTH], size[FN_WIDTH];
+  int i, w, iteration, left = FN_WIDTH;
+#if hz_P
+  REAL values[hz_P];
+  for (i = 0; i < hz_P; i++) values[i] = SPREAD(theta->value[i]);
+#endif /* hz_P */
+  for (i = 0; i < hz_N; i++) v[i] = SPREAD(hz_R(0.0));
+  for (iteration = 0; left && iteration < 8; iteration++) {
+    FN_momentum(x->q, v, x->s, SPREAD(h), hz_WITH_THETA(values) p, by_v);
+    for (i = 0; i < hz_N; i++) p[i] -= x->p[i];
+    for (i = 0; i < hz_N * hz_N; i++) A.lu[i / hz_N][i % hz_N] = by_v[i];
+    FN_factorise(&A);
+    FN_direction(&A, p, move);
+    FN_length(move, size);
+    for (sum = SPREAD(hz_R(0.0)), i = 0; i < hz_N; i++) sum += v[i] += move[i]; /* NaN is in no length, but in a sum */
+    for (left = FN_WIDTH, w = 0; w < FN_WIDTH; w++) {
+      if (!iteration) scale[w] = size[w];
+      found[w] = size[w] <= hz_floor * scale[w] && hz_finite(FN_LANE(sum, w));
+      left -= found[w];
+    }
+  }
+}
+#endif
+
+/* hz_velocity of the first of `count` states, as many side by side as the processor takes; returns how many. `statuses`
+   are without flags. */
+static inline int hz_velocity_some(const hz_state *states, long count, hz_real h, hz_TAKES_THETA hz_real v[hz_SIDE][hz_N],
+    int statuses[hz_SIDE]) {
+  const int some = count < hz_SIDE ? (int)count : hz_SIDE;
+  int w, found[hz_SIDE] = {0};
+#if defined(hz_BATCHED) && !hz_STICKING
+#if hz_P
+  const hz_parameters *values = theta ? theta : &hz_defaults;
+  const int possible = hz_in_bounds(values);
+#else
+  const int possible = 1;
+#endif /* hz_P */
+  if (some > 1 && possible && hz_finite(h) && h > hz_R(0.0)) {
+    hz_wide_state x;
+    hz_lanes wide[hz_N];
+    int i;
+    for (w = 0; w < hz_SIDE; w++) hz_wide_set(&x, w, states + (w < some ? w : some - 1)); /* the last one is repeated */
+    hz_wide_velocity(&x, h, hz_WITH_THETA(values) wide, found);
+    for (w = 0; w < some; w++)
+      for (i = 0; i < hz_N; i++) v[w][i] = hz_wide_LANE(wide[i], w);
+  }
+#endif
+  for (w = 0; w < some; w++)
+    statuses[w] = found[w] ? hz_CONVERGED : 15 & hz_velocity(states + w, h, hz_WITH_THETA(theta) v[w]);
+  return some;
+}
