@@ -15,6 +15,7 @@ from torch import Tensor
 
 from herglotz.data.column_roles import kind_of
 from herglotz.data.csv_columns import is_number, name_and_unit
+from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 from herglotz.least_squares import least_squares
@@ -97,6 +98,7 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
     pairs = [pair for pair in pairs if not pair.again or set(pair.columns) <= set(data.names)]
     if not pairs:
         return data
+    data = complete(data)
     _check(data, pairs)
     bodies: list[tuple[Pair, Tensor]] = []
     angles, rows, notes = [], [], []
@@ -257,10 +259,10 @@ def _variance(arm: Tensor) -> float:
 
 def with_hints(data: Trajectories) -> Trajectories:
     """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
-    notes, earlier = [], []
+    notes, earlier, read = [], [], complete(data)
     for x, y in _pairs_by_name(data):
         pair = Pair(x, y)
-        body = _positions(data, pair, (x, y))[:: -(-data.samples // MOST)]
+        body = _positions(read, pair, (x, y))[:: -(-read.samples // MOST)]
         fixed = circle(body)
         centres = [(fixed, _words(data, pair, fixed)[1]), *((other, f"{one.x}, {one.y}") for one, other in earlier)]
         earlier.append((pair, body))

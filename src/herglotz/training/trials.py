@@ -89,7 +89,7 @@ class Trial:
     @cached_property
     def rms(self) -> float:
         """Misfit of the data, in units of q over the balance."""
-        r = self.problem.misfit(self.path)
+        r = self.problem.misfit(self.path)[self.problem.data.complete]
         return scale_of(r) if self.problem.freedom else float(r.square().mean().sqrt())
 
     @property
@@ -133,7 +133,7 @@ class Trial:
     @cached_property
     def score(self) -> Score:
         """Its loss over held-out blocks."""
-        count, choices = self.problem.data.q.numel(), [len(self.taken)]
+        count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
         (found,) = scores(self._own, [range(self.problem.P)], choices, count, self.fitter.floor)
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
         return found

@@ -85,9 +85,10 @@ def test_units_in_the_letters_of_windows(tmp_path):
 @pytest.mark.parametrize("gap", ["", "nan", "NaN", "NA", "null", "#N/A"])
 def test_rows_without_a_value_are_left_out(tmp_path, gap):
     # fails if a missing sample stops the reading, becomes a number, or goes without a word
-    data = load(written(tmp_path, f"t,x,y\n0,{gap},0\n1,1,1\n2,2,2\n3,3,{gap}\n4,4,4\n5,5,{gap}\n"))
+    data = load(written(tmp_path, f"t,x,y\n0,{gap},0\n1,1,1\n2,2,2\n3,{gap},{gap}\n4,4,4\n5,5,{gap}\n"))
     assert data.t.tolist() == [1, 2, 4]
     assert data.q.tolist() == [[1, 1], [2, 2], [4, 4]]
+    assert data.observed is None
     assert data.notes == ("3 rows are left out, without a value: the first is row 2, column 'x'",)
 
 

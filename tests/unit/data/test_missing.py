@@ -1,0 +1,75 @@
+"""Positions that were not read: what stands in their place, and what reads the others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from herglotz.data import Trajectories, as_trajectories, load, save
+from herglotz.data.gaps import complete, with_missing
+from herglotz.data.roughness import precisions
+
+T = torch.arange(60, dtype=torch.float64) / 10
+
+
+def turning(known):
+    """An angle that turns and is recorded between -π and π, beside a position, with these readings (N, 2)."""
+    q = torch.stack([torch.remainder(3 * T + np.pi, 2 * np.pi) - np.pi, T.sin()], 1)
+    data = Trajectories.of(T, torch.where(known, q, 0.0), names=["a", "x"], angles=[True, False])
+    return with_missing(data, known, str)
+
+
+def test_a_reading_lost_where_an_angle_wraps_costs_no_turn():
+    # fails if the value in the place of a reading lies between both ends of a jump: the jump is then none
+    known = torch.ones(60, 2, dtype=torch.bool)
+    known[[10, 11, 31, 52], 0] = False
+    assert torch.allclose(turning(known).unwrapped().q[:, 0], 3 * T, rtol=0, atol=1e-12)
+
+
+def test_two_recordings_share_no_reading():
+    # fails if the first value of a recording, cut at a missing one, is that of the recording before
+    known = torch.ones(60, 2, dtype=torch.bool)
+    known[30, 0] = False
+    data = turning(known).unwrapped()
+    cut = data.rows(torch.arange(60), (30, 30)).unwrapped()
+    assert torch.allclose(cut.q[:, 0], 3 * T, rtol=0, atol=1e-12)
+
+
+def test_sets_with_and_without_blanks_are_joined_saved_and_read(tmp_path):
+    # fails if one file with a blank cell refuses a folder of files, or an archive forgets which cells were read
+    known = torch.ones(60, 2, dtype=torch.bool)
+    known[7, 1] = False
+    one = turning(known).unwrapped()
+    both = Trajectories.cat([replace(one, observed=None), one])
+    assert both.observed is not None
+    assert both.observed.sum() == 239
+    save(tmp_path / "both.npz", both)
+    assert load(tmp_path / "both.npz").digest() == both.digest()
+    assert complete(both).lengths == (60, 59)
+    save(tmp_path / "both.csv", both)
+    again = load(tmp_path / "both.csv")
+    assert torch.equal(again.q[both.observed > 0], both.q[both.observed > 0])
+    assert again.observed is not None
+    assert torch.equal(again.observed, both.observed)
+
+
+def test_noise_is_that_of_readings():
+    # fails if cubics through readings count as readings: they follow the motion to a third of this noise
+    noise = 1e-3 * torch.randn(2000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    t = torch.arange(2000, dtype=torch.float64) / 100
+    q = torch.stack([t.sin(), t.cos()], 1) + noise
+    known = torch.ones(2000, 2, dtype=torch.bool)
+    known[::4, 1] = known[1::4, 0] = False
+    data = with_missing(Trajectories.of(t, q), known, str)
+    assert (precisions(data) * data.balance).numpy() == pytest.approx([1e-3, 1e-3], rel=0.1)
+
+
+def test_an_array_keeps_what_is_beside_a_nan():  # fails if NaN in one column of an array costs the row
+    x = np.column_stack([np.sin(T.numpy()), np.cos(T.numpy())])
+    x[[20, 21], 0] = np.nan
+    data = as_trajectories(x, h=0.1)
+    assert data.samples == 60
+    assert data.observed is not None
+    assert data.q[20, 1] == x[20, 1]
+    assert data.complete.nonzero()[:, 0].tolist() == [k for k in range(60) if k not in (20, 21)]
