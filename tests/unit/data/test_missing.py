@@ -8,6 +8,7 @@ import torch
 
 from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.gaps import complete, with_missing
+from herglotz.data.polar import in_polar, pairs_of
 from herglotz.data.roughness import precisions
 
 T = torch.arange(60, dtype=torch.float64) / 10
@@ -73,3 +74,19 @@ def test_an_array_keeps_what_is_beside_a_nan():  # fails if NaN in one column of
     assert data.observed is not None
     assert data.q[20, 1] == x[20, 1]
     assert data.complete.nonzero()[:, 0].tolist() == [k for k in range(60) if k not in (20, 21)]
+
+
+def test_an_angle_of_a_chain_is_where_its_own_positions_are():
+    # fails if a tip that is lost costs the angle of the elbow, or interpolated positions count in a circle's fit
+    a, b = 0.8 * T.cos(), (1.3 * T).sin()
+    elbow = torch.stack([a.sin(), -a.cos()], 1)
+    q = torch.cat([elbow, elbow + torch.stack([b.sin(), -b.cos()], 1)], 1)
+    known = torch.ones(60, 4, dtype=torch.bool)
+    known[20:25, 2:] = known[40:42, :2] = False
+    data = with_missing(Trajectories.of(T, torch.where(known, q, 9.0), names=["x1", "y1", "x2", "y2"]), known, str)
+    found = in_polar(data, pairs_of(["x1,y1", "x2,y2"])).unwrapped()
+    assert found.observed is not None
+    assert found.observed[20:25].tolist() == [[1.0, 0.0]] * 5
+    assert found.observed[40:42].tolist() == [[0.0, 0.0]] * 2
+    assert torch.allclose(found.q[found.observed > 0], torch.stack([a, b], 1)[found.observed > 0], rtol=0, atol=1e-9)
+    assert torch.allclose(found.q, torch.stack([a, b], 1), rtol=0, atol=5e-3)
