@@ -76,7 +76,7 @@ def _together(one: Recording, q: slice) -> Recording:
     """The recording with the values of all coordinates in one row.
 
     Where most samples of the coordinate with the fewest stand in rows without another one, the others are interpolated
-    at its times, by cubics through their samples beside.
+    at its times, by cubics through their samples beside. Rows of the others stay, and lack the rarest one.
     """
     known = ~np.isnan(one.values[:, q])
     counts = known.sum(0)
@@ -84,7 +84,6 @@ def _together(one: Recording, q: slice) -> Recording:
     if counts[base] < NEAR or 2 * int(known.all(1).sum()) >= counts[base]:
         return one
     values = one.values.copy()
-    values[:, q] = np.where(known[:, [base]], values[:, q], np.nan)
     rows = np.flatnonzero(known[:, base])
     for k in range(known.shape[1]):
         if k != base:

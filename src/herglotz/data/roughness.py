@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import offsets_of
+from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
 
 SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
@@ -92,9 +93,10 @@ def precisions(data: Trajectories) -> Tensor:
 def part_of(data: Trajectories, most: int) -> Trajectories:
     """About `most` samples of more than twice as many: every second, fourth … one while these follow the motion.
 
-    What is left over is cut to the runs of samples that move most. The data themselves where they have no more.
+    What is left over is cut to the runs of samples that move most. The data themselves where they have no more. Samples
+    that lack positions are the first to go: every m-th row may be none of those that a slower sensor has read.
     """
-    few = data
+    few = data if data.samples < 2 * most else complete(data)
     while few.samples >= 2 * most and min(few.lengths) >= 2 * most / len(few) and not coarse(half := few.thinned(2)):
         few = half
     liveliest = few.liveliest(most)

@@ -245,12 +245,17 @@ class Trajectories:
     def thinned(self, every: int) -> Trajectories:
         """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the steps they then span.
 
+        Where positions are missing, samples that have all of them are counted, and the first of each trajectory.
+
         Raises
         ------
         InputError
             If `every` is not a whole number >= 1, or a trajectory keeps fewer than three samples.
         """
-        return self.keep(every_mth(self.lengths, every).to(self.t.device))
+        kept = self.complete
+        kept[list(self.offsets)] = True
+        counts = [int(own.sum()) for own in kept.split(self.lengths)]
+        return self.keep(kept.masked_scatter(kept, every_mth(counts, every).to(kept.device)))
 
     def keep(self, kept: Tensor) -> Trajectories:
         """Return these samples alone, (N,) bool; steps become longer where samples between them are left out.

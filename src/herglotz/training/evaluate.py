@@ -118,7 +118,7 @@ def _errors(
     unmoved = triples.q2 - triples.q1 - ratio * (triples.q1 - triples.q0)
     stepped = len(triples) and base.model_step == base.max_step  # a recorded step is one of the model's
     rate = getattr(fitted.model.damping, "rate", None)
-    free = None if seen.unseen is None else error[beyond]
+    free = error[beyond] if seen.unseen is not None and bool(beyond.any()) else None
     numbers = {
         "one_step_rms": _rms(problem.residuals(x)) if stepped else None,
         "one_step_rms_constant_velocity": _rms(unmoved) if len(triples) else None,

@@ -9,7 +9,7 @@ import torch
 from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.gaps import complete, with_missing
 from herglotz.data.polar import in_polar, pairs_of
-from herglotz.data.roughness import precisions
+from herglotz.data.roughness import part_of, precisions
 
 T = torch.arange(60, dtype=torch.float64) / 10
 
@@ -64,6 +64,19 @@ def test_noise_is_that_of_readings():
     known[::4, 1] = known[1::4, 0] = False
     data = with_missing(Trajectories.of(t, q), known, str)
     assert (precisions(data) * data.balance).numpy() == pytest.approx([1e-3, 1e-3], rel=0.1)
+
+
+def test_a_part_of_a_long_recording_has_what_a_slow_sensor_read():
+    # fails if every second row is taken, which are those that the slower sensor has not read
+    t = torch.arange(4001, dtype=torch.float64) / 100
+    known = torch.ones(4001, 2, dtype=torch.bool)
+    known[1::2, 1] = known[2000:3000, 1] = False
+    known[2001:3000:2, 1] = True  # half of it out of step
+    data = with_missing(Trajectories.of(t, torch.stack([t.sin(), t.cos()], 1)), known, str)
+    assert data.thinned(2).t.tolist() == t[known.all(1)][::2].tolist()
+    few = part_of(data, 1000)
+    assert few.observed is None
+    assert 900 < few.samples < 2000
 
 
 def test_an_array_keeps_what_is_beside_a_nan():  # fails if NaN in one column of an array costs the row
