@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -21,14 +21,22 @@ from herglotz.training.dry_friction import acceleration_terms, for_each
 from herglotz.training.offers import INPUTS
 from herglotz.training.trials import Trial, Variant
 
-if TYPE_CHECKING:
-    from herglotz.training.search import Search
-
 LEVELS = 24  # of an input, tried between a twentieth of its largest value and that
 LOWEST = 0.05
 AROUND = 1.5  # a level is sharpened within this factor, by
 ROUNDS = 12  # of golden sections: to 0.3 %
 GOLDEN = (5**0.5 - 1) / 2
+
+
+class Driven(Protocol):
+    """A `herglotz.training.search.Search`."""
+
+    data: Trajectories
+    order: int
+
+    def driven_by(self, terms: Sequence[str]) -> Any:
+        """The same of data whose inputs act by these terms as well."""
+        ...
 
 
 def offered_terms(data: Trajectories) -> tuple[str, ...]:
@@ -56,7 +64,7 @@ def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
     return float((A / size @ least_squares(A / size, y) - y).square().mean())
 
 
-def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
+def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
     """The terms of the inputs that a model with all of them among its offers has taken, if it is better than a trial.
 
     Each level is one more number of it.
@@ -77,7 +85,7 @@ def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
     return taken if found.with_zeros(sum(map(bool, map(saturation, taken)))).gain(trial) > 0 else ()
 
 
-def _climbed(search: Search, terms: Sequence[str]) -> Trial | None:
+def _climbed(search: Driven, terms: Sequence[str]) -> Trial | None:
     """The simplest model with what joins it over ever longer segments, these terms of the inputs being offers, too."""
     other = search.driven_by(terms)
     fitter = other.fitter(Variant(search.order))
@@ -92,7 +100,7 @@ def _taken(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     return tuple(every[k - recorded] for k in sorted(set(gains)) if k >= recorded)
 
 
-def _sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
+def _sharpened(search: Driven, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     """The terms with the levels, of those that a model has taken, at which it misses the data least."""
     terms = list(every)
     for term in _taken(found, every):
