@@ -42,6 +42,8 @@ def check(data: Any) -> None:
     for name, x in arrays.items():
         _check_finite(where, offsets, name, x)
     _check_time(where, offsets, arrays["t"])
+    if "observed" in arrays:
+        _check_observed(where, offsets, arrays["observed"])
 
 
 def offsets_of(lengths: Sequence[int]) -> tuple[int, ...]:
@@ -132,6 +134,17 @@ def _check_finite(where: str, offsets: tuple[int, ...], name: str, x: Tensor) ->
     value = float(x[tuple(place)])
     column = f"{name}[{place[1]}]" if len(place) > 1 else name
     raise InputError(f"{where}: {column} of trajectory {b}, sample {k}, is {value}; delete that sample")
+
+
+def _check_observed(where: str, offsets: tuple[int, ...], observed: Tensor) -> None:
+    bad = ((observed != 0) & (observed != 1)).nonzero()
+    if len(bad):
+        row, i = bad[0].tolist()
+        b, k = locate(offsets, row)
+        value = float(observed[row, i])
+        raise InputError(
+            f"{where}: observed[{i}] of trajectory {b}, sample {k}, is {value}; write 1 where it was read, else 0"
+        )
 
 
 def check_sizes(where: str, q: Tensor, names: Sequence[str]) -> None:

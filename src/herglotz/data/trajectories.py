@@ -100,7 +100,7 @@ class Trajectories:
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
 
-        Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v` and `u` of shape (N,) become (N, 1).
+        Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v`, `u` and `observed` (N,) become (N, 1).
         Left out: one trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
         columns_of = (("p", p), ("u", u), ("v", v), ("observed", observed))

@@ -23,8 +23,8 @@ from herglotz.training.trials import Trial, Variant
 
 LEVELS = 24  # of an input, tried between a twentieth of its largest value and that
 LOWEST = 0.05
-AROUND = 1.5  # a level is sharpened within this factor, by
-ROUNDS = 12  # of golden sections: to 0.3 %
+AROUND = 1.5  # factor to either side of its first guess within which a level is sharpened
+ROUNDS = 12  # of golden sections, which leave 0.3 % of that range
 GOLDEN = (5**0.5 - 1) / 2
 
 

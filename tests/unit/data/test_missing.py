@@ -10,6 +10,7 @@ from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.gaps import complete, with_missing
 from herglotz.data.polar import in_polar, pairs_of
 from herglotz.data.roughness import part_of, precisions
+from herglotz.errors import InputError
 
 T = torch.arange(60, dtype=torch.float64) / 10
 
@@ -33,8 +34,9 @@ def test_two_recordings_share_no_reading():
     known = torch.ones(60, 2, dtype=torch.bool)
     known[30, 0] = False
     data = turning(known).unwrapped()
-    cut = data.rows(torch.arange(60), (30, 30)).unwrapped()
-    assert torch.allclose(cut.q[:, 0], 3 * T, rtol=0, atol=1e-12)
+    elsewhere = torch.where(torch.arange(60) < 30, 20.0, 0.0)
+    cut = replace(data, q=data.q + elsewhere[:, None], lengths=(30, 30)).unwrapped()
+    assert torch.allclose(cut.q[:, 0], 3 * T + elsewhere, rtol=0, atol=1e-12)
 
 
 def test_sets_with_and_without_blanks_are_joined_saved_and_read(tmp_path):
@@ -103,3 +105,10 @@ def test_an_angle_of_a_chain_is_where_its_own_positions_are():
     assert found.observed[40:42].tolist() == [[0.0, 0.0]] * 2
     assert torch.allclose(found.q[found.observed > 0], torch.stack([a, b], 1)[found.observed > 0], rtol=0, atol=1e-9)
     assert torch.allclose(found.q, torch.stack([a, b], 1), rtol=0, atol=5e-3)
+
+
+def test_a_weight_is_0_or_1():  # fails if a weight between them, which precisions and errors do not know, is let in
+    weight = torch.ones(60, 2, dtype=torch.float64)
+    weight[32, 1] = 0.5
+    with pytest.raises(InputError, match=r"observed\[1\] of trajectory 1, sample 2, is 0.5; write 1 where it was read"):
+        Trajectories.of(T, torch.stack([T, T], 1), [30, 30], observed=weight)
