@@ -24,7 +24,7 @@ from herglotz.training.trials import Trial, Variant
 LEVELS = 24  # of an input, tried between a twentieth of its largest value and that
 LOWEST = 0.05
 AROUND = 1.5  # factor to either side of its first guess within which a level is sharpened
-ROUNDS = 12  # of golden sections, which leave 0.3 % of that range
+ROUNDS = 16  # of golden sections, which leave 0.05 % of that range
 GOLDEN = (5**0.5 - 1) / 2
 
 
