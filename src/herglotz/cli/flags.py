@@ -36,8 +36,9 @@ READING = (
     flag("--polar", "positions of a body on a circle that become one angle: x,y (centre and radius by least squares), "
          "x,y,X,Y with the centre in numbers or columns, x,-y where y grows downwards; again for the next body of a "
          "chain; none to leave positions as they are", action="append", metavar="X,Y"),
-    flag("--input-terms", "terms of inputs that act beside them, with commas: V^2, |V| or V' of an input V (default: "
-         "those that the data ask for)", type=names, metavar="TERMS"),
+    flag("--input-terms", "terms of inputs that act beside them, with commas: V^2, |V|, V', sat(V/2) or tanh(V/2) "
+         "of an input V, 2 being the level at which it saturates (default: those that the data ask for)",
+         type=names, metavar="TERMS"),
     flag("--sensor-zeros", f"what the sensors read where the coordinates are 0, {EACH}",
          type=finite, nargs="+", metavar="X"),
     flag("--sensor-scales", f"what one unit of each reading is worth, {EACH}", type=finite, nargs="+", metavar="X"),

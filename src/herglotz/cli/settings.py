@@ -151,8 +151,8 @@ OPTIMISER = (
     setting("--find-zeros", "look for zeros of the sensors that differ between recordings, kept where held-out blocks "
             "of time ask for them, or do not (default: where the named terms that were found miss several recordings "
             "by more than the noise)", action=argparse.BooleanOptionalAction),
-    setting("--find-input-terms", "try squares, sizes and rates of inputs where the named terms miss the data by more "
-            "than the noise, or do not (default: tried)", action=argparse.BooleanOptionalAction),
+    setting("--find-input-terms", "try squares, sizes, rates and saturations of inputs where the named terms miss the "
+            "data by more than the noise, or do not (default: tried)", action=argparse.BooleanOptionalAction),
     setting("--supervision", "what the one-step objective is fitted to: positions, s beside them, or momenta as well, "
             "where they are recorded (default q)", choices=SUPERVISION),
     setting("--restarts", "random initialisations of the one-step fit; the best after 30 iterations is kept (default: "

@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
 from herglotz.data.extra_formats import Table
-from herglotz.data.gaps import parted, without
+from herglotz.data.gaps import parted, with_missing
 from herglotz.data.polar import named_by
 from herglotz.data.readers import angles_like, as_told, load, with_angles
 from herglotz.data.sensors import measured
@@ -184,12 +184,12 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time))
     t = np.arange(n) * float(h) if h is not None else _floats("time", clock)
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
-    missing = q.isnan().reshape(n, -1).any(1)
-    known = n - int(missing.sum())
+    missing = q.isnan().reshape(n, -1)
+    known = int((~missing.any(1)).sum())
     refuse({f"array: {known} of its {n} samples have a value, {MIN_SAMPLES} are needed": known < MIN_SAMPLES < n})
     found = Trajectories.of(t, q.where(~q.isnan(), 0.0), u=u, source="array", **_labels(called))
-    first = f"sample {int(missing.long().argmax())}" if known < n else ""
-    return in_radians_and_seconds(without(found, missing, first) if known < n else found)
+    found = with_missing(found, ~missing, lambda k: f"sample {k}") if known < n else found
+    return in_radians_and_seconds(found)
 
 
 def _check_array(q: Tensor, called: Names | None, *, timeless: bool, of_tables: bool) -> None:

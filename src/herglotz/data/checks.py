@@ -15,7 +15,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 
-ARRAYS = ("t", "q", "s", "p", "u", "v")
+ARRAYS = ("t", "q", "s", "p", "u", "v", "observed")
 MIN_SAMPLES = 3  # one discrete Herglotz residual joins q_{k−1}, q_k, q_{k+1}
 EXACT = 2**53  # integers up to here are floats of double precision
 SMALLEST, LARGEST = 1e-50, 1e50  # of numbers that are fitted: cubes and sums of a million squares are numbers
@@ -42,6 +42,8 @@ def check(data: Any) -> None:
     for name, x in arrays.items():
         _check_finite(where, offsets, name, x)
     _check_time(where, offsets, arrays["t"])
+    if "observed" in arrays:
+        _check_observed(where, offsets, arrays["observed"])
 
 
 def offsets_of(lengths: Sequence[int]) -> tuple[int, ...]:
@@ -76,11 +78,12 @@ def _check_shapes(where: str, arrays: Mapping[str, Tensor]) -> None:
     if q.ndim != 2 or q.shape[0] != len(t) or q.shape[1] < 1:
         raise InputError(f"{where}: q must have shape ({len(t)}, n), one row a sample of t, got {tuple(q.shape)}")
     wanted = {"s": f"({len(t)},)", "p": f"({len(t)}, {q.shape[1]})", "u": f"({len(t)}, m)"}
-    wanted["v"] = wanted["p"]
+    wanted["v"] = wanted["observed"] = wanted["p"]
     fits = {
         "s": lambda x: x.shape == t.shape,
         "p": lambda x: x.shape == q.shape,
         "v": lambda x: x.shape == q.shape,
+        "observed": lambda x: x.shape == q.shape,
         "u": lambda x: x.ndim == 2 and x.shape[0] == len(t) and x.shape[1] >= 1,
     }
     for name in wanted:
@@ -131,6 +134,17 @@ def _check_finite(where: str, offsets: tuple[int, ...], name: str, x: Tensor) ->
     value = float(x[tuple(place)])
     column = f"{name}[{place[1]}]" if len(place) > 1 else name
     raise InputError(f"{where}: {column} of trajectory {b}, sample {k}, is {value}; delete that sample")
+
+
+def _check_observed(where: str, offsets: tuple[int, ...], observed: Tensor) -> None:
+    bad = ((observed != 0) & (observed != 1)).nonzero()
+    if len(bad):
+        row, i = bad[0].tolist()
+        b, k = locate(offsets, row)
+        value = float(observed[row, i])
+        raise InputError(
+            f"{where}: observed[{i}] of trajectory {b}, sample {k}, is {value}; write 1 where it was read, else 0"
+        )
 
 
 def check_sizes(where: str, q: Tensor, names: Sequence[str]) -> None:

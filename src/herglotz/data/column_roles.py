@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from typing import NamedTuple
+from unicodedata import combining, normalize
 
 ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|gon|rev|turns?")
 # Kinds of units, in the order in which they are tried. Others, such as counts or 1, leave the role to the name.
@@ -22,39 +23,47 @@ NUMBERED = r"(_?\d+|_.*)?"
 # Names that have a role whatever their words, unless the unit is of another kind.
 ROLES = {
     "time": re.compile(
-        r"t|times?|timestamps?|datetime|secs?|seconds|zeit|zeitstempel|uhrzeit|temps|tiempo|tempo|tijd|tid|czas|čas|aika"
+        r"t|times?|timestamps?|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
+        r"|czas|čas|aika"
     ),
     "trajectory": re.compile(r"trajectory|trial|run"),
     "action": re.compile(r"s"),
     "momentum": re.compile(r"p|p_.*"),
     # Left aside, as are rates: logged velocities are usually filtered, and counters of rows are no motion.
-    "counter": re.compile(r"index|row|sample|frame|step|dt|unnamed: \d+"),
+    "counter": re.compile(r"index|row|sample|(sub[ _]?)?frame#?|step|dt|unnamed: \d+"),
     "input": re.compile(rf"u{NUMBERED}|F|f(\d+|[xyz]|_.*)|i_?[qd]"),
 }
 SYMBOL = r"(?:[qxyzr]|theta|phi|psi|alpha|beta|gamma|th|θ|φ|ϕ|ψ|α|β|pos|position|angle|joint|roll|pitch|yaw)"
 RATE = re.compile(
-    rf"v\d*|[va]_?[xyz]|w[xyz]|d?d?{SYMBOL}_?\d*_?(d?dot|vel|velocity|speed|rate|acc)(_?\d+)?|{SYMBOL}_?d?d_?\d+|{SYMBOL}dd"
+    rf"v\d*|[va]_[xyz]|(.+_)?[vaw][xyz]|d?d?{SYMBOL}_?\d*_?(d?dot|vel|velocity|speed|rate|acc)(_?\d+)?|{SYMBOL}_?d?d_?\d+|{SYMBOL}dd"
     rf"|dd?_?{SYMBOL}{NUMBERED}|d\d?.+?_?/?dt(\^?2)?|(vel|acc|gyro)[xyz]\d*"
 )
 LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")  # of a velocity or an acceleration, unless the unit is that of a position
 DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")  # a desired value, or a derivative: q_d
 KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")  # usual names of coordinates
+# A German compound is what its last part is: Motorstrom, Winkelgeschwindigkeit.
+COMPOUND = re.compile(
+    ".+(winkel|kraft|moment|strom|spannung|drehzahl|geschwindigkeit|beschleunigung|fehler|temperatur|zeit)"
+)
+# Without accents: ángulo is here as angulo.
 _WORDS = {
     "goal": "goal target setpoint setpoints sp desired des reference ref command commands commanded cmd demand "
-            "demanded wanted consigne consigna",
+            "demanded wanted vorgabe fuhrungsgrosse fuehrungsgroesse consigne commande consigna referencia riferimento "
+            "comando",
     # Of what is measured beside a motion.
     "side": "error err std sd stderr variance var covariance cov uncertainty residual quality confidence likelihood "
-            "temperature temp temperatur température temperatura battery batt supply humidity status valid checksum "
-            "crc",
+            "temperature temp temperatur temperatura battery batt supply humidity status statusword statuswort valid "
+            "checksum crc leistung puissance potencia potenza fehler regelabweichung erreur errore reward done",
     "rate": "velocity velocities vel speed rate acceleration acc accel omega gyro jerk dot ddot rpm "
-            "geschwindigkeit winkelgeschwindigkeit drehzahl beschleunigung vitesse accélération velocidad aceleración "
-            "velocità accelerazione",
+            "geschwindigkeit drehzahl beschleunigung vitesse velocidad aceleracion velocita accelerazione",
     "position": "position positions pos angle angles displacement height elongation location coordinate "
-                "winkel weg lage ángulo posición posizione angolo",
-    "angle": "theta phi psi angle alpha beta gamma roll pitch yaw winkel ángulo angolo θ φ ϕ ψ α β",
+                "winkel weg lage auslenkung verschiebung deplacement angulo posicion desplazamiento angolo posizione "
+                "spostamento",
+    "angle": "theta phi psi angle alpha beta gamma roll pitch yaw winkel angulo angolo θ φ ϕ ψ α β",
     "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle kraft drehmoment moment "
-              "strom spannung couple courant tension fuerza corriente coppia corrente forza tensione",
-    "attribute": "motor current input inputs control controls",  # of a position: motor_angle; else of an input
+              "strom spannung couple courant tension fuerza corriente voltaje coppia corrente forza tensione grf",
+    # Of a position: motor_angle; else of an input.
+    "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse",
     "reading": "pot potentiometer lvdt encoder laser",  # of a position, even in volts
     "excitation": "road ground floor shaker excitation disturbance seismic",  # where a motion comes from
     "support": "base pivot support platform",  # places that may be moved from outside
@@ -118,10 +127,15 @@ def is_usual(name: str, unit: str) -> bool:
 
 
 def words_of(name: str) -> frozenset[str]:
-    """The words of a name, in lower case: `ActCurrent`, `goal_position` and `x vel` have two each."""
+    """The words of a name, in lower case and without accents: `ActCurrent`, `goal_position` and `x vel` have two each.
+
+    Of a German compound the last part is one more.
+    """
     parts = re.findall(r"[^\W\d_]+", name)
     found = [word for part in parts for word in re.findall(r"[A-ZÄÖÜ]?[^A-ZÄÖÜ]+|[A-ZÄÖÜ]+(?![^A-ZÄÖÜ])", part)]
-    return frozenset(word.casefold() for word in found)
+    folded = ("".join(x for x in normalize("NFD", word.casefold()) if not combining(x)) for word in found)
+    words = frozenset(folded)
+    return words | {head[1] for head in map(COMPOUND.fullmatch, words) if head}
 
 
 def _whole(key: str, kind: str) -> str:

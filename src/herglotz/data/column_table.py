@@ -1,4 +1,4 @@
-"""What was read of a table, in words: a line a column, then notes, then warnings."""
+"""What was read, in words: of a recording a line; of a table a line a column, then notes, then warnings."""
 
 from __future__ import annotations
 
@@ -28,6 +28,22 @@ def column_table(data: Any) -> str:
     notes = [f"  {note}" for note in data.notes if not note.startswith(WARNING)]
     warnings = [f"{WARNING}{source}: {note[len(WARNING) :]}" for note in data.notes if note.startswith(WARNING)]
     return "\n".join([f"{source}:", *lines, *notes, *warnings])
+
+
+def summary_of(data: Any) -> str:
+    """Return of `Trajectories` one line: what was recorded, how much of it, and in which steps."""
+    coordinates = ", ".join(f"{name} [{unit}]" for name, unit in zip(data.names, data.units, strict=True))
+    known = "".join(f", {name}" for name in "sp" if getattr(data, name) is not None)
+    known += "".join(f", input {name}" + (f" [{unit}]" if unit else "") for name, unit in data.input_labels)
+    plural, unit = "y" if len(data) == 1 else "ies", "" if data.time_unit == "1" else f" {data.time_unit}"
+    gaps = f", {data.gaps} gap{'' if data.gaps == 1 else 's'}" if data.gaps else ""
+    h = data.steps().h
+    irregular = f"irregular steps, {float(h.min()):.3g} to {float(h.max()):.3g}{unit}"
+    step = irregular if data.irregular else f"step {data.typical_step:.4g}{unit}{gaps}"
+    return (
+        f"{data.source or 'trajectories'}: {len(data)} trajector{plural}, {data.samples} samples of "
+        f"{coordinates}{known}; {step}"
+    )
 
 
 def of_file(name: str, note: str) -> str:

@@ -192,7 +192,7 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
             doubts.setdefault(guess.doubt, []).append(i)
     own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
     plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
-    if plain and len(plain) < len(own):
+    if plain and len(own) > 1:  # one alone can be nothing else
         doubts["no unit and no usual name says so"] = plain
     return tuple(_warning(found, columns, doubt) for doubt, columns in doubts.items())
 
@@ -208,6 +208,8 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
     ways = [] if is_u else [f"--inputs {','.join(inputs)}"]
     ways += [] if is_q else [f"--coordinates {','.join(coordinates)}"]
     ways += [f"--drop {some}"] if role else []
+    if set(columns) == set(found.q):
+        ways = ["--inputs or --drop with the names of those that are none"]
     verb = ("is" if one else "are") + (f" taken for {role}" if role else " left aside")
     return f"warning: {few} {verb}, but {doubt}; else give {' or '.join(ways)}"
 

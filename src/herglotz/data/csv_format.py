@@ -33,9 +33,10 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     `herglotz.data.load` asks for roles by keywords (`time=`, `coordinates=`, …) and for angles; here they are a
     `herglotz.data.csv_columns.Wanted`.
 
-    Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A row in
-    which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs. An
-    input that is empty is held from the row before, or goes in a straight line where its hold is "first" or "smooth".
+    Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A coordinate
+    that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row without any, or without s or a
+    momentum, is left out; the step over it has the mean of its inputs. An input that is empty is held from the row
+    before, or goes in a straight line where its hold is "first" or "smooth".
     Rows of stacked tables are sorted by time, and those of one time joined.
 
     The header's cells are `name`, `name[unit]`, `name (unit)`, `name(unit)` of a known unit, or of angles and times
@@ -139,9 +140,9 @@ def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:
     """Write trajectories so that `read_csv` returns the same numbers, bit for bit, atomically.
 
-    `comments` become lines that start with #. A coordinate in rad that is not an angle is written too, although
-    `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit cannot stand in the header (it
-    has a comma, or means another column).
+    `comments` become lines that start with #. Positions that were not read are NaN. A coordinate in rad that is not an
+    angle is written too, although `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit
+    cannot stand in the header (it has a comma, or means another column).
     """
     q = trajectories.names
     header = ["trajectory", f"t[{trajectories.time_unit}]"]
@@ -158,12 +159,14 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     if trajectories.u is not None:
         header, parts = header + [f"u_{i}" for i in range(trajectories.u.shape[1])], [*parts, trajectories.u]
     _check_header(Path(path), header, trajectories)
-    table = np.concatenate([x.detach().cpu().numpy().astype(np.float64) for x in parts], axis=1).tolist()
+    table = np.concatenate([x.detach().cpu().numpy().astype(np.float64) for x in parts], axis=1)
+    if trajectories.observed is not None:
+        table[:, 1 : 1 + len(q)][trajectories.observed.cpu().numpy() == 0] = np.nan
     names = trajectories.trajectory.tolist()
     said = trajectories.arrival._asdict().items()
     comments = [*comments, *(f"{name}: {value}" for name, value in said if value not in ("", None))]
     lines = [f"# {line}" for text in comments for line in text.splitlines()] + [",".join(header)]
-    lines += [",".join([str(b), *map(repr, row)]) for b, row in zip(names, table, strict=True)]
+    lines += [",".join([str(b), *map(repr, row)]) for b, row in zip(names, table.tolist(), strict=True)]
     write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 

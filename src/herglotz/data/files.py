@@ -15,7 +15,8 @@ from herglotz.errors import InputError, no_such_file
 
 PathLike = str | os.PathLike[str]
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, or what this user may take of it
-UNITS = "°µ²³·".encode("cp1252")  # what spreadsheets that do not write UTF-8 write in units
+# What spreadsheets and drives that do not write UTF-8 write in units and in words of Western Europe.
+WINDOWS = "°µ²³·äöüÄÖÜßáàâçéèêëíìîïñóòôúùûÉÈÀÑ".encode("cp1252")
 TEMPORARY = ".{}.????????.tmp"  # names that `tempfile.mkstemp` gives to what becomes a file of this name
 
 
@@ -48,19 +49,20 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
 def read_lines(path: PathLike) -> list[str]:
     r"""Return the lines of a text file, without their ends (\n, \r\n or \r).
 
-    It is UTF-8, UTF-16 with its mark, or else has units in Windows' letters. Raise InputError as `read_bytes`, and if
-    the file is none of them.
+    It is UTF-8, UTF-16 with its mark, or else has units and words in Windows' letters. Raise InputError as
+    `read_bytes`, and if the file is none of them.
     """
     content = read_bytes(path)
-    windows = all(byte < 128 or byte in UNITS for byte in set(content))
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # "Unicode text" of spreadsheets
     try:
-        text = content.decode("cp1252" if windows else "utf-16" if wide else "utf-8-sig")  # with a byte-order mark
+        text = content.decode("utf-16" if wide else "utf-8-sig")  # with a byte-order mark
     except UnicodeDecodeError as error:
-        row = content.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            f"{Path(path)}, row {row}: not UTF-8 text (byte 0x{content[error.start]:02x}); save the file as UTF-8"
-        ) from None
+        if wide or not all(byte < 128 or byte in WINDOWS for byte in set(content)):
+            row = content.count(b"\n", 0, error.start) + 1
+            raise InputError(
+                f"{Path(path)}, row {row}: not UTF-8 text (byte 0x{content[error.start]:02x}); save the file as UTF-8"
+            ) from None
+        text = content.decode("cp1252")
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 

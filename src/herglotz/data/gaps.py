@@ -1,31 +1,73 @@
-"""Gaps in recordings: samples without a value are left out; a gap longer than all that was recorded begins another."""
+"""Gaps in recordings: missing values, and gaps longer than all that was recorded, which begin another trajectory.
+
+A sample with some positions keeps them: the others are interpolated, and have no weight in a fit. Errors are those of
+samples whose positions were all read. A sample without any, or without another value, is left out.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
+from herglotz.data.missing import interpolated
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 
+Place = Callable[[int], str]  # of a sample in a file, in words
 CROSSED = 1000  # typical steps: a gap of so many is crossed in any recording, as that costs little
 
 
-def without(data: Trajectories, missing: Tensor, first: str) -> Trajectories:
-    """Return the set without the samples that are `missing`, (N,) bool; a note counts them and names the `first`.
+def with_missing(data: Trajectories, known: Tensor, place: Place, lacking: Tensor | None = None) -> Trajectories:
+    """Return the set with the positions that are `known`, (N, n) bool, alone; a note counts the others.
 
-    A step over them is longer, and has the mean of their inputs. Each trajectory goes from its first known sample to
-    its last one.
+    Samples that are `lacking` another value, (N,) bool, or all positions are left out, and so are those before the
+    first and after the last sample of a trajectory that has all; the note says the `place` of the first of them.
     """
-    known = (~missing).split(list(data.lengths))
-    inside = torch.cat([(own.cumsum(0) > 0) & (own.flip(0).cumsum(0).flip(0) > 0) for own in known])
-    lengths = tuple(int(own.sum()) for own in inside.split(list(data.lengths)))
-    found = data.rows(inside.nonzero()[:, 0], lengths).keep(~missing[inside])
-    count = "a row is" if int(missing.sum()) == 1 else f"{int(missing.sum())} rows are"
-    return replace(found, notes=(*data.notes, f"{count} left out, without a value: the first is {first}"))
+    lacking = torch.zeros_like(known[:, 0]) if lacking is None else lacking
+    missing = ~known.any(1) | lacking | ~_inside(known.all(1) & ~lacking, data.lengths)
+    data = replace(data, observed=known.to(data.q))
+    if count := int(missing.sum()):
+        what = f"{'a row is' if count == 1 else f'{count} rows are'} left out, without a value"
+        data = replace(data, notes=(*data.notes, f"{what}: the first is {place(int(missing.long().argmax()))}"))
+        data = _trimmed(data, ~missing)
+    assert data.observed is not None
+    known = data.observed > 0
+    if bool(known.all()):
+        return replace(data, observed=None)
+    counts = (f"{name} in {k}" for name, k in zip(data.names, (~known).sum(0).tolist(), strict=True) if k)
+    note = f"missing positions, which have no weight in a fit: {', '.join(counts)} of {data.samples} rows"
+    return replace(data, q=interpolated(data.t, data.q, known, data.lengths), notes=(*data.notes, note))
+
+
+def complete(data: Trajectories) -> Trajectories:
+    """Return the samples whose positions were all read; steps between them have the mean of their inputs.
+
+    Trajectories that keep fewer than three are left out, unless all are.
+    """
+    if data.observed is None:
+        return data
+    counts = [int(own.sum()) for own in data.complete.split(data.lengths)]
+    found = data.select(b for b, count in enumerate(counts) if count >= MIN_SAMPLES)
+    return replace(_trimmed(found, found.complete) if len(found) else data, observed=None)
+
+
+def _trimmed(data: Trajectories, kept: Tensor) -> Trajectories:
+    """The set from the first to the last sample of each trajectory that is `kept`, (N,) bool, without the others.
+
+    A step over these is longer, and has the mean of their inputs.
+    """
+    inside = _inside(kept, data.lengths)
+    lengths = tuple(int(own.sum()) for own in inside.split(data.lengths))
+    return data.rows(inside.nonzero()[:, 0], lengths).keep(kept[inside])
+
+
+def _inside(kept: Tensor, lengths: tuple[int, ...]) -> Tensor:
+    """Whether a sample is neither before the first nor behind the last of its trajectory that is `kept`, (N,) bool."""
+    return torch.cat([(x.cumsum(0) > 0) & (x.flip(0).cumsum(0).flip(0) > 0) for x in kept.split(lengths)])
 
 
 def parted(data: Trajectories) -> Trajectories:

@@ -1,12 +1,14 @@
-"""Inputs that act by their square, their size or their rate: further columns of u that follow from recorded ones.
+"""Inputs that act by their square, size or rate, or saturate: further columns of u that follow from recorded ones.
 
-The force between the plates of a capacitor grows as V², a motor pulls a one-sided brake by |i|, and a moved base drives
-a mass by k r + c r′. The learned map from inputs to forces is linear in all columns. Rates are those of a parabola
-through a value and its neighbours.
+The force between the plates of a capacitor grows as V², a motor pulls a one-sided brake by |i|, a moved base drives a
+mass by k r + c r′, and an amplifier gives no more than its level c, as sat(u/c) or, softly, tanh(u/c). The learned map
+from inputs to forces is linear in all columns. Rates are those of a parabola through a value and its neighbours.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -14,10 +16,13 @@ import torch
 from torch import Tensor
 
 from herglotz.data.column_table import INPUT_TERM
+from herglotz.data.csv_columns import is_number
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 
 FORMS = ("{}^2", "|{}|", "{}'")
+SATURATIONS = {"sat": lambda x: x.clamp(-1, 1), "tanh": torch.tanh}  # of an input over its level
+SATURATED = re.compile(r"(sat|tanh)\((.+)/([^/]+)\)")
 
 
 def input_terms_of(columns: Iterable[Sequence[str]]) -> tuple[str, ...]:
@@ -33,17 +38,19 @@ def all_input_terms(data: Trajectories) -> tuple[str, ...]:
 
 
 def with_input_terms(data: Trajectories, terms: Sequence[str]) -> Trajectories:
-    """The recording with these terms of its inputs as further columns of u: `V^2`, `|V|` and `V'` of an input V.
+    """The recording with these terms of its inputs as further columns of u.
 
-    Raise InputError if a term is none of these, or of no input.
+    Of an input V they are `V^2`, `|V|`, `V'`, and `sat(V/c)`, which is V/c between -1 and 1 and ±1 beyond, and
+    `tanh(V/c)` of a level c, a number in the unit of V. Raise InputError if a term is none of these, or of no input.
     """
     terms = tuple(term for term in terms if term not in input_terms_of(data.columns))
     if not terms:
         return data
     where, labels = data.source or "data", dict(data.input_labels)
     known = {form.format(name): (name, form) for name in labels for form in FORMS}
+    known |= {term: (of[2], term) for term in terms if (of := saturation(term)) and of[2] in labels}
     every = ", ".join(labels) or "no inputs"
-    remedy = f"write x^2, |x| or x' of an input x; the inputs are {every}"
+    remedy = f"write x^2, |x|, x', sat(x/2) or tanh(x/2) of an input x, 2 being its level > 0; the inputs are {every}"
     for term in terms:
         refuse({f"{where}: {term!r} is no term of an input; {remedy}": term not in known})
     assert data.u is not None
@@ -56,8 +63,17 @@ def with_input_terms(data: Trajectories, terms: Sequence[str]) -> Trajectories:
     return replace(data, u=torch.cat([data.u, torch.stack(columns, 1)], 1), columns=(*recorded, *rows))
 
 
+def saturation(term: str) -> tuple[str, float, str] | None:
+    """The kind of a saturation, its level, and the input that it is of; None of any other term."""
+    of = SATURATED.fullmatch(term)
+    level = float(of[3]) if of and is_number(of[3]) else 0.0
+    return (of[1], level, of[2]) if of and 0 < level < math.inf else None
+
+
 def _column(data: Trajectories, u: Tensor, form: str) -> Tensor:
     """(N,) values of a term of an input (N,)."""
+    if of := saturation(form):
+        return SATURATIONS[of[0]](u / of[1])
     if form != "{}'":
         return u.square() if form == "{}^2" else u.abs()
     parts = zip(u.split(data.lengths), data.t.split(data.lengths), strict=True)
@@ -65,6 +81,8 @@ def _column(data: Trajectories, u: Tensor, form: str) -> Tensor:
 
 
 def _unit(unit: str, form: str, time_unit: str) -> str:
+    if saturation(form):
+        return ""
     if form == "|{}|" or not unit:
         return unit
     return f"{unit}^2" if form == "{}^2" else f"{unit}/{time_unit}"

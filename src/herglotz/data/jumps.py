@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.csv_columns import Wanted
+from herglotz.data.gaps import complete
 from herglotz.data.trajectories import GAP, Trajectories
 from herglotz.data.units import in_degrees
 from herglotz.errors import InputError
@@ -46,7 +47,7 @@ def refuse_jumps(data: Trajectories, wanted: Wanted) -> None:
     """Raise where a coordinate that the user has not named moves in jumps alone: a fit of it would only fail later."""
     if wanted.coordinates is not None or not wanted.motion:
         return
-    found = [name for name in jumping(data) if wanted.before(name) is None]
+    found = [name for name in jumping(complete(data)) if wanted.before(name) is None]
     if not found:
         return
     inputs = ",".join([*(name for name, _ in data.input_labels), *found])

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from herglotz.data.column_roles import kind_of
 from herglotz.data.csv_columns import is_number, name_and_unit
+from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 from herglotz.least_squares import least_squares
@@ -99,7 +100,7 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
         return data
     _check(data, pairs)
     bodies: list[tuple[Pair, Tensor]] = []
-    angles, rows, notes = [], [], []
+    angles, rows, notes, whole = [], [], [], data.complete
     for pair, name in zip(pairs, _names(data, pairs), strict=True):
         body = _positions(data, pair, (pair.x, pair.y))
         centre, spec, where = _centre(data, pair, body, bodies)
@@ -109,7 +110,7 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
         refuse({f"{data.source or 'data'}: {at}; give another centre": bool((r == 0).any())})
         angles.append(torch.atan2(arm[:, 0], -arm[:, 1]))
         rows.append((name, POLAR, spec))
-        notes.append(_note(data, pair, name, where, r, angles[-1]))
+        notes.append(_note(data, pair, name, where, r[whole], angles[-1]))
         bodies.append((pair, body))
     return _with_angles(data, pairs, angles, rows, notes)
 
@@ -143,14 +144,15 @@ def _centre(
         names = [str(name) for name in pair.centre]
         return _positions(data, pair, names), pair.spec(names), ", ".join(names)
     found: list[tuple[float, Tensor, str, str]] = []
+    read = body[data.complete]
     if pair.centre is None or pair.again:
-        fixed = circle(body)
-        found.append((_criterion(body - fixed, 2), fixed, *_words(data, pair, fixed)))
+        fixed = circle(read)
+        found.append((_criterion(read - fixed, 2), fixed, *_words(data, pair, fixed)))
     if pair.centre is not None:
         given = body.new_tensor(pair.centre) * body.new_tensor(pair.signs)
-        found.append((_criterion(body - given, 0), given, *_words(data, pair, given)))
+        found.append((_criterion(read - given, 0), given, *_words(data, pair, given)))
     else:
-        found += [(_criterion(body - other, 0), other, pair.spec((one.x, one.y)), f"{one.x}, {one.y}")
+        found += [(_criterion((body - other)[data.complete], 0), other, pair.spec((one.x, one.y)), f"{one.x}, {one.y}")
                   for one, other in earlier]  # fmt: skip
     return min(found, key=lambda candidate: candidate[0])[1:]
 
@@ -203,12 +205,18 @@ def _with_angles(
     kept = [k for k, name in enumerate(data.names) if name in made or name not in of]
     labels = [(made[data.names[k]][0], "rad", True) if data.names[k] in made
               else (data.names[k], data.units[k], data.angles[k]) for k in kept]  # fmt: skip
+    observed = data.observed
+    if observed is not None:  # an angle is where all positions that it is made of are
+        parts = {name: [data.names.index(x) for x in _pair(spec).columns] for name, _, spec in rows}
+        places = [parts.get(label[0], [k]) for k, label in zip(kept, labels, strict=True)]
+        observed = torch.stack([observed[:, own].prod(1) for own in places], 1)
     q = torch.stack([made[data.names[k]][1] if data.names[k] in made else data.q[:, k] for k in kept], 1)
     columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
     names, units, turning = zip(*labels, strict=True)
     return replace(
         data,
         q=q,
+        observed=observed,
         v=None,
         names=names,
         units=units,
@@ -257,10 +265,10 @@ def _variance(arm: Tensor) -> float:
 
 def with_hints(data: Trajectories) -> Trajectories:
     """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
-    notes, earlier = [], []
+    notes, earlier, read = [], [], complete(data)
     for x, y in _pairs_by_name(data):
         pair = Pair(x, y)
-        body = _positions(data, pair, (x, y))[:: -(-data.samples // MOST)]
+        body = _positions(read, pair, (x, y))[:: -(-read.samples // MOST)]
         fixed = circle(body)
         centres = [(fixed, _words(data, pair, fixed)[1]), *((other, f"{one.x}, {one.y}") for one, other in earlier)]
         earlier.append((pair, body))

@@ -1,6 +1,6 @@
 """Columns of one table that were sampled at different times: rows joined, inputs between their samples.
 
-A sample of the motion is a row in which every coordinate is known. An input is needed between samples, too: it is held
+A sample of the motion is a row in which a coordinate is known. An input is needed between samples, too: it is held
 from its sample to its next one, or goes there in a straight line, and a step of the motion has its mean.
 """
 
@@ -13,12 +13,11 @@ import numpy as np
 import torch
 
 from herglotz.data.csv_columns import Columns
-from herglotz.data.holds import lagrange
+from herglotz.data.missing import NEAR, between
 from herglotz.data.trajectories import Trajectories
 
 MIN_STEPS = 20  # of an input that is told from one whose steps fell two numbers of rows apart by chance
 OFTEN = 0.1  # of these numbers of rows each: a row that is missing here and there is no clock
-NEAR = 4  # samples of a column that a value between them is made of: a cubic
 
 
 class Recording(NamedTuple):
@@ -77,7 +76,7 @@ def _together(one: Recording, q: slice) -> Recording:
     """The recording with the values of all coordinates in one row.
 
     Where most samples of the coordinate with the fewest stand in rows without another one, the others are interpolated
-    at its times, by cubics through their samples beside.
+    at its times, by cubics through their samples beside. Rows of the others stay, and lack the rarest one.
     """
     known = ~np.isnan(one.values[:, q])
     counts = known.sum(0)
@@ -89,15 +88,14 @@ def _together(one: Recording, q: slice) -> Recording:
     for k in range(known.shape[1]):
         if k != base:
             own = known[:, k]
-            values[rows, q.start + k] = _between(values[own, 0], values[own, q.start + k], values[rows, 0])
+            values[rows, q.start + k] = _between(values[own, 0], one.values[own, q.start + k], values[rows, 0])
     return Recording(one.label, one.at, values)
 
 
 def _between(t: np.ndarray, x: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Values of cubics through the nearest four samples (t, x) at other times; NaN outside of the samples."""
-    first = np.clip(np.searchsorted(t, at) - NEAR // 2, 0, len(t) - NEAR)[:, None] + np.arange(NEAR)
-    weights = lagrange(torch.from_numpy(t[first] - at[:, None])).numpy()
-    return np.where((at >= t[0]) & (at <= t[-1]), (weights * x[first]).sum(1), np.nan)
+    values = between(*map(torch.from_numpy, (t, x, at))).numpy()
+    return np.where((at >= t[0]) & (at <= t[-1]), values, np.nan)
 
 
 def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]:

@@ -71,7 +71,7 @@ def load(
     angles: Names | bool | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
     degrees: Names | None = None,  # coordinates in degrees whose header does not say so; () for none
     polar: Names | None = None,  # pairs of positions, "x,y", that become one angle each; () for none
-    input_terms: Names | None = None,  # squares, sizes and rates of inputs that act as well; () for none
+    input_terms: Names | None = None,  # squares, sizes, rates … of inputs that act as well; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
@@ -96,7 +96,8 @@ def load(
         ["x1,y1", "x2,y2"] of a chain, the second body on the first; "x,y,X,Y" with the centre in numbers or columns;
         "x,-y" where y grows downwards. Left out: as in `like`; () for none.
     input_terms
-        Terms of inputs that act beside them (`herglotz.data.input_terms`): "V^2", "|V|", "V'". Left out: as in `like`.
+        Terms of inputs that act beside them (`herglotz.data.input_terms`): "V^2", "|V|", "V'", "sat(V/2)", "tanh(V/2)".
+        Left out: as in `like`.
     unwrap
         Make angles continuous.
     show

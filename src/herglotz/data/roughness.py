@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from herglotz.data.checks import offsets_of
+from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
 
 SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
@@ -25,17 +29,29 @@ def roughness(data: Trajectories, degree: int = DEGREE) -> float:
 
 
 def _residuals(data: Trajectories, degree: int) -> Tensor:
-    """`roughness` of every coordinate, (n,)."""
+    """`roughness` of every coordinate, (n,): each by its own readings where some are missing."""
+    q = data.q / data.balance
+    if data.observed is None:
+        return _of_readings(data.t, q, data.lengths, degree)
+    each = []
+    for x, known in zip(q.T, (data.observed > 0).T, strict=True):
+        lengths = [int(own.sum()) for own in known.split(data.lengths)]
+        each.append(_of_readings(data.t[known], x[known][:, None], lengths, degree))
+    return torch.cat(each)
+
+
+def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> Tensor:
+    """Of each column of q (N, k), read at times (N,) of trajectories of these lengths, (k,)."""
     firsts = [
         torch.arange(first, first + length - SAMPLES + 1)
-        for first, length in zip(data.offsets, data.lengths, strict=True)
+        for first, length in zip(offsets_of(tuple(lengths)), lengths, strict=True)
         if length >= SAMPLES
     ]
     if not firsts:
-        return torch.full((data.dof,), torch.inf, dtype=torch.float64)
+        return torch.full((q.shape[1],), torch.inf, dtype=torch.float64)
     rows = torch.cat(firsts)
-    rows = rows[:: -(-len(rows) // MOST)].to(data.t.device)[:, None] + torch.arange(SAMPLES, device=data.t.device)
-    t, q = data.t[rows].double().cpu(), (data.q / data.balance)[rows].double().cpu()
+    rows = rows[:: -(-len(rows) // MOST)].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device)
+    t, q = t[rows].double().cpu(), q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
     Q = torch.linalg.qr(torch.stack([x**k for k in range(degree + 1)], -1)).Q
     r = q - Q @ (Q.mT @ q)
@@ -77,9 +93,10 @@ def precisions(data: Trajectories) -> Tensor:
 def part_of(data: Trajectories, most: int) -> Trajectories:
     """About `most` samples of more than twice as many: every second, fourth … one while these follow the motion.
 
-    What is left over is cut to the runs of samples that move most. The data themselves where they have no more.
+    What is left over is cut to the runs of samples that move most. The data themselves where they have no more. Samples
+    that lack positions are the first to go: every m-th row may be none of those that a slower sensor has read.
     """
-    few = data
+    few = data if data.samples < 2 * most else complete(data)
     while few.samples >= 2 * most and min(few.lengths) >= 2 * most / len(few) and not coarse(half := few.thinned(2)):
         few = half
     liveliest = few.liveliest(most)

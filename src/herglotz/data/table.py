@@ -15,7 +15,7 @@ import torch
 from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.clock import without_repeats
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
-from herglotz.data.gaps import without
+from herglotz.data.gaps import with_missing
 from herglotz.data.rates import Recording, completed, in_order
 from herglotz.data.rows import Unusable, group_rows, quote
 from herglotz.data.trajectories import Trajectories
@@ -36,8 +36,9 @@ def from_table(
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
-    Rows in which a coordinate is missing are left out, and a note says how many: the step over them is longer, with the
-    mean of its inputs, which go on between the rows that have them (`herglotz.data.rates`). A trajectory that is too
+    A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). One without any is left out,
+    and a note says how many are: the step over them is longer, with the mean of its inputs, which go on between the
+    rows that have them (`herglotz.data.rates`). A trajectory that is too
     short or whose time does not increase is left out with a warning, as long as most can be used. Raise InputError if
     they cannot.
     """
@@ -54,13 +55,13 @@ def from_table(
     whole, gone = _usable(path, whole, lambda one: _check_enough(path, columns, one))
     found = said(_trajectories(path, columns, whole))
     found = replace(found, hold=hold, notes=(*found.notes, *notes, *left, *made, *gone))
-    missing = np.concatenate([np.isnan(one.values).any(1) for one in whole])
+    missing = np.isnan(np.concatenate([one.values for one in whole]))
     if not missing.any():
         return found
-    one = next(one for one in whole if np.isnan(one.values).any())
-    row, column = np.argwhere(np.isnan(one.values))[0]
-    first = f"row {one.at[row]}, column '{columns.names[columns.numeric[column]]}'"
-    return without(found, torch.from_numpy(missing), first)
+    rows, q = np.concatenate([one.at for one in whole]), slice(1, 1 + len(columns.q))
+    place = lambda k: f"row {rows[k]}, column '{columns.names[columns.numeric[missing[k].argmax()]]}'"  # noqa: E731
+    lacking = torch.from_numpy(np.delete(missing, q, 1).any(1))
+    return with_missing(found, torch.from_numpy(~missing[:, q]), place, lacking)
 
 
 def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:

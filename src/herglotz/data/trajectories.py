@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
-from herglotz.data.column_table import INPUT_TERM, column_table
+from herglotz.data.column_table import INPUT_TERM, column_table, summary_of
 from herglotz.data.holds import Arrival, check_arrival, held
+from herglotz.data.missing import interpolated, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
 from herglotz.errors import InputError, refuse
@@ -38,6 +39,8 @@ class Trajectories:
     s, p, u, v
         (N,) action and (N, n) momentum, as in `herglotz.State`, (N, m) control input and (N, n) velocity of a model, in
         units of the recording, where they are known.
+    observed
+        (N, n) dimensionless weight of each position in a fit: 0 where none was read and q interpolates; None: 1.
     time_unit, source, columns, notes
         Of t; origin, for messages; name, role and unit of each column that was read, and what else was made of them.
     hold, delay, lag
@@ -67,6 +70,7 @@ class Trajectories:
     columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
     notes: tuple[str, ...] = ()  # on reading the table: its separators, rows left out
     v: Tensor | None = None  # (N, n) velocity, of a model: recorded ones are not read
+    observed: Tensor | None = None  # (N, n) 0 where a position is missing, else 1; None: none is
 
     def __post_init__(self) -> None:
         check_arrival(self.source or "trajectories", self.arrival)
@@ -86,6 +90,7 @@ class Trajectories:
         p: Tensor | np.ndarray | None = None,
         u: Tensor | np.ndarray | None = None,
         v: Tensor | np.ndarray | None = None,
+        observed: Tensor | np.ndarray | None = None,
         time_unit: str = "s",
         source: str = "",
         hold: str = "",
@@ -95,10 +100,11 @@ class Trajectories:
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
 
-        Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v` and `u` of shape (N,) become (N, 1).
+        Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v`, `u` and `observed` (N,) become (N, 1).
         Left out: one trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
-        own_p, own_u, own_v = (as_columns(name, x) for name, x in (("p", p), ("u", u), ("v", v)))
+        columns_of = (("p", p), ("u", u), ("v", v), ("observed", observed))
+        own_p, own_u, own_v, own = (as_columns(name, x) for name, x in columns_of)
         t, q = as_tensor("t", t), as_tensor("q", q)
         q = q[:, None] if q.ndim == 1 else q
         counts = lengths.tolist() if isinstance(lengths, (Tensor, np.ndarray)) else lengths
@@ -108,7 +114,7 @@ class Trajectories:
             t, q, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
             tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
             None if s is None else as_tensor("s", s), own_p, own_u, time_unit, source, hold, delay, lag, columns,
-            v=own_v,
+            v=own_v, observed=own,
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -146,6 +152,11 @@ class Trajectories:
     def trajectory(self) -> Tensor:
         """Trajectory of every sample, (N,) long."""
         return torch.repeat_interleave(torch.arange(len(self)), torch.tensor(self.lengths)).to(self.t.device)
+
+    @property
+    def complete(self) -> Tensor:
+        """Whether all positions of a sample were read, (N,) bool."""
+        return torch.ones_like(self.t, dtype=torch.bool) if self.observed is None else (self.observed > 0).all(1)
 
     @property
     def degrees(self) -> tuple[str, ...]:
@@ -234,12 +245,17 @@ class Trajectories:
     def thinned(self, every: int) -> Trajectories:
         """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the steps they then span.
 
+        Where positions are missing, samples that have all of them are counted, and the first of each trajectory.
+
         Raises
         ------
         InputError
             If `every` is not a whole number >= 1, or a trajectory keeps fewer than three samples.
         """
-        return self.keep(every_mth(self.lengths, every).to(self.t.device))
+        kept = self.complete
+        kept[list(self.offsets)] = True
+        counts = [int(own.sum()) for own in kept.split(self.lengths)]
+        return self.keep(kept.masked_scatter(kept, every_mth(counts, every).to(kept.device)))
 
     def keep(self, kept: Tensor) -> Trajectories:
         """Return these samples alone, (N,) bool; steps become longer where samples between them are left out.
@@ -270,6 +286,8 @@ class Trajectories:
     def cat(cls, sets: Iterable[Trajectories]) -> Trajectories:
         """Join sets of the same coordinates, units and optional arrays."""
         sets = list(sets)
+        if any(one.observed is not None for one in sets):
+            sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
         check_alike(sets)
         present = [name for name in ARRAYS if getattr(sets[0], name) is not None]
         columns = {name: torch.cat([getattr(one, name) for one in sets]) for name in present}
@@ -291,7 +309,9 @@ class Trajectories:
         turning = torch.tensor(self.angles, device=self.q.device)
         if not turning.any():
             return self
-        return replace(self, q=unwrap(self.q, self.trajectory, turning))
+        q = self.q if self.observed is None else last_read(self.q, self.observed > 0, self.trajectory)
+        q = unwrap(q, self.trajectory, turning)
+        return replace(self, q=q if self.observed is None else interpolated(self.t, q, self.observed > 0, self.lengths))
 
     def with_angles(self, angles: str | Iterable[str]) -> Trajectories:
         """Return the set with exactly these coordinates marked as angles; a unit "1" among them becomes "rad"."""
@@ -316,18 +336,7 @@ class Trajectories:
 
     def summary(self) -> str:
         """Return one line for people."""
-        coordinates = ", ".join(f"{name} [{unit}]" for name, unit in zip(self.names, self.units, strict=True))
-        known = "".join(f", {name}" for name in "sp" if getattr(self, name) is not None)
-        known += "".join(f", input {name}" + (f" [{unit}]" if unit else "") for name, unit in self.input_labels)
-        plural, unit = "y" if len(self) == 1 else "ies", "" if self.time_unit == "1" else f" {self.time_unit}"
-        gaps = f", {self.gaps} gap{'' if self.gaps == 1 else 's'}" if self.gaps else ""
-        h = self.steps().h
-        irregular = f"irregular steps, {float(h.min()):.3g} to {float(h.max()):.3g}{unit}"
-        step = irregular if self.irregular else f"step {self.typical_step:.4g}{unit}{gaps}"
-        return (
-            f"{self.source or 'trajectories'}: {len(self)} trajector{plural}, {self.samples} samples of "
-            f"{coordinates}{known}; {step}"
-        )
+        return summary_of(self)
 
     def table(self) -> str:
         """Return what every column of the table that was read was taken for, a line each, for people."""

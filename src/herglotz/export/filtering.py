@@ -13,6 +13,7 @@ from torch import Tensor
 
 from herglotz.codegen.c_compiler import compiler
 from herglotz.data import Trajectories
+from herglotz.data.gaps import complete
 from herglotz.errors import InputError
 from herglotz.export.c_compile import compile_c
 from herglotz.export.c_header import MAX_DERIVATIVES
@@ -71,7 +72,7 @@ def filter(
     Returns
     -------
     Filtered
-        States, velocities and their covariance at every sample, in the units of the data.
+        States, velocities and their covariance at every sample whose positions were all read, in the units of the data.
 
     Raises
     ------
@@ -81,7 +82,7 @@ def filter(
     """
     chosen = dict(parameters or {})
     model = copy.deepcopy(run.model).double()
-    data = of_the_run(run, recording).unwrapped().to(dtype=torch.float64, device="cpu")
+    data = complete(of_the_run(run, recording)).unwrapped().to(dtype=torch.float64, device="cpu")
     wander = tuple(each for _, each in chosen.values())
     kalman = KalmanFilter(model, noise or noise_of(run, wander), list(chosen), stepper=_compiled(model, list(chosen)))
     if len(kalman.names) != len(chosen):

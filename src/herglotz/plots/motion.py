@@ -34,7 +34,7 @@ def plot_data(data: Trajectories) -> Figure:
     with styled():
         figure = new_figure(*_size(len(cells), 2.4), data.summary())
         for ax, (b, i) in zip(_axes(figure, len(cells), 1), cells, strict=True):
-            t, q = _series(data, data.q, b, i)
+            t, q = _readings(data, b, i)
             t_open, q_open = _broken(t, q, data)
             ax[0].plot(t_open, q_open, color=MODEL, lw=0.8, alpha=0.6)
             ax[0].plot(t, q, ".", color=INK, ms=3)
@@ -145,7 +145,7 @@ def momentum_unit(run: Run) -> str:
 
 def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
     data, unit, count = motion.data, motion.data.units[i], motion.counts[b]
-    t, q = _series(data, data.q, b, i)
+    t, q = _readings(data, b, i)
     _, model = _series(data, motion.model, b, i)
     boundary = t[0] if count == 0 else t[-1] if count >= len(t) else 0.5 * (t[count - 1] + t[count])
     if count < len(t):
@@ -181,8 +181,8 @@ def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, un
     bottom.set_ylim(-1.25 * (reach or 1.0), 1.9 * (reach or 1.0))  # room for the RMS above the points
     for span, color, where in ((slice(0, count), MODEL, 0.0), (slice(count, None), UNSEEN, split)):
         part = residual[span]
-        if len(part) and (where or split == 0.0 or split > ROOM_FOR_RMS):
-            text = f"RMS {size(math.sqrt(float(np.mean(part**2))), unit)}"
+        if np.isfinite(part).any() and (where or split == 0.0 or split > ROOM_FOR_RMS):
+            text = f"RMS {size(math.sqrt(float(np.nanmean(part**2))), unit)}"
             place = {"xycoords": bottom.get_xaxis_transform(), "xytext": (5, -2), "va": "top"}
             label(bottom, t[0] + where * (t[-1] - t[0]), 1.0, text, color, **place)
 
@@ -211,6 +211,12 @@ def _axes(figure: Figure, cells: int, rows: int) -> list[list[Axes]]:
 def _series(data: Trajectories, values: torch.Tensor, b: int, i: int) -> tuple[np.ndarray, np.ndarray]:
     rows = slice(data.offsets[b], data.offsets[b] + data.lengths[b])
     return data.t[rows].double().cpu().numpy(), values[rows, i].detach().double().cpu().numpy()
+
+
+def _readings(data: Trajectories, b: int, i: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times of a trajectory, and what was read of one coordinate; NaN where nothing was."""
+    t, q = _series(data, data.q, b, i)
+    return t, q if data.observed is None else np.where(_series(data, data.observed, b, i)[1] > 0, q, np.nan)
 
 
 def _broken(t: np.ndarray, q: np.ndarray, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:

@@ -49,6 +49,10 @@ def _terms(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
     return f"a model of named terms follows whole trajectories to {miss}"
 
 
+def _missing(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    return None if seen.kept.observed is None else "some positions are missing, which single steps cannot leave out"
+
+
 def _structured(seen: Look, config: FitConfig) -> str | None:
     return seen.structure if config.objective == "auto" != seen.settings.objective else None
 
@@ -83,6 +87,7 @@ RULES = (
     Rule("Did the user name the objective?", "as named", _named),
     Rule("Can friction hold a joint?", "trajectory", _sticking),
     Rule("Do named terms follow whole trajectories?", "trajectory", _terms),
+    Rule("Are positions missing?", "trajectory", _missing),
     Rule("Does a dictionary of features explain the steps?", "as found", _structured),
     Rule("Does the baseline's equation of motion explain the steps?", "residual", _explained),
     Rule("Does a flexible model miss single steps?", "trajectory", _noisy),

@@ -95,7 +95,7 @@ class FitConfig:
         (`herglotz.training.sensor_zeros`). The search for terms is then repeated. None: where named terms miss whole
         trajectories by more than the noise. True: also where they do not. False: nowhere.
     find_input_terms
-        Inputs may act by their square, their size or their rate as well (`herglotz.data.input_terms`): these are tried
+        Inputs may act by their square, size or rate as well, or saturate (`herglotz.data.input_terms`): this is tried
         where named terms miss the data by more than the noise.
     supervision
         What the one-step objective is fitted to: "q" (positions), "qs" (s beside them) or "qps" (momenta as well),

@@ -74,10 +74,11 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
 
 
 def unseen_errors(run: Run) -> list[Tensor]:
-    """Errors of the free run over the unseen samples of each trajectory, (K, n); K is 0 where nothing was held out."""
-    error = run.prediction.detach() - run.data.unwrapped().q
+    """Errors of the free run over unseen complete samples of each trajectory, (K, n); K is 0 if none is held out."""
+    error, complete = run.prediction.detach() - run.data.unwrapped().q, run.data.complete
     rows = zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
-    return [error[first + trained : first + length] for first, length, trained in rows]
+    spans = (slice(first + trained, first + length) for first, length, trained in rows)
+    return [error[span][complete[span]] for span in spans]
 
 
 def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
@@ -103,6 +104,7 @@ def _errors(
     error, unit = states.q - data.q, fitted.notes.get("unit_of_s")
     used, beyond = training.clone(), ~training
     used[training] = ~dropped
+    used, beyond = used & data.complete, beyond & data.complete
     if robust:
         beyond &= ~spikes(data)
     unseen = seen.unseen or data
@@ -116,13 +118,13 @@ def _errors(
     unmoved = triples.q2 - triples.q1 - ratio * (triples.q1 - triples.q0)
     stepped = len(triples) and base.model_step == base.max_step  # a recorded step is one of the model's
     rate = getattr(fitted.model.damping, "rate", None)
-    free = None if seen.unseen is None else error[beyond]
+    free = error[beyond] if seen.unseen is not None and bool(beyond.any()) else None
     numbers = {
         "one_step_rms": _rms(problem.residuals(x)) if stepped else None,
         "one_step_rms_constant_velocity": _rms(unmoved) if len(triples) else None,
         "train_rms": _rms(error[used]),
         "outliers": int(dropped.sum()),
-        "outliers_unseen": int((~training).sum() - beyond.sum()),
+        "outliers_unseen": int((~training & data.complete).sum() - beyond.sum()),
         "extrapolation_rms": None if free is None else _rms(free),
         "gain_over_mean": None if free is None else _gain(free, (data.q - data.q[used].mean(0))[beyond]),
         "spread": _rms(data.q - data.q.mean(0)),

@@ -14,6 +14,7 @@ from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
 from herglotz.data.files import remove_leftovers
+from herglotz.data.gaps import complete
 from herglotz.data.holds import Arrival
 from herglotz.data.input_terms import with_input_terms
 from herglotz.data.lock import locked
@@ -111,6 +112,7 @@ def fit(
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
+    data = weighed(data, config.objective if plan is None else plan.objective, config.supervision)
     read = data
     if model is not None:
         return _fit_own(data, model, config, progress, reading, plan or out or resume or tensorboard)
@@ -131,6 +133,11 @@ def fit(
         if log is not None:
             log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run
+
+
+def weighed(data: Trajectories, objective: str, supervision: str) -> Trajectories:
+    """The data with what an objective can weigh: fits of whole trajectories every position, others whole samples."""
+    return data if supervision == "q" and objective in ("auto", "trajectory") else complete(data)
 
 
 def _fit_own(

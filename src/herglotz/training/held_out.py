@@ -35,6 +35,7 @@ class HeldOut:
         waves: Tensor | None = None,  # (P,) weights of the prior of the waves of functions; 0 of other numbers
     ):
         self.block, self.sigma, P = blocks(problem.data).to(theta.device), problem.sigma, problem.P
+        self.complete = problem.data.complete
         zero = torch.zeros_like(theta)
         self.leaving, self.waves = (zero if x is None else x for x in (leaving, waves))
         r = problem.misfit(path) / problem.sigma

@@ -76,7 +76,7 @@ class Prediction:
     @property
     def rms_per_coordinate(self) -> tuple[float, ...] | None:
         """RMS error of each coordinate over the samples that the free run reached; None where it reached none."""
-        error = (self.states.q - self.data.q)[self.free]
+        error = (self.states.q - self.data.q)[self.free & self.data.complete]
         error = error[torch.isfinite(error).all(-1)]
         return tuple(error.square().mean(0).sqrt().tolist()) if len(error) else None
 
@@ -94,7 +94,8 @@ class Prediction:
         if not any(counts):
             return None
         v = None if self.v is None else self.v.nan_to_num()
-        whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None, v=v)
+        q, p = self.states.q.nan_to_num(), self.states.p.nan_to_num()
+        whole = replace(self.data, q=q, p=p, s=None, v=v, observed=None)
         return whole.rows(leading_rows(self.data.lengths, counts), tuple(filter(None, counts)))
 
     def metrics(self) -> dict[str, Any]:
@@ -216,10 +217,11 @@ def of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
     data = with_waves(data, run.config.frequencies)
     data = data if data.u is None else with_input_terms(data, input_terms_of(wanted.columns))
     u = data.u if run.model.inputs else None
-    p, v = (None if x is None else x[:, at] for x in (data.p, data.v))
+    p, v, observed = (None if x is None else x[:, at] for x in (data.p, data.v, data.observed))
     called = {data.names[i]: name for i, name in zip(at, wanted.names, strict=True)}
     data = replace(
-        data, q=data.q[:, at], p=p, v=v, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
+        data, q=data.q[:, at], p=p, v=v, u=u, observed=observed, names=wanted.names, units=wanted.units,
+        angles=wanted.angles,
         columns=tuple((called.get(name, name), role, unit) for name, role, unit in data.columns),
     )  # fmt: skip
     return acting(data, run.arrival)  # other recordings that say nothing are like those of the fit

@@ -61,7 +61,8 @@ def scores(
 
     Misfits below `floor`, in units of q over the balance, are rounding.
     """
-    losses, rms = _losses(model.residuals(sets), model.block, floor)
+    block = torch.where(model.complete, model.block, -1)
+    losses, rms = _losses(model.residuals(sets), block, floor)
     rest = zip(losses, model.told(sets).sum(1).tolist(), choices, rms.tolist(), strict=True)
     return [Score(own, count, numbers, chosen, error) for own, numbers, chosen, error in rest]
 
@@ -79,7 +80,7 @@ def fitted_score(
 
 def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float) -> Score:
     """The score over the samples that a fit has not used, which a free run over whole trajectories foretells."""
-    unseen = ~problem.used
+    unseen = ~problem.used & problem.data.complete
     block = torch.where(unseen, torch.cumsum(unseen, 0) - 1, 0) * BLOCKS // max(1, int(unseen.sum()))
     block = torch.where(unseen, block, -1)
     (losses,), (rms,) = _losses(problem.misfit(path)[None], block, floor)

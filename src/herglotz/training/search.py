@@ -14,17 +14,18 @@ from functools import cached_property
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.input_terms import all_input_terms, with_input_terms
+from herglotz.data.input_terms import with_input_terms
 from herglotz.data.roughness import part_of
 from herglotz.data.sensors import measured
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
+from herglotz.training.acting_inputs import asked_terms
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import DRY
-from herglotz.training.offers import INPUTS, standing
+from herglotz.training.offers import standing
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import differing_zeros
@@ -296,17 +297,7 @@ class Search:
 
     def input_terms(self, trial: Trial) -> tuple[str, ...]:
         """The terms of the inputs that a model with all of them among its offers has taken, if it is better."""
-        every = all_input_terms(self.data) if self.config.find_input_terms else ()
-        if trial.at_the_noise or not every:
-            return ()
-        other = self.driven_by(every)
-        fitter = other.fitter(Variant(self.order))
-        found = other.climbed(fitter, fitter.simple, {})
-        if found is None or not found.replaces(trial):
-            return ()
-        gains, m = [name for name in found.taken if name.startswith(INPUTS)], len(other.data.input_labels)
-        columns, recorded = {int(name.partition("[")[2].rstrip("]")) % m for name in gains}, m - len(every)
-        return tuple(every[k - recorded] for k in sorted(columns) if k >= recorded)
+        return asked_terms(self, trial) if self.config.find_input_terms and not trial.at_the_noise else ()
 
     def braking(self, trial: Trial) -> Trial:
         """With a load in the place of dry friction that pushes, which would create energy, or with neither.

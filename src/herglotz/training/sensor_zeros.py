@@ -77,7 +77,7 @@ def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
     _, A, _ = target.normal_equations(result.x)
     A = dense(A)
     assert problem.path is not None
-    rms = _rms(problem.misfit(problem.path))
+    rms = _rms(problem.misfit(problem.path)[problem.data.complete])
     variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-target.count :] * (rms / problem.sigma) ** 2
     return FoundZeros(result.x[-target.count :], variance.clamp_min(0).sqrt(), rms)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
@@ -46,8 +47,8 @@ class TrajectoryFit:
 
     @property
     def misfit(self) -> Tensor:
-        """Residuals of the data that are used, (N', n), in units of q."""
-        return self.problem.misfit(self.path)[self.problem.used]
+        """Residuals of the complete samples that are used, (N', n), in units of q."""
+        return self.problem.misfit(self.path)[self.problem.used & self.problem.data.complete]
 
     @property
     def noise(self) -> float:
@@ -187,7 +188,8 @@ class SegmentStages:
         A heavy-tailed loss finds outliers, but fits what is left less well than least squares do (reweighted least
         squares, Rousseeuw & Leroy 1987). A push breaks a joint, and no sample that is left out can mend it.
         """
-        out = far_out(trial.misfit)
+        out = torch.zeros_like(trial.problem.used)
+        out[trial.problem.data.complete] = far_out(trial.misfit)
         if float(out.double().mean()) > FEW:
             return None
         rest = self.fit(self.lengths[0], trial.noise, None, trial, ~out)

@@ -89,7 +89,7 @@ class Trial:
     @cached_property
     def rms(self) -> float:
         """Misfit of the data, in units of q over the balance."""
-        r = self.problem.misfit(self.path)
+        r = self.problem.misfit(self.path)[self.problem.data.complete]
         return scale_of(r) if self.problem.freedom else float(r.square().mean().sqrt())
 
     @property
@@ -133,7 +133,7 @@ class Trial:
     @cached_property
     def score(self) -> Score:
         """Its loss over held-out blocks."""
-        count, choices = self.problem.data.q.numel(), [len(self.taken)]
+        count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
         (found,) = scores(self._own, [range(self.problem.P)], choices, count, self.fitter.floor)
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
         return found
@@ -142,11 +142,12 @@ class Trial:
         """Whether this richer model replaces a simpler one."""
         return self.gain(simple) > 0
 
-    def gain(self, simple: Trial) -> float:
-        """By how much it does; infinite where it follows longer segments."""
+    def gain(self, simple: Trial, more: int = 0) -> float:
+        """By how much it does, with so many numbers beside its own; infinite where it follows longer segments."""
         if self.length != simple.length:
             return math.inf if self.length > simple.length else -math.inf
-        return self.score.gain(simple.score, max(self.fitter.offered, simple.fitter.offered))
+        offered = max(self.fitter.offered, simple.fitter.offered)
+        return replace(self.score, zeros=more).gain(simple.score, offered)
 
     def fits_better(self, simple: Trial, zeros: int = 0) -> bool:
         """Whether it replaces a model that has the same offers, with so many zeros of sensors beside its numbers."""

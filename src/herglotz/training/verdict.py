@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -90,7 +90,7 @@ def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
     if found is None:
         return ""
     grid = found.problem.grid
-    return reason_of(data, found.misfit, grid.node // (grid.longest + 1))
+    return reason_of(data, found.problem.misfit(found.path), grid.node // (grid.longest + 1))
 
 
 def _gross(windows: Tensor, data: Trajectories) -> Tensor:
@@ -187,8 +187,10 @@ def judged(
     kept, states = task.data.keep(used), fitted.states[~seen.spikes]
     windows = window_errors(task, fitted, states[used], kept)
     out = _gross(windows, kept) if fitted.notes.get("robust") else torch.zeros_like(kept.t, dtype=torch.bool)
-    kept, windows = kept.keep(~out), windows[~out]
-    unseen = None if seen.unseen is None else unseen_window_errors(task, fitted, seen.unseen)
+    out &= kept.complete
+    kept, windows = kept.keep(~out), windows[~out & kept.complete]
+    held_out = seen.unseen is not None and bool(seen.unseen.complete.any())
+    unseen = unseen_window_errors(task, fitted, cast(Trajectories, seen.unseen)) if held_out else None
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)
     scaled = replace(kept, q=kept.q / unit)
     if unseen is not None and free is not None and _rms(unseen / unit) > _rms(free / unit):

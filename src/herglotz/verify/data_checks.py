@@ -79,9 +79,10 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
 
 
 def _without_spikes(run: Run) -> Run:
-    """Return the run without the samples that are gross errors."""
+    """Return the run without the samples that are gross errors, or not complete."""
     bad = spikes(run.data.unwrapped())
-    if run.config.robust == "off" or not bool(bad.any()):
+    bad = ~run.data.complete | (bad if run.config.robust != "off" else torch.zeros_like(bad))
+    if not bool(bad.any()):
         return run
     kept = leading(run.data.lengths, run.train_lengths).to(bad.device) & ~bad
     trained = tuple(int(own.sum()) for own in kept.split(list(run.data.lengths)))

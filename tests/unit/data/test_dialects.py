@@ -73,21 +73,23 @@ def test_tables_with_other_endings(tmp_path, name):  # fails if only .csv is rea
 
 
 def test_units_in_the_letters_of_windows(tmp_path):
-    # fails if the ° of a spreadsheet that does not write UTF-8 is refused, or any other such byte is let in
+    # fails if the ° or ö of a drive that does not write UTF-8 is refused, or any other such byte is let in
     text = table(";", ",", ("t (µs)", "Winkel (°)"))
+    assert load(written(tmp_path, "t,Länge\n0,1\n1,2\n2,3\n", encoding="cp1252")).names == ("Länge",)
     data = load(written(tmp_path, text, encoding="cp1252"))
     assert data.digest() == load(written(tmp_path, text)).digest()
     assert (data.degrees, data.time_unit) == (("Winkel",), "s")
-    with pytest.raises(InputError, match=r"row 1: not UTF-8 text \(byte 0xe4\)"):
-        load(written(tmp_path, "t,Länge\n0,1\n1,2\n2,3\n", encoding="cp1252"))
+    with pytest.raises(InputError, match=r"row 1: not UTF-8 text \(byte 0xb3\)"):
+        load(written(tmp_path, "t,długość\n0,1\n1,2\n2,3\n", encoding="cp1250"))
 
 
 @pytest.mark.parametrize("gap", ["", "nan", "NaN", "NA", "null", "#N/A"])
 def test_rows_without_a_value_are_left_out(tmp_path, gap):
     # fails if a missing sample stops the reading, becomes a number, or goes without a word
-    data = load(written(tmp_path, f"t,x,y\n0,{gap},0\n1,1,1\n2,2,2\n3,3,{gap}\n4,4,4\n5,5,{gap}\n"))
+    data = load(written(tmp_path, f"t,x,y\n0,{gap},0\n1,1,1\n2,2,2\n3,{gap},{gap}\n4,4,4\n5,5,{gap}\n"))
     assert data.t.tolist() == [1, 2, 4]
     assert data.q.tolist() == [[1, 1], [2, 2], [4, 4]]
+    assert data.observed is None
     assert data.notes == ("3 rows are left out, without a value: the first is row 2, column 'x'",)
 
 

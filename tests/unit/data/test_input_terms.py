@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, as_trajectories, load
-from herglotz.data.input_terms import all_input_terms, input_terms_of, with_input_terms
+from herglotz.data.input_terms import all_input_terms, input_terms_of, saturation, with_input_terms
 from herglotz.data.readers import save
 from herglotz.errors import InputError
 
@@ -68,10 +68,20 @@ def test_arrays_have_terms_too(tmp_path):
     assert torch.equal(again.u, data.u)  # pyright: ignore
 
 
-@pytest.mark.parametrize("term", ["volts^3", "speed'", "volts"])
+def test_inputs_saturate_at_a_level():
+    # fails if a level is taken for another number, or a saturation is not the same in another recording
+    data = Trajectories.of(T, T.cos(), u=2 * T.sin())
+    found = with_input_terms(data, ["sat(u/0.5)", "tanh(u/2e-1)"])
+    assert found.u is not None
+    assert torch.allclose(found.u[:, 1], (4 * T.sin()).clamp(-1, 1))
+    assert torch.allclose(found.u[:, 2], torch.tanh(10 * T.sin()))
+    assert found.input_labels == (("u", ""), ("sat(u/0.5)", ""), ("tanh(u/2e-1)", ""))
+    assert saturation("sat(a/b/0.5)") == ("sat", 0.5, "a/b")
+
+
+@pytest.mark.parametrize("term", ["volts^3", "speed'", "volts", "sat(volts)", "sat(volts/0)", "tanh(speed/2)"])
 def test_a_term_of_no_input_is_refused(tmp_path, term):
     # fails if a word that is misspelt drops a term silently
-    with pytest.raises(
-        InputError, match=r"is no term of an input; write x\^2, \|x\| or x' of an input x; the inputs are"
-    ):
+    forms = r"x\^2, \|x\|, x', sat\(x/2\) or tanh\(x/2\) of an input x, 2 being its level"
+    with pytest.raises(InputError, match=rf"is no term of an input; write {forms} > 0; the inputs are"):
         load(recording(tmp_path), inputs=["volts", "base"], input_terms=[term], show=False)

@@ -124,19 +124,29 @@ def test_coordinates_with_clocks_of_their_own(tmp_path, capsys):
     fine = np.arange(150) * 0.031 + 0.002
     both = union((T, X, None), (fine, None, np.cos(2 * fine)))
     data = load(written(tmp_path, both[np.argsort(both[:, 0])], "t[s],x[m],y[m]"))
-    assert (data.t.tolist(), data.q[:, 0].tolist()) == (T[1:].tolist(), X[1:].tolist())  # y begins behind the first x
-    assert data.q[:, 1].numpy() == pytest.approx(np.cos(2 * T[1:]), abs=3e-6)
+    whole = data.complete
+    assert (data.t[whole].tolist(), data.q[whole, 0].tolist()) == (T[1:].tolist(), X[1:].tolist())  # y begins later
+    assert data.q[whole, 1].numpy() == pytest.approx(np.cos(2 * T[1:]), abs=3e-6)
+    assert data.t[~whole].tolist() == [t for t in fine.tolist() if T[1] < t < T[-1] and t != T[18]]
     said = "warning: a.csv: x and y are seldom in one row, and are interpolated at the times of the rarest"
     assert said in capsys.readouterr().err
 
 
-def test_blanks_by_chance_are_left_out(tmp_path, capsys):  # fails if noise is interpolated where samples are enough
+def test_blanks_by_chance_leave_the_other_cells(tmp_path, capsys):
+    # fails if a blank costs the cells beside it, or counts as a reading
     y = np.cos(T)
     y[::4] = np.nan
     x = np.where(np.arange(40) % 5 == 1, np.nan, X)
     data = load(written(tmp_path, union((T, x, y)), "t[s],x[m],y[m]"))
-    assert data.t.tolist() == T[~(np.isnan(x) | np.isnan(y))].tolist()
-    assert "interpolated" not in capsys.readouterr().err
+    both = np.column_stack([x, y])
+    rows = (np.arange(40) >= 2) & ~np.isnan(both).all(1)  # the first two have one each, rows 16 and 36 none
+    assert data.t.tolist() == T[rows].tolist()
+    assert data.observed is not None
+    assert data.observed.tolist() == (~np.isnan(both)[rows]).astype(float).tolist()
+    read = data.observed > 0
+    assert data.q[read].tolist() == both[rows][read.numpy()].tolist()
+    assert data.q[:, 1].numpy() == pytest.approx(np.cos(T[rows]), abs=2e-4)  # a cubic
+    assert "missing positions, which have no weight in a fit: x in 5, y in 7 of 36 rows" in capsys.readouterr().err
 
 
 def test_frames_and_the_command_line(tmp_path, capsys):

@@ -30,6 +30,12 @@ ROLES = {
     "ddx": "left aside", "dphi/dt": "left aside", "wz": "left aside", "v2": "left aside", "a_x": "left aside",
     "joint_speed": "left aside", "yawrate": "left aside", "Geschwindigkeit": "left aside", "vitesse": "left aside",
     "velocidad": "left aside", "Temperatur": "left aside", "alphadot": "left aside", "dt": "left aside",
+    # Compounds by their last part, words without their accents, and what loggers of robots write.
+    "Motorstrom": "input", "Pendelwinkel": "coordinate", "Schleppfehler[mm]": "left aside", "angulo": "coordinate",
+    "Winkelbeschleunigung": "left aside", "aceleracion": "left aside", "Stellgröße": "input", "Führungsgröße": "input",
+    "commande": "input", "voltaje": "input", "referencia": "input", "erreur": "left aside", "Leistung": "left aside",
+    "GRF_z": "input", "ctrl": "input", "action": "input", "reward": "left aside", "imu_ax": "left aside",
+    "Sub Frame": "left aside", "Frame#": "left aside", "Winkelabweichung[deg]": "coordinate",
     # No rates: there is no column ist or x, or the unit is that of a position.
     "dist": "coordinate", "dz[mm]": "coordinate", "v1[m]": "coordinate", "depth": "coordinate",
     "base_angle[rad]": "coordinate", "elbow_x": "coordinate",
@@ -102,10 +108,19 @@ def test_what_is_a_guess_is_said_in_a_warning(tmp_path, capsys, cell):
 
 
 @pytest.mark.parametrize(
-    "header", ["t,a,b", "t[s],theta[rad],x[m],F[N]", "t,q1,q2,u", "Zeit,Winkel[°],Moment[Nm],T[°C]"]
+    "header", ["t,a", "t,a,u", "t[s],theta[rad],x[m],F[N]", "t,q1,q2,u", "Zeit,Winkel[°],Moment[Nm],T[°C]"]
 )
 def test_nothing_is_said_of_what_is_clear(tmp_path, capsys, header):  # fails if every table is warned of
     read(tmp_path, table(header))
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_two_columns_that_nothing_tells_apart_are_a_guess(tmp_path, capsys):
+    # fails if a table t,a,b is fitted as two coordinates without a word: one of them may drive the other
+    read(tmp_path, table("t,a,b"))
+    said = "warning: motion.csv: a, b are taken for coordinates, but no unit and no usual name says so; else give"
+    assert said + " --inputs or --drop with the names of those that are none" in capsys.readouterr().err
+    read(tmp_path, table("t,a,b"), coordinates=["a", "b"])
     assert "warning" not in capsys.readouterr().err
 
 
@@ -117,7 +132,20 @@ def test_many_columns_without_a_usual_name_are_one_warning(tmp_path, capsys):  #
 
 
 @pytest.mark.parametrize(
-    "name", ["Zeit", "Zeit[s]", "temps", "tiempo", "Zeitstempel", "elapsed_time", "simTime[s]", "seconds", "clock[s]"]
+    "name",
+    [
+        "Zeit",
+        "Zeit[s]",
+        "temps",
+        "tiempo",
+        "Zeitstempel",
+        "elapsed_time",
+        "simTime[s]",
+        "seconds",
+        "clock[s]",
+        "Messzeit",
+        "heure",
+    ],
 )
 def test_times_in_other_words(tmp_path, name):  # fails if a time is a coordinate, and the user is told there is none
     data = read(tmp_path, table(f"x[m],{name},u_t[N]"))

@@ -8,6 +8,8 @@ import pytest
 
 import herglotz as hz
 from herglotz.data import Trajectories
+from herglotz.data.input_terms import saturation
+from herglotz.training.acting_inputs import offered_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.look import look
@@ -57,6 +59,24 @@ def test_what_an_input_acts_by_is_found(term, runs):
     assert run.metrics["plan"]["input_terms"] == (term,) or run.metrics["plan"]["input_terms"] == [term]
     assert run.metrics["verdict"].startswith("fits to the noise")
     assert term in str(run.equation())
+
+
+def test_the_level_at_which_an_input_saturates_is_found():
+    # fails if saturations are not offered, or a level stays where accelerations put it
+    data = driven(lambda u, _: 3 * np.clip(u, -0.6, 0.6), sway, samples=150)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search.order = 2  # as of noisier data, in half the time
+    offered = [saturation(term) for term in offered_terms(data)[3:]]
+    assert [(of[0], of[2]) for of in offered if of] == [("sat", "u"), ("tanh", "u")]
+    assert offered[0] is not None
+    assert offered[0][1] == pytest.approx(0.6, rel=0.15)
+    first = search.first()
+    assert first is not None
+    (term,) = search.input_terms(first)
+    found = saturation(term)
+    assert found is not None
+    assert (found[0], found[2]) == ("sat", "u")
+    assert found[1] == pytest.approx(0.6, rel=0.01)
 
 
 def test_a_run_predicts_recordings_without_the_term(runs):

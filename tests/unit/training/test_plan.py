@@ -59,11 +59,11 @@ def test_the_drawing_in_the_docs_is_the_code():
     ("noise", "settings", "number", "objective"),
     [
         (0.0, {}, 3, "trajectory"),
-        (0.0, {"level": "linear"}, 5, "residual"),
+        (0.0, {"level": "linear"}, 6, "residual"),
         (0.01, {}, 3, "trajectory"),
         (0.0, {"sticking": True}, 2, "trajectory"),
         (0.01, {"objective": "smoothing"}, 1, "smoothing"),
-        (0.0, {"mass_width": 3}, 7, "trajectory"),
+        (0.0, {"mass_width": 3}, 8, "trajectory"),
         (0.0, {"supervision": "qs"}, 0, "residual"),
     ],
 )

@@ -79,7 +79,8 @@ class ShootingProblem(StatesProblem):
     def _weigh(self) -> None:
         """What residuals are divided by, which follows from σ."""
         self.better = self._known_better()  # (N, n)
-        self.weight = self.used.to(self.data.q)[:, None] * self.better  # (N, n)
+        observed = 1.0 if self.data.observed is None else self.data.observed
+        self.weight = self.used.to(self.data.q)[:, None] * self.better * observed  # (N, n)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
         relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
@@ -185,8 +186,7 @@ class ShootingProblem(StatesProblem):
         if path is None:
             return x.new_full((), torch.inf)
         fit, joints = self._missed_by(path.x), self._joints(path.x, self._weights(x[: self.P]))
-        anchor = self._anchor(x)
-        return self.loss(fit, joints) + anchor.square().sum() / 2 + self.prior_cost(x[: self.P])
+        return self.loss(fit, joints) + self._anchor(x).square().sum() / 2 + self.prior_cost(x[: self.P])
 
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Arrowhead, Tensor]:
         """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: of the states alone, θ as it is."""

@@ -46,9 +46,9 @@ class SmoothingProblem(StatesProblem):
         S, M = grid.segments, grid.longest + 1
         node = torch.arange(M, device=data.q.device)
         self.inside = (node <= grid.end[:, None])[..., None].to(data.q)  # (S, M, 1) padding has 0
-        self.seen, self.target = data.q.new_zeros(S * M, 1), data.q.new_zeros(S * M, n)
-        self.seen[grid.node], self.target[grid.node] = 1.0, data.q
-        self.seen, self.target = self.seen.reshape(S, M, 1), self.target.reshape(S, M, n)
+        self.seen, self.target = data.q.new_zeros(S * M, n), data.q.new_zeros(S * M, n)
+        self.seen[grid.node], self.target[grid.node] = 1.0 if data.observed is None else data.observed, data.q
+        self.seen, self.target = self.seen.reshape(S, M, n), self.target.reshape(S, M, n)
         # What a force that the model does not know adds to v and p in a step, to q by the way, and to s.
         v = (self.deviations * self.speed / self.scale).expand(*grid.h.shape, n)
         s = (self.sigma * v.new_tensor([self.action]) / self.scale.max()).expand(*grid.h.shape, 1)
