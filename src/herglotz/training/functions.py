@@ -50,18 +50,23 @@ class Band(NamedTuple):
         return self.name.startswith(("damping", "friction"))
 
 
-def bands(data: Trajectories, base: Baseline) -> list[Band]:
-    """All functions that these coordinates may be given beside their named terms."""
+def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Band]:
+    """All functions that these coordinates may be given beside their named terms.
+
+    `fine`: the damping and the mass of one coordinate have waves as short as its potential's, which are too many for a
+    search.
+    """
     found: dict[str, list[tuple[str, float]]] = {}
     several = data.dof > 1
+    pairs, mass = (POTENTIAL // 2, POTENTIAL) if fine and not several else (DAMPING, MASS)
     for i, angle in enumerate(data.angles):
         own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], OF_MANY if several else POTENTIAL)
         found[f"V(q{i + 1})"] = own
-        around = own if angle else _pairs(data, i)
-        found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * DAMPING]]
+        around = own if angle else _pairs(data, i, pairs)
+        found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * pairs]]
         found[f"friction(v{i + 1})"] = _of_speed(f"v{i + 1}", base.speed[i])
         if not several:
-            found["mass(q1)"] = [(f"{x} v1^2", k) for x, k in own[: 2 * MASS if angle else MASS]]
+            found["mass(q1)"] = [(f"{x} v1^2", k) for x, k in own[: 2 * mass if angle else mass]]
         elif angle:
             for a, b in combinations_with_replacement(range(1, data.dof + 1), 2):
                 found[f"mass(q{i + 1}) of v{a} v{b}"] = [(f"{x} v{a} v{b}", k) for x, k in own[2:4]]
@@ -142,9 +147,9 @@ def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> lis
     return found
 
 
-def _pairs(data: Trajectories, i: int) -> list[tuple[str, float]]:
+def _pairs(data: Trajectories, i: int, count: int) -> list[tuple[str, float]]:
     """Waves of one coordinate whose period is its interval."""
-    return _periodic(f"q{i + 1}", _interval(data, [(i, 1.0)])[1], DAMPING)
+    return _periodic(f"q{i + 1}", _interval(data, [(i, 1.0)])[1], count)
 
 
 def _of_speed(speed: str, largest: float) -> list[tuple[str, float]]:

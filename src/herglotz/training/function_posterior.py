@@ -1,0 +1,219 @@
+"""The posterior of functions: of a run's numbers together with all waves that its functions could have.
+
+A fit keeps the waves that are worth their price, and a posterior of these alone takes all others for known to be 0: its
+bands of a function are far too narrow. Here every function (potential, damping, mass, friction) has all its waves, with
+
+* a prior N(0, α_f τ_k²), τ_k the deviations of `prior_spreads`, a strength α_f of each function. It maximises the
+  marginal likelihood times a prior of √α_f, ∝ √α exp(−α/2), that keeps it from 0 (Chung et al. 2013, A nondegenerate
+  penalized likelihood estimator for variance parameters): with γ_f = Σ (1 − C_kk/(α_f τ_k²)) numbers that the data tell
+  of a function (MacKay 1992), α_f = α_f (Σ θ_k²/(α_f τ_k²) + 1) / (γ_f + α_f) at the maximum;
+* the σ of the noise at which the residuals are likeliest;
+* the mean of the first mass over the data as it is, which positions leave free (trap 3 of `docs/mathematics.md`).
+
+The motion is linearised once, at the fit. Functions are compared with those of continuous motion, from which those of a
+rule of order p differ by h^p: Jᵀr of model steps h and h/2 is extrapolated (Richardson). What held-out blocks of time
+are missed by widens the bands as it does all others (head of `herglotz.training.uncertainty`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, jacrev
+
+from herglotz.models import ContactLagrangian
+from herglotz.models.phase import Phase
+from herglotz.training.arrowhead import dense
+from herglotz.training.cross_validation import foretold_errors
+from herglotz.training.dictionary import keys_of
+from herglotz.training.functions import Band, bands, prior_spreads
+from herglotz.training.kernel import MAX_PARAMETERS
+from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.pruning import inverse_of
+from herglotz.training.uncertainty import Laplace, inflation_of
+
+ROUNDS, SETTLED = 200, 0.01  # of strengths, and the relative change that ends them
+HELD = 1e-4  # of the first mass, to which its mean is known
+
+
+@dataclass(frozen=True)
+class FunctionPosterior:
+    """𝒩(θ, covariance) of the numbers of a model with all waves."""
+
+    model: ContactLagrangian
+    theta: Tensor  # (P,)
+    covariance: Tensor  # (P, P)
+
+
+def function_posterior(posterior: Laplace) -> FunctionPosterior:
+    """The posterior of a run's functions; of a model that takes no waves (networks, symmetries) that of its numbers."""
+    every = bands(posterior.problem.data, posterior.base, fine=True)
+    model = _with_waves(posterior.run.model, every)
+    found = None if model is None else _linear(posterior, model, every)
+    P = len(posterior.theta)
+    return found or FunctionPosterior(posterior.run.model, posterior.theta, posterior.covariance[:P, :P])
+
+
+def mass_at(model: ContactLagrangian, q: Tensor, h: float) -> Tensor:
+    """m(q) = −h ∂²K/∂q₀∂q₁ at rest, (n, n, K), at positions q (K, n)."""
+    n = q.shape[-1]
+    K = model.terms(Phase(q, q, torch.full_like(q[:, 0], h), 2, model.config)).K
+    return q.new_zeros(n, n, len(q)) if K is None else -h * K.hessian()[:n, n:].movedim(-1, 2)
+
+
+def by_numbers(model: ContactLagrangian, function: Callable[[ContactLagrangian], Tensor], theta: Tensor) -> Tensor:
+    """∂f/∂θ, (..., P), of a function f of a model at the numbers θ (P,), which are those of the model after it."""
+    numbers, of = ParameterVector(model), _Of(model, function)
+    numbers.set(theta)
+
+    def at(theta: Tensor) -> Tensor:
+        return functional_call(of, {f"model.{name}": x for name, x in numbers.unflatten(theta).items()}, ())
+
+    J = jacrev(at)(numbers.get())
+    assert isinstance(J, Tensor)
+    return J
+
+
+class _Of(nn.Module):
+    """A function of a model as a module, whose parameters `functional_call` reaches."""
+
+    def __init__(self, model: ContactLagrangian, function: Callable[[Any], Tensor]):
+        super().__init__()
+        self.model, self.function = model, function
+
+    def forward(self) -> Tensor:
+        return self.function(self.model)
+
+
+def _with_waves(model: ContactLagrangian, every: list[Band]) -> ContactLagrangian | None:
+    """The model with all waves, which are 0 where it has none; None where its kind takes none."""
+    c, own = model.config, ParameterVector(model)
+    if c.networks or c.translations or c.terms or c.level in ("affine", "full"):
+        return None
+    still, moving = ([x for b in every if b.brakes == brakes for x in b.texts] for brakes in (False, True))
+    moving = [] if c.level == "conservative" else moving
+    features, drag = (tuple(dict.fromkeys((*a, *b))) for a, b in ((c.features, still), (c.drag, moving)))
+    whole = replace(c, level="forced" if drag else c.level, features=features, drag=drag, absent=())
+    names = ParameterVector(ContactLagrangian(whole)).numbers
+    value = dict(zip(keys_of(own.numbers, c), own.get().tolist(), strict=True))
+    learned = {*value, *still, *moving}
+    absent = tuple(name for name, key in zip(names, keys_of(names, whole), strict=True) if key not in learned)
+    if len(names) - len(absent) > MAX_PARAMETERS:
+        return None
+    whole = ContactLagrangian(replace(whole, absent=absent)).to(own.get())
+    numbers = ParameterVector(whole)
+    keys = keys_of(numbers.numbers, whole.config)
+    numbers.set(own.get().new_tensor([value.get(key, 0.0) for key in keys]))
+    return whole
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What data say of numbers, whatever the starts are: ½ (c + 2 bᵀδ + δᵀAδ) at θ + δ; residuals are over a σ."""
+
+    A: Tensor  # (P, P)
+    b: Tensor  # (P,)
+    c: float
+    count: int  # of residuals less starts
+    scale: Tensor  # (P,) derivatives of the logarithm of the first mass
+
+
+@dataclass(frozen=True)
+class _Waves:
+    """The prior of numbers: 𝒩(mean, 1/weight), those of function f times its strength α_f."""
+
+    mean: Tensor  # (P,)
+    weight: Tensor  # (P,)
+    of: Tensor  # (P,) number of the function; F: of none
+    functions: int  # F
+
+
+def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> FunctionPosterior | None:
+    """The posterior of a model with all waves, linear about the fit; None where the model cannot be run there."""
+    theta, problem = ParameterVector(model).get(), _problem(posterior, model, 2)
+    P, d, start = problem.P, problem.d, posterior.path.x[:, 0, : problem.d]
+    coarse, fine = (_sums(x, problem.pack(theta, start)) for x in (_problem(posterior, model, 1), problem))
+    if not bool(coarse[0].isfinite() & fine[0].isfinite()):
+        return None
+    more = 1 / (2**model.config.order - 1)
+    cost, b = (x + more * (x - y) for x, y in ((fine[0], coarse[0]), (fine[2], coarse[2])))
+    A = fine[1]
+    states = inverse_of(A[P:, P:])
+    onto = A[:P, P:] @ states
+    q, h = posterior.problem.data.q, posterior.run.h
+    mass = by_numbers(model, lambda m: mass_at(m, q[:: max(1, len(q) // 500)], h)[0, 0].mean().log(), theta)
+    c, count = float(2 * cost - b[P:] @ states @ b[P:]), q.numel() - len(states)
+    known = _Known(A[:P, :P] - onto @ A[P:, :P], b[:P] - onto @ b[P:], c, count, mass.double().cpu())
+    prior = _prior(posterior, model, every)
+    moved, weight, variance = _likeliest(known, prior, theta.double().cpu(), posterior.problem.freedom is None)
+    starts = start - (states @ (b[P:] + A[P:, :P] @ moved)).reshape(-1, d).to(start)
+    theta = theta + moved.to(theta)
+    path = problem.solve(problem.pack(theta, starts))
+    if path is None:
+        return None
+    A[:P, :P] += variance * weight
+    errors = foretold_errors(problem, path, theta, A.to(theta))
+    factor = inflation_of(errors, variance**0.5)
+    return FunctionPosterior(model, theta, inverse_of(A)[:P, :P] * variance * factor**2)
+
+
+def _problem(posterior: Laplace, model: ContactLagrangian, parts: int) -> ShootingProblem:
+    """Each trajectory as one segment, without a prior, in model steps that are so many times shorter than the fit's."""
+    of = posterior.problem
+    grid = segment_grid(of.data, max(of.data.lengths), posterior.base.model_step / parts)
+    problem = ShootingProblem(model, of.data, grid, sigma=of.sigma, freedom=of.freedom, used=of.used)
+    if problem.compiled is None:
+        problem.guess_from(of, posterior.path)
+    return problem
+
+
+def _sums(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """½|r|², JᵀJ and Jᵀr, float64 on the CPU."""
+    cost, A, b = problem.normal_equations(x)
+    return cost.double().cpu(), dense(A).double().cpu(), b.double().cpu()
+
+
+def _prior(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> _Waves:
+    """That of the fit, and of all waves."""
+    numbers, data = ParameterVector(model), posterior.problem.data
+    spreads = {**posterior.base.spreads, **prior_spreads(every, posterior.base, data.balance, [])}
+    keys, known = keys_of(numbers.numbers, model.config), {*numbers.numbers}
+    spreads = {key: spread for key, spread in spreads.items() if key in keys or key in known}
+    prior = prior_of(model, replace(posterior.base, spreads=spreads), None)
+    names = list(dict.fromkeys(band.name.rsplit(" ", 1)[0] for band in every))
+    place = {text: names.index(band.name.rsplit(" ", 1)[0]) for band in every for text in band.texts}
+    of = torch.tensor([place.get(key, len(names)) for key in keys])
+    weight = prior.normal_equations(prior.start)[1].diagonal()
+    return _Waves(prior.start.double().cpu(), weight.double().cpu(), of, len(names))
+
+
+def _likeliest(known: _Known, prior: _Waves, theta: Tensor, gaussian: bool) -> tuple[Tensor, Tensor, float]:
+    """The step (P,) to the posterior's mean, the weight (P, P) of the prior, and the variance of residuals.
+
+    The strengths and the variance are those at which the data are likeliest; a robust loss keeps its own variance, 1.
+    """
+    strength, variance, left = torch.ones(prior.functions + 1, dtype=torch.float64), 1.0, prior.mean - theta
+    step, weight = left, prior.weight
+    for _ in range(ROUNDS):
+        weight = prior.weight / strength[prior.of]
+        C = inverse_of(known.A / variance + weight.diag() + known.scale[:, None] * known.scale / HELD**2)
+        step = C @ (weight * left - known.b / variance)
+        size, told = torch.zeros(2, prior.functions + 1, dtype=torch.float64).index_add_(
+            1, prior.of, torch.stack([weight * (step - left).square(), 1 - weight * C.diagonal()])
+        )
+        factor = (size + 1) / (told + strength)
+        factor[-1] = 1.0  # the prior of numbers that are no waves
+        strength = strength * factor
+        if gaussian:
+            rest = known.c + float(2 * known.b @ step + step @ known.A @ step)
+            variance = rest / (known.count - float(told.sum()))
+        if float((factor - 1).abs().max()) < SETTLED:
+            break
+    return step, weight.diag() + known.scale[:, None] * known.scale / HELD**2, variance
