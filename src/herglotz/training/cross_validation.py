@@ -63,18 +63,16 @@ def held_out_errors(
 def foretold_errors(problem: ShootingProblem, path: Path, theta: Tensor, A: Tensor) -> Tensor:
     """`held_out_errors` over what the fit without a fold expects there: (FOLDS,), 1 where residuals are white, of σ.
 
-    Without the rows B a fit foretells r_B = 0 with the covariance (I − H)⁻¹ = I + J_B A_¬B⁻¹ J_Bᵀ, H = J_B A⁻¹ J_Bᵀ, and
-    misses it by e = (I − H)⁻¹ r_B: this is the root of eᵀ(I − H) e / |B|. Where parameters are many, errors of left-out
-    blocks are large because these blocks tell what nothing else does.
+    With H = J_B A⁻¹ J_Bᵀ a fit without the rows B misses them by e = (I − H)⁻¹ r_B, whose covariance is (I − H)⁻¹ where
+    the model is true: this is the root of eᵀ(I − H) e / |B|. Where parameters are many, errors of left-out blocks are
+    large because these blocks tell what nothing else does.
     """
     r, G = _whitened_rows(problem, path, theta, A)
     each = lambda rows: (r[rows] @ _left_out(G[rows], r[rows]) / rows.sum()).sqrt()[None]  # noqa: E731
     return left_out_errors(r, problem.data, each, problem.better.flatten() > SURE)
 
 
-def _whitened_rows(
-    problem: ShootingProblem, path: Path, theta: Tensor, A: Tensor | Arrowhead
-) -> tuple[Tensor, Tensor]:
+def _whitened_rows(problem: ShootingProblem, path: Path, theta: Tensor, A: Tensor | Arrowhead) -> tuple[Tensor, Tensor]:
     """Data residuals (N·n,), and G (N·n, K) with G Gᵀ = J A⁻¹ Jᵀ, float64."""
     r, J = data_rows(problem, path, theta)
     values, vectors = torch.linalg.eigh(dense(A).double())

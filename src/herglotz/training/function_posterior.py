@@ -1,7 +1,8 @@
 """The posterior of functions: of a run's numbers together with all waves that its functions could have.
 
 A fit keeps the waves that are worth their price, and a posterior of these alone takes all others for known to be 0: its
-bands of a function are far too narrow. Here every function (potential, damping, mass, friction) has all its waves, with
+bands of a function are far too narrow. Here every function (potential, damping, mass, friction) has all its waves. They
+stand for powers and other named terms of the function, too, which come from a dictionary and are not known. Waves have
 
 * a prior N(0, α_f τ_k²), τ_k the deviations of `prior_spreads`, a strength α_f of each function. It maximises the
   marginal likelihood times a prior of √α_f, ∝ √α exp(−α/2), that keeps it from 0 (Chung et al. 2013, A nondegenerate
@@ -30,7 +31,7 @@ from herglotz.models.phase import Phase
 from herglotz.training.arrowhead import dense
 from herglotz.training.cross_validation import foretold_errors
 from herglotz.training.dictionary import keys_of
-from herglotz.training.functions import Band, bands, prior_spreads
+from herglotz.training.functions import Band, bands, prior_spreads, replaced
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
@@ -41,6 +42,7 @@ from herglotz.training.uncertainty import Laplace, inflation_of
 
 ROUNDS, SETTLED = 200, 0.01  # of strengths, and the relative change that ends them
 HELD = 1e-4  # of the first mass, to which its mean is known
+LEFT = 1e-6  # of a coefficient, where waves stand for its term
 
 
 @dataclass(frozen=True)
@@ -168,9 +170,9 @@ def _problem(posterior: Laplace, model: ContactLagrangian, parts: int) -> Shooti
     """Each trajectory as one segment, without a prior, in model steps that are so many times shorter than the fit's."""
     of = posterior.problem
     grid = segment_grid(of.data, max(of.data.lengths), posterior.base.model_step / parts)
-    problem = ShootingProblem(model, of.data, grid, sigma=of.sigma, freedom=of.freedom, used=of.used)
-    if problem.compiled is None:
-        problem.guess_from(of, posterior.path)
+    settings = {"sigma": of.sigma, "freedom": of.freedom, "used": of.used, "compiled": False}
+    problem = ShootingProblem(model, of.data, grid, **settings)
+    problem.guess_from(of, posterior.path)
     return problem
 
 
@@ -181,11 +183,14 @@ def _sums(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _prior(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> _Waves:
-    """That of the fit, and of all waves."""
+    """That of the fit, of all waves, and around 0 of the terms that these stand for."""
     numbers, data = ParameterVector(model), posterior.problem.data
     spreads = {**posterior.base.spreads, **prior_spreads(every, posterior.base, data.balance, [])}
     keys, known = keys_of(numbers.numbers, model.config), {*numbers.numbers}
     spreads = {key: spread for key, spread in spreads.items() if key in keys or key in known}
+    gone = replaced(model.config.features, model.config.drag, model.config.angles)
+    theta = numbers.get().tolist()
+    spreads |= {key: LEFT * abs(x) for key, x in zip(keys, theta, strict=True) if key in gone and x}
     prior = prior_of(model, replace(posterior.base, spreads=spreads), None)
     names = list(dict.fromkeys(band.name.rsplit(" ", 1)[0] for band in every))
     place = {text: names.index(band.name.rsplit(" ", 1)[0]) for band in every for text in band.texts}

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement, groupby
 from typing import NamedTuple
@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.models.drag import parse_drag
 from herglotz.models.features import parse
 from herglotz.training.baseline import Baseline
 from herglotz.training.named_terms import NamedTerms, own_terms
@@ -82,14 +83,23 @@ def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Ban
 
 def terms_with(every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
     """The terms with all waves of these functions, which take the place of powers in the potential but the lowest."""
-    own = own_terms(angles)
-    kept = [
-        text for text in terms.features
-        if "v" in text or text in own or parse(text, angles)[0].function in ("cos", "sin")
-    ]  # fmt: skip
+    gone = replaced(terms.features, (), angles)
+    kept = [text for text in terms.features if text not in gone]
     waves = {brakes: [text for own in every if own.brakes == brakes for text in own.texts] for brakes in (False, True)}
     still = NamedTerms(tuple(waves[False]), tuple(waves[True]))
     return replace(terms, features=tuple(kept)).joined(still)
+
+
+def replaced(features: Iterable[str], drag: Iterable[str], angles: tuple[bool, ...]) -> set[str]:
+    """Those of these terms that functions can stand for: powers in the potential, and drag of one coordinate alone."""
+    own = own_terms(angles)
+    still = {
+        text for text in features
+        if "v" not in text and text not in own and parse(text, angles)[0].function not in ("cos", "sin")
+    }  # fmt: skip
+    parsed = {text: parse_drag(text, angles) for text in drag}
+    alone = {x for x, f in parsed.items() if f.of is None and f.at == f.on and (f.b or f.c) and not (f.air or f.wave)}
+    return still | alone
 
 
 def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from torch import Tensor
 from herglotz.data.splits import leading
 from herglotz.errors import InputError, refuse
 from herglotz.models import ContactLagrangian, refuse_own
+from herglotz.models.terms import LinearDamping
 from herglotz.stepping.field import FieldOf
 from herglotz.threads import one_thread
 from herglotz.training.function_posterior import by_numbers, function_posterior, mass_at
@@ -29,6 +30,7 @@ from herglotz.training.uncertainty import Laplace
 CONSTANT = 1e-6  # of the largest value: a function that varies by less is constant, but for rounding of float32
 SAMPLES = 200  # of the data at most, that the mean of the mass is made of
 Line = tuple[Tensor, float, float]  # points x (K,), and the ends of the recorded range
+Part = tuple[str, tuple[int, ...], Line]  # kind, coordinates and line of a function
 
 
 @dataclass(frozen=True)
@@ -136,15 +138,15 @@ class _Lines:
             for part in self._of(run.model, i, _range(q[:, i], points, beyond), _range(v[:, i], points, beyond))
         ]
 
-    def _of(self, model: ContactLagrangian, i: int, at: Line, speeds: Line) -> list[tuple[str, tuple[int, ...], Line]]:
-        """Kind, coordinates and line of the functions of one coordinate."""
-        found = [("potential", (i,), at), ("force", (i,), at)]
-        rubs = model.friction is not None or hasattr(model.damping, "rate")
+    def _of(self, model: ContactLagrangian, i: int, at: Line, speeds: Line) -> list[Part]:
+        """The functions of one coordinate."""
+        found: list[Part] = [("potential", (i,), at), ("force", (i,), at)]
+        rubs = isinstance(model.damping, LinearDamping)
         found += [("friction", (i,), speeds)] if rubs else []
         found += [("damping", (i,), at)] if rubs and _varies(self._damping(model, i, at[0])) else []
         m = mass_at(model, self._line(i, at[0]), self.h)
         pairs = ((j, k) for j in range(len(m)) for k in range(j, len(m)))
-        return found + [("mass", (j, k, i), at) for j, k in pairs if _varies(m[j, k], m)]
+        return [*found, *(("mass", (j, k, i), at) for j, k in pairs if _varies(m[j, k], m))]
 
     def values(self, model: ContactLagrangian) -> Tensor:
         """All functions of a model in the gauge, one after the other, float64."""
@@ -186,11 +188,12 @@ class _Lines:
 
     def _friction(self, model: ContactLagrangian, q: Tensor, v: Tensor) -> Tensor:
         """−γ m v of the contact term at s = 0, and the forces beside L but those of inputs, (K, n)."""
-        h, rate = torch.full_like(q[:, 0], self.h), getattr(model.damping, "rate", None)
-        momentum = (mass_at(model, q, self.h).movedim(-1, 0) @ v[..., None])[..., 0]
-        force = 0.0 * momentum if rate is None else -rate * momentum
+        if not isinstance(model.damping, LinearDamping):
+            return 0.0 * v
+        h, rate = torch.full_like(q[:, 0], self.h), model.damping.rate
+        force = -rate * (mass_at(model, q, self.h).movedim(-1, 0) @ v[..., None])[..., 0]
         parts = model.forces(q - h[:, None] * v / 2, q + h[:, None] * v / 2, torch.zeros_like(h), h)
-        if parts is None or rate is None:
+        if parts is None:
             return force
         c = 1.0 if model.action is not None else (-rate * h).exp()[:, None]
         return force + (parts[0] / c + parts[1]) / h[:, None]
