@@ -54,7 +54,7 @@ def held_out_errors(
     white noise, would both be fooled by their neighbours. Starts that are known far better than by σ are never left
     out: a free run begins there.
     """
-    r, G = _whitened_rows(problem, path, theta, A)
+    r, G = _whitened(*data_rows(problem, path, theta), dense(A))
     better = problem.better.flatten().to(r)  # counts in r and J, and not in errors in units of q
     errors = left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
     return errors * problem.sigma
@@ -67,15 +67,16 @@ def foretold_errors(problem: ShootingProblem, path: Path, theta: Tensor, A: Tens
     the model is true: this is the root of eᵀ(I − H) e / |B|. Where parameters are many, errors of left-out blocks are
     large because these blocks tell what nothing else does.
     """
-    r, G = _whitened_rows(problem, path, theta, A)
+    size = A.diagonal().sqrt()  # weights of waves differ by many orders
+    r, J = data_rows(problem, path, theta)
+    r, G = _whitened(r, J.double() / size, A / size[:, None] / size)
     each = lambda rows: (r[rows] @ _left_out(G[rows], r[rows]) / rows.sum()).sqrt()[None]  # noqa: E731
     return left_out_errors(r, problem.data, each, problem.better.flatten() > SURE)
 
 
-def _whitened_rows(problem: ShootingProblem, path: Path, theta: Tensor, A: Tensor | Arrowhead) -> tuple[Tensor, Tensor]:
+def _whitened(r: Tensor, J: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
     """Data residuals (N·n,), and G (N·n, K) with G Gᵀ = J A⁻¹ Jᵀ, float64."""
-    r, J = data_rows(problem, path, theta)
-    values, vectors = torch.linalg.eigh(dense(A).double())
+    values, vectors = torch.linalg.eigh(A.double())
     known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
     return r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())
 

@@ -18,6 +18,7 @@ are missed by widens the bands as it does all others (head of `herglotz.training
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -40,6 +41,7 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import inverse_of
 from herglotz.training.uncertainty import Laplace, inflation_of
 
+FALLS = (0, 1, 2)  # Matérn processes of ν = 3/2, 5/2, 7/2: the one at which the data are likeliest
 ROUNDS, SETTLED = 200, 0.01  # of strengths, and the relative change that ends them
 HELD = 1e-4  # of the first mass, to which its mean is known
 LEFT = 1e-6  # of a coefficient, where waves stand for its term
@@ -125,16 +127,28 @@ class _Known:
     c: float
     count: int  # of residuals less starts
     scale: Tensor  # (P,) derivatives of the logarithm of the first mass
+    robust: bool  # the loss has a scale of its own
 
 
 @dataclass(frozen=True)
 class _Waves:
-    """The prior of numbers: 𝒩(mean, 1/weight), those of function f times its strength α_f."""
+    """The prior 𝒩(mean, 1/weight) of numbers less θ; that of waves is times the strength of their function."""
 
     mean: Tensor  # (P,)
     weight: Tensor  # (P,)
     of: Tensor  # (P,) number of the function; F: of none
+    rate: Tensor  # (P,) of a wave over that of the longest one of its function, 1 of others
     functions: int  # F
+
+
+@dataclass(frozen=True)
+class _Likeliest:
+    """The strengths of one prior at which the data are likeliest."""
+
+    likelihood: float  # log marginal likelihood, but for a constant
+    step: Tensor  # (P,) from θ to the posterior's mean
+    weight: Tensor  # (P, P) of the prior
+    variance: float  # of residuals
 
 
 def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> FunctionPosterior | None:
@@ -152,16 +166,18 @@ def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> 
     q, h = posterior.problem.data.q, posterior.run.h
     mass = by_numbers(model, lambda m: mass_at(m, q[:: max(1, len(q) // 500)], h)[0, 0].mean().log(), theta)
     c, count = float(2 * cost - b[P:] @ states @ b[P:]), q.numel() - len(states)
-    known = _Known(A[:P, :P] - onto @ A[P:, :P], b[:P] - onto @ b[P:], c, count, mass.double().cpu())
+    robust = posterior.problem.freedom is not None
+    known = _Known(A[:P, :P] - onto @ A[P:, :P], b[:P] - onto @ b[P:], c, count, mass.double().cpu(), robust)
     prior = _prior(posterior, model, every)
-    moved, weight, variance = _likeliest(known, prior, theta.double().cpu(), posterior.problem.freedom is None)
+    best = max((_likeliest(known, prior, fall) for fall in FALLS), key=lambda found: found.likelihood)
+    moved, variance = best.step, best.variance
     starts = start - (states @ (b[P:] + A[P:, :P] @ moved)).reshape(-1, d).to(start)
     theta = theta + moved.to(theta)
     path = problem.solve(problem.pack(theta, starts))
     if path is None:
         return None
-    A[:P, :P] += variance * weight
-    errors = foretold_errors(problem, path, theta, A.to(theta))
+    A[:P, :P] += variance * best.weight
+    errors = foretold_errors(problem, path, theta, A.to(theta.device))
     factor = inflation_of(errors, variance**0.5)
     return FunctionPosterior(model, theta, inverse_of(A)[:P, :P] * variance * factor**2)
 
@@ -196,29 +212,34 @@ def _prior(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> _
     place = {text: names.index(band.name.rsplit(" ", 1)[0]) for band in every for text in band.texts}
     of = torch.tensor([place.get(key, len(names)) for key in keys])
     weight = prior.normal_equations(prior.start)[1].diagonal()
-    return _Waves(prior.start.double().cpu(), weight.double().cpu(), of, len(names))
+    rate = {text: k / band.longest for band in every for text, k in zip(band.texts, band.rates, strict=True)}
+    rates = weight.new_tensor([rate.get(key, 1.0) for key in keys]).double().cpu()
+    mean = (prior.start - numbers.get()).double().cpu()
+    return _Waves(mean, weight.double().cpu(), of, rates, len(names))
 
 
-def _likeliest(known: _Known, prior: _Waves, theta: Tensor, gaussian: bool) -> tuple[Tensor, Tensor, float]:
-    """The step (P,) to the posterior's mean, the weight (P, P) of the prior, and the variance of residuals.
-
-    The strengths and the variance are those at which the data are likeliest; a robust loss keeps its own variance, 1.
-    """
-    strength, variance, left = torch.ones(prior.functions + 1, dtype=torch.float64), 1.0, prior.mean - theta
-    step, weight = left, prior.weight
+def _likeliest(known: _Known, prior: _Waves, fall: int) -> _Likeliest:
+    """The posterior of numbers whose waves k fall as by so many more powers of k, with its strengths and variance."""
+    F, own, fixed = prior.functions, prior.weight * prior.rate ** (2 * fall), known.scale.outer(known.scale) / HELD**2
+    strength, variance, rest = torch.ones(F + 1, dtype=torch.float64), 1.0, known.c
+    step, weight, spent = prior.mean, own, torch.zeros_like(own)
     for _ in range(ROUNDS):
-        weight = prior.weight / strength[prior.of]
-        C = inverse_of(known.A / variance + weight.diag() + known.scale[:, None] * known.scale / HELD**2)
-        step = C @ (weight * left - known.b / variance)
-        size, told = torch.zeros(2, prior.functions + 1, dtype=torch.float64).index_add_(
-            1, prior.of, torch.stack([weight * (step - left).square(), 1 - weight * C.diagonal()])
-        )
+        weight = own / strength[prior.of]
+        C = inverse_of(known.A / variance + weight.diag() + fixed)
+        step = C @ (weight * prior.mean - known.b / variance)
+        spent = weight * (step - prior.mean).square()
+        rows = torch.stack([spent, (1 - weight * C.diagonal()).clamp_min(0.0)])
+        size, told = torch.zeros(2, F + 1, dtype=torch.float64).index_add_(1, prior.of, rows)
         factor = (size + 1) / (told + strength)
-        factor[-1] = 1.0  # the prior of numbers that are no waves
+        factor[F] = 1.0  # the prior of numbers that are no waves
         strength = strength * factor
-        if gaussian:
-            rest = known.c + float(2 * known.b @ step + step @ known.A @ step)
-            variance = rest / (known.count - float(told.sum()))
+        rest = known.c + float(2 * known.b @ step + step @ known.A @ step)
+        variance = variance if known.robust else rest / (known.count - float(told.sum()))
         if float((factor - 1).abs().max()) < SETTLED:
             break
-    return step, weight.diag() + known.scale[:, None] * known.scale / HELD**2, variance
+    H, waves = known.A / variance + weight.diag() + fixed, prior.of < F
+    size = H.diagonal().sqrt()
+    terms = torch.linalg.eigvalsh(H / size / size[:, None]).clamp_min(1e-300).log().sum() + 2 * size.log().sum()
+    terms = terms - weight[waves].log().sum() + spent.sum() + rest / variance + known.count * math.log(variance)
+    likelihood = -float(terms - (strength[:F].log() - strength[:F]).sum()) / 2
+    return _Likeliest(likelihood, step, weight.diag() + fixed, variance)

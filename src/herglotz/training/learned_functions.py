@@ -150,7 +150,7 @@ class _Lines:
 
     def values(self, model: ContactLagrangian) -> Tensor:
         """All functions of a model in the gauge, one after the other, float64."""
-        unit = mass_at(model, self.some, self.h)[0, 0].double().mean()
+        unit = mass_at(model, self.some, self.h)[0, 0].double().cpu().mean()
         return torch.cat([self._value(model, kind, of, *line) / unit for kind, of, line in self.parts])
 
     def _value(
@@ -161,16 +161,16 @@ class _Lines:
             v = self.middle.new_zeros(len(x), len(self.middle))
             v[:, i] = x.to(v)
             q = self.middle.expand_as(v)
-            return (self._friction(model, q, v) - self._friction(model, q, 0 * v))[:, i].double()
+            return (self._friction(model, q, v) - self._friction(model, q, 0 * v))[:, i].double().cpu()
         if kind == "damping":
             return self._damping(model, i, x)
         q = self._line(i, x)
         if kind == "mass":
-            return mass_at(model, q, self.h)[of[0], of[1]].double()
-        field, rest = FieldOf(model.potential)(q), self._friction(model, q, 0 * q)[:, i].double()
+            return mass_at(model, q, self.h)[of[0], of[1]].double().cpu()
+        field, rest = FieldOf(model.potential)(q), self._friction(model, q, 0 * q)[:, i].double().cpu()
         if kind == "force":
-            return rest - field.slope[:, i].double()
-        V = field.V.double() - torch.cat([rest[:1] * 0, torch.cumulative_trapezoid(rest, x)])
+            return rest - field.slope[:, i].double().cpu()
+        V = field.V.double().cpu() - torch.cat([rest[:1] * 0, torch.cumulative_trapezoid(rest, x)])
         return V - V[(x >= low) & (x <= high)].mean()
 
     def _damping(self, model: ContactLagrangian, i: int, x: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ class _Lines:
         q = self._line(i, x)
         v = torch.zeros_like(q)
         v[:, i] = self.speed[i]
-        return (self._friction(model, q, -v) - self._friction(model, q, v))[:, i].double() / (2 * self.speed[i])
+        return (self._friction(model, q, -v) - self._friction(model, q, v))[:, i].double().cpu() / (2 * self.speed[i])
 
     def _line(self, i: int, x: Tensor) -> Tensor:
         """Positions (K, n): coordinate i along x, the others at their median."""
