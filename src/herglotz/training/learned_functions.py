@@ -178,7 +178,9 @@ class _Lines:
         q = self._line(i, x)
         v = torch.zeros_like(q)
         v[:, i] = self.speed[i]
-        return (self._friction(model, q, -v) - self._friction(model, q, v))[:, i].double().cpu() / (2 * self.speed[i])
+        return (self._friction(model, q, -v) - self._friction(model, q, v))[:, i].double().cpu() / float(
+            2 * self.speed[i]
+        )
 
     def _line(self, i: int, x: Tensor) -> Tensor:
         """Positions (K, n): coordinate i along x, the others at their median."""
