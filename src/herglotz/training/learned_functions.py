@@ -37,6 +37,8 @@ Part = tuple[str, tuple[int, ...], Line]  # kind, coordinates and line of a func
 class LearnedFunction:
     """A function of a model along one coordinate or speed, the other coordinates being at their median.
 
+    Its posterior at x is 𝒩(mean, std²): section 7 of `docs/trajectory.md`.
+
     Parameters
     ----------
     kind
@@ -49,10 +51,10 @@ class LearnedFunction:
     value
         (K,) of the model, in units where the first coordinate's mass is 1.
     low, high
-        The range of x that the training data have.
+        The range of x that the training data have, in the data's units.
     mean, std
-        (K,) of the posterior, in the same units; None without one. The mean differs from `value` where the data ask for
-        more than a model has, or where its steps are not short.
+        (K,) of the posterior, in the units of `value`; None without one. The mean differs from `value` where the data
+        ask for more than a model has, or where its steps are not short.
     """
 
     kind: str
@@ -87,7 +89,7 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
     points
         K, number of points, evenly over the recorded range.
     beyond
-        Part of the range that is added on both sides, where the model extrapolates.
+        Part of the range that is added on both sides, where the model extrapolates; dimensionless.
 
     Returns
     -------

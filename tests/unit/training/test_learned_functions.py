@@ -1,4 +1,4 @@
-"""What a run has learned as functions: their gauge, and bands that hold the truth where no term of the model says it."""
+"""What a run has learned as functions: their gauge, and bands that hold a truth that no term of the model says."""
 
 from dataclasses import replace
 from typing import Any
@@ -16,7 +16,6 @@ from herglotz.training.cross_validation import FOLDS, data_rows, foretold_errors
 from herglotz.training.function_posterior import by_numbers, function_posterior
 from herglotz.training.learned_functions import _Lines
 from herglotz.training.parameter_vector import ParameterVector
-
 
 PLAN = Plan(
     "linear", "trajectory", "none", 2, ("q1^2", "q1^4", "q1^6"), "", 0.0, 0.0, (), 2, {"alike": True},
@@ -43,7 +42,7 @@ def by_kind(functions):
 
 
 def test_a_band_holds_a_function_that_no_term_of_the_model_says(fitted):
-    # fails if the posterior is that of the model's own numbers or if the band is about the model's curve; see SHARES
+    # fails if the posterior is that of the model's own numbers or if the band is about the model's curve
     law, posterior = fitted
     found = by_kind(learned_functions(posterior))
     for kind, least in (("potential", 0.75), ("force", 0.75), ("friction", 0.0)):
@@ -54,6 +53,18 @@ def test_a_band_holds_a_function_that_no_term_of_the_model_says(fitted):
         low, high = f.interval(0.9999)
         assert ((low.numpy() <= true) & (true <= high.numpy())).mean() > 0.95, kind
         assert float(f.std.square().mean().sqrt()) < 0.03 * np.abs(true).max(), kind
+
+
+def test_the_numbers_of_a_model_alone_say_too_little_of_its_functions(fitted):
+    # fails if the fit above could do without the waves: what is measured here is why bands have them
+    law, posterior = fitted
+    run, P = posterior.run, len(posterior.theta)
+    lines = _Lines(run, 101, 0.0)
+    J = by_numbers(run.model, lines.values, posterior.theta)
+    std = ((J @ posterior.covariance[:P, :P]) * J).sum(1).sqrt()[101:202].numpy()
+    force = by_kind(learned_functions(run))["force"]
+    missed = np.abs(truth(law, run, force) - force.value.numpy())
+    assert np.mean(missed < 1.645 * std) < 0.1
 
 
 def test_what_blocks_are_missed_by_is_over_what_the_fit_foretells(fitted):
@@ -152,5 +163,3 @@ def test_what_has_no_band_says_so(fitted):
     assert force.low < force.x[50] < force.high
     wide = by_kind(learned_functions(run, beyond=0.5))["force"]
     assert float(wide.x[-1] - wide.x[0]) == pytest.approx(2 * (force.high - force.low))
-
-
