@@ -82,7 +82,7 @@ def _labels(run: Run) -> dict[str, str]:
 def _draw(ax: Axes, f: LearnedFunction, color: str) -> None:
     ax.axvspan(f.low, f.high, color=SUPPORT, lw=0, zorder=0)
     ax.axhline(0.0, color=MUTED, lw=0.6, zorder=1)
-    if f.mean is not None and f.std is not None:
+    if f.mean is not None and f.std is not None and bool(f.std.isfinite().all()):
         ax.fill_between(f.x, f.mean - 2 * f.std, f.mean + 2 * f.std, color=color, alpha=0.25, lw=0, zorder=2)
     ax.plot(f.x, f.value, color=color, zorder=3)
     ax.set_xlim(float(f.x[0]), float(f.x[-1]))

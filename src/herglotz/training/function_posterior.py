@@ -49,11 +49,17 @@ LEFT = 1e-6  # of a coefficient, where waves stand for its term
 
 @dataclass(frozen=True)
 class FunctionPosterior:
-    """𝒩(θ, covariance) of the numbers of a model with all waves."""
+    """𝒩(θ, f² covariance) of the numbers of a model with all waves."""
 
     model: ContactLagrangian
     theta: Tensor  # (P,)
-    covariance: Tensor  # (P, P)
+    covariance: Tensor  # (P, P) float64, on the CPU
+    factor: float  # f, infinite where left-out blocks of time cannot be foretold
+
+    def std(self, J: Tensor) -> Tensor:
+        """Standard deviations (K,) of values whose derivatives by θ are J (K, P)."""
+        found = ((J.double().cpu() @ self.covariance) * J.double().cpu()).sum(-1).clamp_min(0).sqrt()
+        return found * self.factor if self.factor < math.inf else torch.full_like(found, math.inf)
 
 
 def function_posterior(posterior: Laplace) -> FunctionPosterior:
@@ -61,8 +67,8 @@ def function_posterior(posterior: Laplace) -> FunctionPosterior:
     every = bands(posterior.problem.data, posterior.base, fine=True)
     model = _with_waves(posterior.run.model, every)
     found = None if model is None else _linear(posterior, model, every)
-    P = len(posterior.theta)
-    return found or FunctionPosterior(posterior.run.model, posterior.theta, posterior.covariance[:P, :P])
+    P, own = len(posterior.theta), inverse_of(posterior.information.cpu())
+    return found or FunctionPosterior(posterior.run.model, posterior.theta, own[:P, :P], posterior.inflation)
 
 
 def mass_at(model: ContactLagrangian, q: Tensor, h: float) -> Tensor:
@@ -179,7 +185,7 @@ def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> 
     A[:P, :P] += variance * best.weight
     errors = foretold_errors(problem, path, theta, A.to(theta.device))
     factor = inflation_of(errors, variance**0.5)
-    return FunctionPosterior(model, theta, inverse_of(A)[:P, :P] * variance * factor**2)
+    return FunctionPosterior(model, theta, inverse_of(A)[:P, :P] * variance, factor)
 
 
 def _problem(posterior: Laplace, model: ContactLagrangian, parts: int) -> ShootingProblem:

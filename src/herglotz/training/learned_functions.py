@@ -6,7 +6,7 @@ Positions identify a model only up to a gauge (trap 3 of `docs/mathematics.md`),
 * the potential V is 0 in the mean over the recorded range;
 * friction is 0 at rest: a constant force, which waves of a speed have too, is a tilt of V.
 
-A band is that of the function in this gauge, std² = ∇f · Σ ∇f, with the posterior of `function_posterior`.
+A band is that of the function in this gauge, std² = ∇f · Σ ∇f, with the covariance Σ of `function_posterior`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ class LearnedFunction:
         The range of x that the training data have, in the data's units.
     mean, std
         (K,) of the posterior, in the units of `value`; None without one. The mean differs from `value` where the data
-        ask for more than a model has, or where its steps are not short.
+        ask for more than a model has, or where its steps are not short. `std` is infinite where left-out blocks of
+        time cannot be foretold.
     """
 
     kind: str
@@ -116,8 +117,7 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
             mean = std = [None] * len(value)
         else:
             posterior = function_posterior(of)
-            J = by_numbers(posterior.model, lines.values, posterior.theta).double().cpu()
-            std = ((J @ posterior.covariance.cpu()) * J).sum(-1).clamp_min(0).sqrt().split(points)
+            std = posterior.std(by_numbers(posterior.model, lines.values, posterior.theta)).split(points)
             mean = lines.values(posterior.model).split(points)
     every = zip(lines.parts, value, mean, std, strict=True)
     return [LearnedFunction(kind, i, x, y, low, high, m, s) for (kind, i, (x, low, high)), y, m, s in every]

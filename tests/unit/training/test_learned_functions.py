@@ -11,12 +11,14 @@ from benchmarks import function_bands
 from benchmarks.function_bands import truth
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
+from herglotz.plots import plot_learned
 from herglotz.training import Plan, fit, laplace, learned_functions
 from herglotz.training.cross_validation import FOLDS, data_rows, foretold_errors, held_out_errors
 from herglotz.training.function_posterior import by_numbers, function_posterior
 from herglotz.training.learned_functions import _Lines
 from herglotz.training.parameter_vector import ParameterVector
 
+INF = float("inf")
 PLAN = Plan(
     "linear", "trajectory", "none", 2, ("q1^2", "q1^4", "q1^6"), "", 0.0, 0.0, (), 2, {"alike": True},
     {"stiffness": (0.0,), "tilt": (0.0,), "rate": (0.1,), "potential.features.sum.coefficient": (1.5, -1.0, 0.3)},
@@ -52,6 +54,7 @@ def test_a_band_holds_a_function_that_no_term_of_the_model_says(fitted):
         assert inside.mean() >= least, kind
         low, high = f.interval(0.9999)
         assert ((low.numpy() <= true) & (true <= high.numpy())).mean() > 0.95, kind
+        assert f.std is not None
         assert float(f.std.square().mean().sqrt()) < 0.03 * np.abs(true).max(), kind
 
 
@@ -140,7 +143,18 @@ def test_a_model_of_networks_has_the_posterior_of_its_numbers(fitted):
     posterior = laplace(replace(run, model=networked(run.model)))
     found = function_posterior(posterior)
     assert found.model is posterior.run.model
-    torch.testing.assert_close(found.covariance, posterior.covariance[: len(found.theta), : len(found.theta)])
+    own = posterior.covariance[: len(found.theta), : len(found.theta)]
+    torch.testing.assert_close(found.covariance * found.factor**2, own)
+
+
+def test_blocks_that_cannot_be_foretold_leave_no_band(fitted, monkeypatch):
+    # fails if ∞ times a derivative of 0, of friction at rest, is no number, or the figure does not end
+    posterior = fitted[1]
+    monkeypatch.setattr(
+        "herglotz.training.function_posterior.foretold_errors", lambda *_: torch.tensor([1.0, 1.0, 1.0, INF, INF])
+    )
+    assert all(bool((f.std == INF).all()) for f in learned_functions(posterior) if f.std is not None)
+    assert not any(ax.collections for ax in plot_learned(posterior.run, posterior).axes)
 
 
 def networked(model):
