@@ -1,5 +1,6 @@
 """What a run has learned as functions: their gauge, and bands that hold a truth that no term of the model says."""
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.plots import plot_learned
 from herglotz.training import Plan, fit, laplace, learned_functions
 from herglotz.training.cross_validation import FOLDS, data_rows, foretold_errors, held_out_errors
-from herglotz.training.function_posterior import by_numbers, function_posterior
+from herglotz.training.function_posterior import FunctionPosterior, by_numbers, function_posterior
 from herglotz.training.learned_functions import _Lines
 from herglotz.training.parameter_vector import ParameterVector
 
@@ -150,9 +151,8 @@ def test_a_model_of_networks_has_the_posterior_of_its_numbers(fitted):
 def test_blocks_that_cannot_be_foretold_leave_no_band(fitted, monkeypatch):
     # fails if ∞ times a derivative of 0, of friction at rest, is no number, or the figure does not end
     posterior = fitted[1]
-    monkeypatch.setattr(
-        "herglotz.training.function_posterior.foretold_errors", lambda *_: torch.tensor([1.0, 1.0, 1.0, INF, INF])
-    )
+    unknown = FunctionPosterior(posterior.run.model, posterior.theta, torch.eye(len(posterior.theta)).double(), INF)
+    monkeypatch.setattr(sys.modules["herglotz.training.learned_functions"], "function_posterior", lambda _: unknown)
     assert all(bool((f.std == INF).all()) for f in learned_functions(posterior) if f.std is not None)
     assert not any(ax.collections for ax in plot_learned(posterior.run, posterior).axes)
 
