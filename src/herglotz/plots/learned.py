@@ -33,7 +33,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     run
         A fitted run.
     posterior
-        Adds bands of two standard deviations about the posterior's mean.
+        Adds bands of two standard deviations about the posterior's mean, where the data are.
     """
     every = learned_functions(run if posterior is None else posterior, points=POINTS, beyond=BEYOND)
     columns = min(run.data.dof, MOST_COLUMNS)
@@ -82,7 +82,8 @@ def _labels(run: Run) -> dict[str, str]:
 def _draw(ax: Axes, f: LearnedFunction, color: str) -> None:
     ax.axvspan(f.low, f.high, color=SUPPORT, lw=0, zorder=0)
     ax.axhline(0.0, color=MUTED, lw=0.6, zorder=1)
-    if f.mean is not None and f.std is not None and bool(f.std.isfinite().all()):
-        ax.fill_between(f.x, f.mean - 2 * f.std, f.mean + 2 * f.std, color=color, alpha=0.25, lw=0, zorder=2)
+    if f.mean is not None and f.std is not None and bool((known := f.std.isfinite()).any()):
+        x, mean, width = f.x[known], f.mean[known], 2 * f.std[known]
+        ax.fill_between(x, mean - width, mean + width, color=color, alpha=0.25, lw=0, zorder=2)
     ax.plot(f.x, f.value, color=color, zorder=3)
     ax.set_xlim(float(f.x[0]), float(f.x[-1]))

@@ -54,8 +54,8 @@ class LearnedFunction:
         The range of x that the training data have, in the data's units.
     mean, std
         (K,) of the posterior, in the units of `value`; None without one. The mean differs from `value` where the data
-        ask for more than a model has, or where its steps are not short. `std` is infinite where left-out blocks of
-        time cannot be foretold.
+        ask for more than a model has, or where its steps are not short. `std` is infinite beyond
+        the recorded range, and where left-out blocks of time cannot be foretold.
     """
 
     kind: str
@@ -120,7 +120,10 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
             std = posterior.std(by_numbers(posterior.model, lines.values, posterior.theta)).split(points)
             mean = lines.values(posterior.model).split(points)
     every = zip(lines.parts, value, mean, std, strict=True)
-    return [LearnedFunction(kind, i, x, y, low, high, m, s) for (kind, i, (x, low, high)), y, m, s in every]
+    return [
+        LearnedFunction(kind, i, x, y, low, high, m, _inside(s, x, low, high))
+        for (kind, i, (x, low, high)), y, m, s in every
+    ]
 
 
 class _Lines:
@@ -208,6 +211,11 @@ def _range(values: Tensor, points: int, beyond: float) -> Line:
     low, high = float(values.min()), float(values.max())
     room = beyond * ((high - low) or 1.0)
     return torch.linspace(low - room, high + room, points, dtype=torch.float64), low, high
+
+
+def _inside(std: Tensor | None, x: Tensor, low: float, high: float) -> Tensor | None:
+    """Infinite beyond the recorded range, where waves vanish because nothing is known, not because functions do."""
+    return None if std is None else torch.where((x >= low) & (x <= high), std, torch.inf)
 
 
 def _varies(values: Tensor, among: Tensor | None = None) -> bool:

@@ -149,8 +149,13 @@ def test_a_model_of_networks_has_the_posterior_of_its_numbers(fitted):
 
 
 def test_blocks_that_cannot_be_foretold_leave_no_band(fitted, monkeypatch):
-    # fails if ∞ times a derivative of 0, of friction at rest, is no number, or the figure does not end
+    # fails if ∞ times a derivative of 0, of friction at rest, is no number, or a band is drawn beyond the data
     posterior = fitted[1]
+    figure = plot_learned(posterior.run, posterior)
+    for f, ax in zip(learned_functions(posterior.run), figure.axes, strict=True):
+        (band,) = ax.collections
+        x = band.get_paths()[0].vertices[:, 0]
+        assert f.low <= x.min() < x.max() <= f.high
     unknown = FunctionPosterior(posterior.run.model, posterior.theta, torch.eye(len(posterior.theta)).double(), INF)
     monkeypatch.setattr(sys.modules["herglotz.training.learned_functions"], "function_posterior", lambda _: unknown)
     assert all(bool((f.std == INF).all()) for f in learned_functions(posterior) if f.std is not None)
@@ -176,4 +181,5 @@ def test_what_has_no_band_says_so(fitted):
         learned_functions(run, beyond=-1.0)
     assert force.low < force.x[50] < force.high
     wide = by_kind(learned_functions(run, beyond=0.5))["force"]
+    assert wide.std is None
     assert float(wide.x[-1] - wide.x[0]) == pytest.approx(2 * (force.high - force.low))
