@@ -154,7 +154,7 @@ def test_blocks_that_cannot_be_foretold_leave_no_band(fitted, monkeypatch):
     figure = plot_learned(posterior.run, posterior)
     for f, ax in zip(learned_functions(posterior.run), figure.axes, strict=True):
         (band,) = ax.collections
-        x = band.get_paths()[0].vertices[:, 0]
+        x = np.asarray(band.get_paths()[0].vertices)[:, 0]
         assert f.low <= x.min() < x.max() <= f.high
     unknown = FunctionPosterior(posterior.run.model, posterior.theta, torch.eye(len(posterior.theta)).double(), INF)
     monkeypatch.setattr(sys.modules["herglotz.training.learned_functions"], "function_posterior", lambda _: unknown)
