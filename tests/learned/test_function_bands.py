@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.function_bands import KINDS, measured
 
-# The largest RMS errors over the largest value of five seeds (benchmarks/results/function_bands.json): of the model,
+# The largest RMS errors over the largest value of five seeds (`python benchmarks/function_bands.py`): of the model,
 # and of the posterior's mean.
 WORST = {
     ("well", "potential"): (0.0171, 0.0025), ("well", "force"): (0.0846, 0.0071), ("well", "damping"): (0.254, 0.049),

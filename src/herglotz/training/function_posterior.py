@@ -44,6 +44,7 @@ from herglotz.training.uncertainty import Laplace, inflation_of
 FALLS = (0, 1, 2)  # Matérn processes of ν = 3/2, 5/2, 7/2: the one at which the data are likeliest
 ROUNDS, SETTLED = 200, 0.01  # of strengths, and the relative change that ends them
 HELD = 1e-4  # of the first mass, to which its mean is known
+SAMPLES = 200  # of the data at most, that the mean of the mass is made of
 LEFT = 1e-6  # of a coefficient, where waves stand for its term
 
 
@@ -170,7 +171,8 @@ def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> 
     states = inverse_of(A[P:, P:])
     onto = A[:P, P:] @ states
     q, h = posterior.problem.data.q, posterior.run.h
-    mass = by_numbers(model, lambda m: mass_at(m, q[:: max(1, len(q) // 500)], h)[0, 0].mean().log(), theta)
+    some = q[:: -(-len(q) // SAMPLES)]
+    mass = by_numbers(model, lambda m: mass_at(m, some, h)[0, 0].mean().log(), theta)
     c, count = float(2 * cost - b[P:] @ states @ b[P:]), q.numel() - len(states)
     robust = posterior.problem.freedom is not None
     known = _Known(A[:P, :P] - onto @ A[P:, :P], b[:P] - onto @ b[P:], c, count, mass.double().cpu(), robust)

@@ -23,12 +23,11 @@ from herglotz.models import ContactLagrangian, refuse_own
 from herglotz.models.terms import LinearDamping
 from herglotz.stepping.field import FieldOf
 from herglotz.threads import one_thread
-from herglotz.training.function_posterior import by_numbers, function_posterior, mass_at
+from herglotz.training.function_posterior import SAMPLES, by_numbers, function_posterior, mass_at
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace
 
 CONSTANT = 1e-6  # of the largest value: a function that varies by less is constant, but for rounding of float32
-SAMPLES = 200  # of the data at most, that the mean of the mass is made of
 Line = tuple[Tensor, float, float]  # points x (K,), and the ends of the recorded range
 Part = tuple[str, tuple[int, ...], Line]  # kind, coordinates and line of a function
 
