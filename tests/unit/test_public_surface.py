@@ -15,6 +15,7 @@ import pytest
 
 import herglotz as hz
 from herglotz.cli.parser import build_parser
+from herglotz.training.learned_functions import LearnedFunction
 from herglotz.training.motion import Motion
 from herglotz.training.selection import Selection
 from herglotz.training.uncertainty import Bands
@@ -38,7 +39,8 @@ EXTRAS = re.compile(r"herglotz\.(regressor|environment)\.")
 REFERENCE = {path: _named(path) for path in re.findall(r"^::: (\S+)$", PAGE, re.M) if not EXTRAS.match(path)}
 PUBLIC = {f"hz.{name}": getattr(hz, name) for name in hz.__all__}
 PUBLIC |= {path: value for path, value in REFERENCE.items() if value not in PUBLIC.values()}
-OWNERS = (hz.Run, hz.Stepper, hz.Trajectories, hz.State, hz.FitConfig, hz.ModelConfig, Motion, Selection, Bands)
+OWNERS = (hz.Run, hz.Stepper, hz.Trajectories, hz.State, hz.FitConfig, hz.ModelConfig)
+OWNERS += (Motion, Selection, Bands, LearnedFunction)
 
 
 UNIT = re.compile(r"\bunits?\b|\brad\b|dimensionless|relative to")

@@ -4,6 +4,10 @@ from herglotz.training.choose import choose as choose
 from herglotz.training.config import FitConfig as FitConfig
 from herglotz.training.fit import fit as fit
 from herglotz.training.identifiability import traded as traded
+from herglotz.training.learned_functions import (
+    LearnedFunction as LearnedFunction,
+    learned_functions as learned_functions,
+)
 from herglotz.training.look import Look as Look, look as look
 from herglotz.training.plan import Plan as Plan
 from herglotz.training.problems.one_step import ResidualProblem as ResidualProblem

@@ -54,13 +54,31 @@ def held_out_errors(
     white noise, would both be fooled by their neighbours. Starts that are known far better than by σ are never left
     out: a free run begins there.
     """
-    r, J = data_rows(problem, path, theta)
-    values, vectors = torch.linalg.eigh(dense(A).double())
-    known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
-    r, G = r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())  # G Gᵀ = J A⁻¹ Jᵀ
+    r, G = _whitened(*data_rows(problem, path, theta), dense(A))
     better = problem.better.flatten().to(r)  # counts in r and J, and not in errors in units of q
     errors = left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
     return errors * problem.sigma
+
+
+def foretold_errors(problem: ShootingProblem, path: Path, theta: Tensor, A: Tensor) -> Tensor:
+    """`held_out_errors` over what the fit without a fold expects there: (FOLDS,), 1 where residuals are white, of σ.
+
+    With H = J_B A⁻¹ J_Bᵀ a fit without the rows B misses them by e = (I − H)⁻¹ r_B, whose covariance is (I − H)⁻¹ where
+    the model is true: this is the root of eᵀ(I − H) e / |B|. Where parameters are many, errors of left-out blocks are
+    large because these blocks tell what nothing else does.
+    """
+    size = A.diagonal().sqrt()  # weights of waves differ by many orders
+    r, J = data_rows(problem, path, theta)
+    r, G = _whitened(r, J.double() / size, A / size[:, None] / size)
+    each = lambda rows: (r[rows] @ _left_out(G[rows], r[rows]) / rows.sum()).sqrt()[None]  # noqa: E731
+    return left_out_errors(r, problem.data, each, problem.better.flatten() > SURE)
+
+
+def _whitened(r: Tensor, J: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
+    """Data residuals (N·n,), and G (N·n, K) with G Gᵀ = J A⁻¹ Jᵀ, float64."""
+    values, vectors = torch.linalg.eigh(A.double())
+    known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
+    return r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())
 
 
 def data_rows(problem: ShootingProblem, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement, groupby
 from typing import NamedTuple
@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.models.drag import parse_drag
 from herglotz.models.features import parse
 from herglotz.training.baseline import Baseline
 from herglotz.training.named_terms import NamedTerms, own_terms
@@ -50,18 +51,23 @@ class Band(NamedTuple):
         return self.name.startswith(("damping", "friction"))
 
 
-def bands(data: Trajectories, base: Baseline) -> list[Band]:
-    """All functions that these coordinates may be given beside their named terms."""
+def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Band]:
+    """All functions that these coordinates may be given beside their named terms.
+
+    `fine`: the damping and the mass of one coordinate have waves as short as its potential's, which are too many for a
+    search.
+    """
     found: dict[str, list[tuple[str, float]]] = {}
     several = data.dof > 1
+    pairs, mass = (POTENTIAL // 2, POTENTIAL) if fine and not several else (DAMPING, MASS)
     for i, angle in enumerate(data.angles):
         own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], OF_MANY if several else POTENTIAL)
         found[f"V(q{i + 1})"] = own
-        around = own if angle else _pairs(data, i)
-        found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * DAMPING]]
+        around = own if angle else _pairs(data, i, pairs)
+        found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * pairs]]
         found[f"friction(v{i + 1})"] = _of_speed(f"v{i + 1}", base.speed[i])
         if not several:
-            found["mass(q1)"] = [(f"{x} v1^2", k) for x, k in own[: 2 * MASS if angle else MASS]]
+            found["mass(q1)"] = [(f"{x} v1^2", k) for x, k in own[: 2 * mass if angle else mass]]
         elif angle:
             for a, b in combinations_with_replacement(range(1, data.dof + 1), 2):
                 found[f"mass(q{i + 1}) of v{a} v{b}"] = [(f"{x} v{a} v{b}", k) for x, k in own[2:4]]
@@ -77,14 +83,23 @@ def bands(data: Trajectories, base: Baseline) -> list[Band]:
 
 def terms_with(every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
     """The terms with all waves of these functions, which take the place of powers in the potential but the lowest."""
-    own = own_terms(angles)
-    kept = [
-        text for text in terms.features
-        if "v" in text or text in own or parse(text, angles)[0].function in ("cos", "sin")
-    ]  # fmt: skip
+    gone = replaced(terms.features, (), angles)
+    kept = [text for text in terms.features if text not in gone]
     waves = {brakes: [text for own in every if own.brakes == brakes for text in own.texts] for brakes in (False, True)}
     still = NamedTerms(tuple(waves[False]), tuple(waves[True]))
     return replace(terms, features=tuple(kept)).joined(still)
+
+
+def replaced(features: Iterable[str], drag: Iterable[str], angles: tuple[bool, ...]) -> set[str]:
+    """Those of these terms that functions can stand for: powers in the potential, and drag of one coordinate alone."""
+    own = own_terms(angles)
+    still = {
+        text for text in features
+        if "v" not in text and text not in own and parse(text, angles)[0].function not in ("cos", "sin")
+    }  # fmt: skip
+    parsed = {text: parse_drag(text, angles) for text in drag}
+    alone = {x for x, f in parsed.items() if f.of is None and f.at == f.on and (f.b or f.c) and not (f.air or f.wave)}
+    return still | alone
 
 
 def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
@@ -142,9 +157,9 @@ def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> lis
     return found
 
 
-def _pairs(data: Trajectories, i: int) -> list[tuple[str, float]]:
+def _pairs(data: Trajectories, i: int, count: int) -> list[tuple[str, float]]:
     """Waves of one coordinate whose period is its interval."""
-    return _periodic(f"q{i + 1}", _interval(data, [(i, 1.0)])[1], DAMPING)
+    return _periodic(f"q{i + 1}", _interval(data, [(i, 1.0)])[1], count)
 
 
 def _of_speed(speed: str, largest: float) -> list[tuple[str, float]]:

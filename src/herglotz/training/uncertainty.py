@@ -95,8 +95,7 @@ class Laplace:
         x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
         A = dense(self.problem.normal_equations(x)[1])
         errors = held_out_errors(self.problem, self.path, self.theta, A)
-        held_out = float("inf") if int(errors.isinf().sum()) > 1 else float(errors.median())
-        self.inflation = max(1.0, held_out / self.sigma) if held_out < float("inf") else float("inf")
+        self.inflation = inflation_of(errors, self.sigma)
         self.information = A.double()  # prior included
         self.covariance = inverse_of(self.information) * self.inflation**2
 
@@ -178,6 +177,11 @@ class Laplace:
         if path is None:
             raise InputError("the model cannot be run over its own data, so it has no bands; fit it again")
         return problem, path
+
+
+def inflation_of(errors: Tensor, sigma: float) -> float:
+    """The factor of deviations: the median of RMS `errors` over held-out blocks over σ, 1 at least."""
+    return float("inf") if int(errors.isinf().sum()) > 1 else max(1.0, float(errors.median()) / sigma)
 
 
 @one_thread()

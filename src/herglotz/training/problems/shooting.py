@@ -58,13 +58,13 @@ class ShootingProblem(StatesProblem):
         *,
         used: Tensor | None = None,  # (N,) which samples have a say; all without it. The others are outliers
         s: Tensor | None = None,  # (N,) in the model's unit, where it is known: trajectories start from it, not near 0
+        compiled: bool = True,  # by a kernel, where there can be one: not worth it for a few evaluations
         **settings: Any,  # of `LeastSquares`; `freedom` is for the residuals of data and joints
     ):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
-        self.s, self._precise = s, None
+        self.s, self._precise, self.jointed = s, None, bool(grid.joined.any())
         self.masses = JointMasses(self.parameters, data.q)  # that momenta of joints are over
-        self.jointed = bool(grid.joined.any())
         self._weigh()
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
@@ -72,7 +72,7 @@ class ShootingProblem(StatesProblem):
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
         self.zeros = data.q.new_zeros(())  # what the sensors read at 0, (N, n), where `WithZeros` fits it
-        placed = kernel_of(model) if s is None and world()[1] == 1 else None
+        placed = kernel_of(model) if compiled and s is None and world()[1] == 1 else None
         sharpest = dict(model.named_buffers()).get("friction.sharpest")
         self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, sharpest, self.n)
 

@@ -1,0 +1,223 @@
+"""What a model has learned, as functions of one coordinate or speed, with the bands of their posterior.
+
+Positions identify a model only up to a gauge (trap 3 of `docs/mathematics.md`), and functions are compared in this one:
+
+* the first entry of the mass is 1 in the mean over the data, so that forces are accelerations of the first coordinate;
+* the potential V is 0 in the mean over the recorded range;
+* friction is 0 at rest: a constant force, which waves of a speed have too, is a tilt of V.
+
+A band is that of the function in this gauge, std² = ∇f · Σ ∇f, with the covariance Σ of `function_posterior`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import torch
+from torch import Tensor
+
+from herglotz.data.splits import leading
+from herglotz.errors import InputError, refuse
+from herglotz.models import ContactLagrangian, refuse_own
+from herglotz.models.terms import LinearDamping
+from herglotz.stepping.field import FieldOf
+from herglotz.threads import one_thread
+from herglotz.training.function_posterior import SAMPLES, by_numbers, function_posterior, mass_at
+from herglotz.training.run import Run
+from herglotz.training.uncertainty import Laplace
+
+CONSTANT = 1e-6  # of the largest value: a function that varies by less is constant, but for rounding of float32
+Line = tuple[Tensor, float, float]  # points x (K,), and the ends of the recorded range
+Part = tuple[str, tuple[int, ...], Line]  # kind, coordinates and line of a function
+
+
+@dataclass(frozen=True)
+class LearnedFunction:
+    """A function of a model along one coordinate or speed, the other coordinates being at their median.
+
+    Its posterior at x is 𝒩(mean, std²): section 7 of `docs/trajectory.md`.
+
+    Parameters
+    ----------
+    kind
+        "potential" V, "force" −∂V/∂q_i, "friction" f_i(v_i), "damping" −f_i/v_i by position at the RMS speed, or
+        "mass" m_jk.
+    of
+        (i,) the coordinate, from 0; of a mass (j, k, i), its entry and the coordinate that it is a function of.
+    x
+        (K,) positions or speeds, in the data's units.
+    value
+        (K,) of the model, in units where the first coordinate's mass is 1.
+    low, high
+        The range of x that the training data have, in the data's units.
+    mean, std
+        (K,) of the posterior, in the units of `value`; None without one. The mean differs from `value` where the data
+        ask for more than a model has, or where its steps are not short. `std` is infinite beyond
+        the recorded range, and where left-out blocks of time cannot be foretold.
+    """
+
+    kind: str
+    of: tuple[int, ...]
+    x: Tensor  # (K,)
+    value: Tensor  # (K,)
+    low: float
+    high: float
+    mean: Tensor | None = None  # (K,)
+    std: Tensor | None = None  # (K,)
+
+    def interval(self, level: float = 0.9) -> tuple[Tensor, Tensor]:
+        """Lower and upper end of the central interval of the posterior, (K,) each."""
+        refuse({f"level must be between 0 and 1, got {level:g}; 0.9 is usual": not 0 < level < 1})
+        if self.mean is None or self.std is None:
+            raise InputError("a function without a posterior has no band; give one: learned_functions(laplace(run))")
+        width = NormalDist().inv_cdf(0.5 + level / 2) * self.std
+        return self.mean - width, self.mean + width
+
+
+@one_thread()
+def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0.0) -> list[LearnedFunction]:
+    """The functions that a run has learned, along each coordinate, with bands where its posterior is given.
+
+    Each coordinate has its potential and force; friction where the model has any; damping and the entries of the mass
+    where they depend on position. The gauge is that of the head of this module (section 7 of `docs/trajectory.md`).
+
+    Parameters
+    ----------
+    of
+        A fitted run, or its posterior, `laplace(run)`.
+    points
+        K, number of points, evenly over the recorded range.
+    beyond
+        Part of the range that is added on both sides, where the model extrapolates; dimensionless.
+
+    Returns
+    -------
+    list of LearnedFunction
+        Potential, force, friction, damping and mass of the first coordinate, and so on.
+
+    Raises
+    ------
+    InputError
+        If the model is one's own module, there are fewer than two points, or `beyond` is negative.
+
+    Examples
+    --------
+    >>> potential, force, *others = learned_functions(laplace(run))
+    >>> low, high = force.interval(0.9)
+    """
+    run = of.run if isinstance(of, Laplace) else of
+    refuse_own(run.model, "its functions", "evaluate the module itself")
+    refuse({f"points must be 2 or more, got {points}": points < 2, f"beyond must be >= 0, got {beyond:g}": beyond < 0})
+    lines = _Lines(run, points, beyond)
+    with torch.no_grad():
+        value = lines.values(run.model).split(points)
+        if not isinstance(of, Laplace):
+            mean = std = [None] * len(value)
+        else:
+            posterior = function_posterior(of)
+            std = posterior.std(by_numbers(posterior.model, lines.values, posterior.theta)).split(points)
+            mean = lines.values(posterior.model).split(points)
+    every = zip(lines.parts, value, mean, std, strict=True)
+    return [
+        LearnedFunction(kind, i, x, y, low, high, m, _inside(s, x, low, high))
+        for (kind, i, (x, low, high)), y, m, s in every
+    ]
+
+
+class _Lines:
+    """The lines that a run's functions are evaluated on."""
+
+    @torch.no_grad()
+    def __init__(self, run: Run, points: int, beyond: float):
+        self.h, q, steps = run.h, run.states.q.detach(), run.data.steps()
+        trained = leading(run.data.lengths, run.train_lengths).to(q.device)
+        v = (q[steps.index + 1] - q[steps.index]) / steps.h[:, None]
+        q, v = q[trained & q.isfinite().all(-1)], v[trained[steps.index + 1] & v.isfinite().all(-1)]
+        self.some = q[:: -(-len(q) // SAMPLES)]
+        self.middle, self.speed = q.median(0).values, v.square().mean(0).sqrt()
+        self.parts = [
+            part
+            for i in range(run.data.dof)
+            for part in self._of(run.model, i, _range(q[:, i], points, beyond), _range(v[:, i], points, beyond))
+        ]
+
+    def _of(self, model: ContactLagrangian, i: int, at: Line, speeds: Line) -> list[Part]:
+        """The functions of one coordinate."""
+        found: list[Part] = [("potential", (i,), at), ("force", (i,), at)]
+        rubs = isinstance(model.damping, LinearDamping)
+        found += [("friction", (i,), speeds)] if rubs else []
+        found += [("damping", (i,), at)] if rubs and _varies(self._damping(model, i, at[0])) else []
+        m = mass_at(model, self._line(i, at[0]), self.h)
+        pairs = ((j, k) for j in range(len(m)) for k in range(j, len(m)))
+        return [*found, *(("mass", (j, k, i), at) for j, k in pairs if _varies(m[j, k], m))]
+
+    def values(self, model: ContactLagrangian) -> Tensor:
+        """All functions of a model in the gauge, one after the other, float64."""
+        unit = mass_at(model, self.some, self.h)[0, 0].double().cpu().mean()
+        return torch.cat([self._value(model, kind, of, *line) / unit for kind, of, line in self.parts])
+
+    def _value(
+        self, model: ContactLagrangian, kind: str, of: tuple[int, ...], x: Tensor, low: float, high: float
+    ) -> Tensor:
+        i = of[-1]
+        if kind == "friction":
+            v = self.middle.new_zeros(len(x), len(self.middle))
+            v[:, i] = x.to(v)
+            q = self.middle.expand_as(v)
+            return (self._friction(model, q, v) - self._friction(model, q, 0 * v))[:, i].double().cpu()
+        if kind == "damping":
+            return self._damping(model, i, x)
+        q = self._line(i, x)
+        if kind == "mass":
+            return mass_at(model, q, self.h)[of[0], of[1]].double().cpu()
+        field, rest = FieldOf(model.potential)(q), self._friction(model, q, 0 * q)[:, i].double().cpu()
+        if kind == "force":
+            return rest - field.slope[:, i].double().cpu()
+        V = field.V.double().cpu() - torch.cat([rest[:1] * 0, torch.cumulative_trapezoid(rest, x)])
+        return V - V[(x >= low) & (x <= high)].mean()
+
+    def _damping(self, model: ContactLagrangian, i: int, x: Tensor) -> Tensor:
+        """−f_i/v_i, the mean of both directions, at the RMS speed."""
+        q = self._line(i, x)
+        v = torch.zeros_like(q)
+        v[:, i] = self.speed[i]
+        return (self._friction(model, q, -v) - self._friction(model, q, v))[:, i].double().cpu() / float(
+            2 * self.speed[i]
+        )
+
+    def _line(self, i: int, x: Tensor) -> Tensor:
+        """Positions (K, n): coordinate i along x, the others at their median."""
+        q = self.middle.expand(len(x), -1).clone()
+        q[:, i] = x.to(q)
+        return q
+
+    def _friction(self, model: ContactLagrangian, q: Tensor, v: Tensor) -> Tensor:
+        """−γ m v of the contact term at s = 0, and the forces beside L but those of inputs, (K, n)."""
+        if not isinstance(model.damping, LinearDamping):
+            return 0.0 * v
+        h, rate = torch.full_like(q[:, 0], self.h), model.damping.rate
+        force = -rate * (mass_at(model, q, self.h).movedim(-1, 0) @ v[..., None])[..., 0]
+        parts = model.forces(q - h[:, None] * v / 2, q + h[:, None] * v / 2, torch.zeros_like(h), h)
+        if parts is None:
+            return force
+        c = 1.0 if model.action is not None else (-rate * h).exp()[:, None]
+        return force + (parts[0] / c + parts[1]) / h[:, None]
+
+
+def _range(values: Tensor, points: int, beyond: float) -> Line:
+    """Points over the range of values and beyond, and the range."""
+    low, high = float(values.min()), float(values.max())
+    room = beyond * ((high - low) or 1.0)
+    return torch.linspace(low - room, high + room, points, dtype=torch.float64), low, high
+
+
+def _inside(std: Tensor | None, x: Tensor, low: float, high: float) -> Tensor | None:
+    """Infinite beyond the recorded range, where waves vanish because nothing is known, not because functions do."""
+    return None if std is None else torch.where((x >= low) & (x <= high), std, torch.inf)
+
+
+def _varies(values: Tensor, among: Tensor | None = None) -> bool:
+    """Whether a function varies by more than rounding."""
+    size = (values if among is None else among).abs().amax()
+    return bool(values.amax() - values.amin() > CONSTANT * size)
