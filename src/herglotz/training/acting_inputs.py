@@ -17,7 +17,7 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import SATURATIONS, all_input_terms, saturation
 from herglotz.data.smoothing import smoothed
 from herglotz.least_squares import least_squares
-from herglotz.training.dry_friction import acceleration_terms, for_each
+from herglotz.training.acceleration_terms import acceleration_terms, for_each
 from herglotz.training.offers import INPUTS
 from herglotz.training.trials import Trial, Variant
 

@@ -140,7 +140,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
         **seen.why_arrival,
         "input_terms": seen.why_input_terms or AS_SET,
         "zeros": seen.why_zeros or "no recording was found to differ from the others",
-        "forces": _forces_reason(seen),
+        "forces": seen.structure or AS_SET,
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),
         "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
@@ -178,12 +178,6 @@ def _level_reason(seen: Look, config: FitConfig) -> str:
     if seen.data.u is not None:
         return "inputs are recorded"
     return "dry or coupled friction is a force" if config.coulomb or config.coupled else "the simplest with damping"
-
-
-def _forces_reason(seen: Look) -> str:
-    """Why the model has the friction it has: the terms found, and whether driven data show dry friction."""
-    asked = seen.structure is None or seen.data.u is not None
-    return "; ".join(x for x in (seen.structure, seen.friction if asked else None) if x)
 
 
 def _outlier_reason(seen: Look) -> str:

@@ -82,9 +82,8 @@ class FitConfig:
         Dry friction beside the viscous one at the forced level.
     sticking
         Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
-        are fitted, from a start with smooth friction. None: where nothing is said of level, objective and friction, and
-        driven data show dry friction (`herglotz.training.dry_friction`); a search for named terms that finds dry
-        friction tries it, too (`herglotz.training.search`).
+        are fitted, from a start with smooth friction. None: where a search for named terms finds dry friction and this
+        is as likely (`herglotz.training.search`).
     robust
         Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
         squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the

@@ -15,7 +15,7 @@ def with_dissipation(search: Search, best: Trial) -> Trial:
     A search is worth its time where s² makes a better model of this one, or this one follows nothing for long. One
     starts with s²: where s and its coefficient are 0, the motion changes with neither.
     """
-    if best.at_the_noise or search.config.translations:
+    if best.at_the_noise or search.config.translations or search.config.sticking:
         return best
     part(MORE_TERMS)
     fitter, lowest = search.fitter(Variant(2, dissipation=tuple(POWERS))), next(iter(POWERS))

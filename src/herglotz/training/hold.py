@@ -1,9 +1,9 @@
 """What happens to recorded inputs before they act, where neither the data nor the user say it.
 
 The hold between samples, a delay and the lag of an actuator (`herglotz.data.actuator`) make other inputs of the steps.
-One linear problem is solved for each: accelerations by differences against `dry_friction.acceleration_terms`, dry
-friction and what joints move in one another. Differences amplify noise: over short windows the problem is made
-one of positions again, whose noise is white. What misses them less, by more than a tenth and beyond the spread of
+One linear problem is solved for each: accelerations by differences against `acceleration_terms`, dry friction and what
+joints move in one another. Differences amplify noise: over short windows the problem is made one
+of positions again, whose noise is white. What misses them less, by more than a tenth and beyond the spread of
 that gain over blocks of time, is taken: first a hold, then a delay or a lag, then both.
 """
 
@@ -23,12 +23,13 @@ from herglotz.data.smoothing import smoothed
 from herglotz.data.splits import liveliest_rows
 from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
+from herglotz.training.acceleration_terms import acceleration_terms, for_each
 from herglotz.training.baseline import differences
-from herglotz.training.dry_friction import BLOCKS, acceleration_terms, for_each
 
 # The mean over blocks of log(mean square without / with). Measured: 0.36 to 3.9 for delays of 0.4 and 2.3 steps that
 # noise of 1 % lets see, up to 0.16 for errors of the linear model itself.
 WORTH = 0.2
+BLOCKS = 10  # of time
 CLEARLY = 3.0  # standard errors over blocks
 MOST = 3000  # samples that are looked at
 TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)  # delays and lags, in typical steps

@@ -20,7 +20,6 @@ from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline, across_translations, estimate_baseline, outliers_pull
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
-from herglotz.training.dry_friction import friction_holds
 from herglotz.training.hold import with_arrival
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
@@ -72,7 +71,6 @@ class Look:
     why_arrival: dict[str, str]  # the reason of each of its fields
     zeros: tuple[float, ...]  # (B · n) what the sensors read at 0, recording after recording; empty: 0; `data` has q
     why_zeros: str  # why they are what they are; empty: no recording was found to differ
-    friction: str  # why friction is set-valued or not
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
@@ -142,11 +140,11 @@ def _seen(
     outliers = settings.robust == "on" or bool(dropped.any())
     outliers = outliers or (settings.robust == "auto" and outliers_pull(kept, drag=drag))
     settings = settings if plan is None else plan.applied(settings)
-    settings, why_friction = _with_friction(kept, settings, user_settings, plan)
+    settings = replace(settings, sticking=bool(settings.sticking))  # what is not said a search for terms asks
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
     base = across_translations(base, kept, settings.translations, outliers=outliers)
     seen = Look(
-        data, train, unseen, kept, dropped, outliers, arrival, why_arrival, zeros, why_zeros="", friction=why_friction,
+        data, train, unseen, kept, dropped, outliers, arrival, why_arrival, zeros, why_zeros="",
         noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
     if plan is None:
@@ -185,8 +183,7 @@ def _with_terms(
     """Named terms that follow trajectories, or terms of a dictionary of features, or those of the baseline."""
     kept, base, settings = seen.kept, seen.base, seen.settings
     if terms_are_free(kept, user_settings):
-        # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
-        plain = replace(settings, sticking=settings.sticking or user_settings.sticking)
+        plain = replace(settings, sticking=user_settings.sticking)
         find = lambda: known or search(kept, base, plain, outliers=seen.outliers, holds=holds)  # noqa: E731
         found = kept_structure("terms", find, base, settings, stages)
         seen = replace(seen, structure=found.reason, found=found)
@@ -198,22 +195,6 @@ def _with_terms(
     elif settings.features:
         seen = replace(seen, base=start_of_features(kept, base, settings))
     return replace(seen, baseline_motion=_baseline_motion(seen.task(stages)))
-
-
-def _with_friction(
-    kept: Trajectories, settings: FitConfig, user_settings: FitConfig, plan: Plan | None
-) -> tuple[FitConfig, str]:
-    """The settings with friction that is set-valued or not, and why; driven data are asked where nothing is said."""
-    c = user_settings
-    plain = (c.level, c.objective, c.supervision, c.optimiser) == ("auto", "auto", "q", "lm") and not c.coulomb
-    if plan is not None or settings.sticking is not None:
-        return settings, "as set, or by default"
-    if kept.u is None or not plain:
-        return replace(
-            settings, sticking=False
-        ), "sticking is looked for in driven data alone, where no setting decides"
-    sticking, why = friction_holds(kept)
-    return replace(settings, sticking=sticking), why
 
 
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:

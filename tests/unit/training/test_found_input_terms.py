@@ -70,7 +70,7 @@ def test_the_level_at_which_an_input_saturates_is_found():
     assert [(of[0], of[2]) for of in offered if of] == [("sat", "u"), ("tanh", "u")]
     assert offered[0] is not None
     assert offered[0][1] == pytest.approx(0.6, rel=0.15)
-    first = search.first()
+    first = search.first
     assert first is not None
     (term,) = search.input_terms(first)
     found = saturation(term)
