@@ -36,6 +36,7 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any], *, unroll: in
     """
     try:
         import onnx  # noqa: F401
+        import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise InputError(f"ONNX export needs {error.name}; install it with: pip install 'herglotz[export]'") from None
@@ -99,7 +100,20 @@ def graph_of(
     del proto.graph.value_info[:]
     proto.producer_name, proto.ir_version = "herglotz", min(proto.ir_version, 10)
     helper.set_model_props(proto, dict(properties))
-    return proto.SerializeToString()
+    return _runnable(proto.SerializeToString())
+
+
+def _runnable(content: bytes) -> bytes:
+    """A model that onnxruntime has every operation of: many it has in float32 only."""
+    import onnxruntime as ort
+
+    options = ort.SessionOptions()
+    options.graph_optimization_level, options.log_severity_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL, 4
+    try:
+        ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions have no common class
+        raise InputError(f"ONNX export: {error}; export to --format pt2 or c") from error
+    return content
 
 
 def _reason(error: Exception) -> InputError:

@@ -8,15 +8,15 @@ from typing import Any
 
 import onnx_ir as ir
 import torch
+from onnx_ir.tensor_adapters import from_torch_dtype
 from onnxscript.function_libs.torch_lib import ops as _  # noqa: F401  it fills the registry
 from onnxscript.function_libs.torch_lib.registration import default_registry
-from onnxscript.onnx_opset import opset20 as op
 from torch import fx
 
 from herglotz.codegen.trace import Example
 from herglotz.errors import InputError
 from herglotz.export.inline import graph_of_key, results_of
-from herglotz.export.lower.onnx_operations import OPERATIONS
+from herglotz.export.lower.onnx_operations import OPERATIONS, op
 
 Values = dict[fx.Node, Any]
 OF_STORAGE = (torch.device, torch.layout, torch.memory_format)  # options that ONNX has no need of
@@ -62,7 +62,7 @@ def _given(x: Any, values: Values) -> Any:
         return {name: _given(y, values) for name, y in x.items()}
     if isinstance(x, (list, tuple)):
         return [_given(y, values) for y in x]
-    return int(ir.tensor_adapters.from_torch_dtype(x)) if isinstance(x, torch.dtype) else x
+    return int(from_torch_dtype(x)) if isinstance(x, torch.dtype) else x
 
 
 def _describe(value: Any, example: Any, batch: int) -> None:
@@ -71,7 +71,7 @@ def _describe(value: Any, example: Any, batch: int) -> None:
         for x, y in zip(value, example, strict=True):
             _describe(x, y, batch)
     elif isinstance(example, Example):
-        value.dtype = ir.tensor_adapters.from_torch_dtype(example.dtype)
+        value.dtype = from_torch_dtype(example.dtype)
         value.shape = ir.Shape([None if x and x % batch == 0 else x for x in example.shape])
     else:
         value.dtype, value.shape = ir.DataType.INT64, ir.Shape([])

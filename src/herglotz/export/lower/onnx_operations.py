@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import onnx_ir as ir
 import torch
-from onnxscript.onnx_opset import opset20 as op
+from onnxscript.onnx_opset import opset20
 
-from herglotz.errors import refuse
+from herglotz.errors import InputError
 
 aten = torch.ops.aten
+op: Any = opset20
 Value = Any  # an `onnx_ir.Value`, whose operators onnxscript writes down
 
 
@@ -29,6 +30,16 @@ def constant(value: Any, dtype: ir.DataType) -> Value:
 def integers(*values: int) -> Value:
     """Axes, indices, a shape."""
     return op.Constant(value_ints=list(values))
+
+
+def weighted(kind: Callable[..., Value]) -> Callable[..., Value]:
+    """`add` or `sub` of x and α y."""
+
+    def written(x: Value, y: Value | float, alpha: float = 1) -> Value:
+        y = constant(y, x.dtype) if isinstance(y, (int, float)) else y
+        return kind(x, y if alpha == 1 else op.Mul(constant(alpha, x.dtype), y))
+
+    return written
 
 
 def subtracted_from(x: Value, number: float, alpha: float = 1) -> Value:
@@ -116,6 +127,11 @@ def product(a: Value, b: Value) -> Value:
     return op.Gemm(a, b)
 
 
+def products(a: Value, b: Value) -> Value:
+    """`bmm`, for which there is no Gemm."""
+    return op.Einsum(a, b, equation="bij,bjk->bik")
+
+
 def product_with_vector(a: Value, b: Value) -> Value:
     """`mv`."""
     return op.Squeeze(op.Gemm(a, op.Unsqueeze(b, integers(1))), integers(1))
@@ -131,32 +147,26 @@ def split(x: Value, sizes: Sequence[int], dim: int = 0) -> list[Value]:
 
 def entry_backward(g: Value, sizes: Sequence[Any], dim: int, index: int) -> Value:
     """`select_backward`, the derivative of one entry of an axis: zeros around g."""
-    return entries_backward(
-        op.Unsqueeze(g, integers(dim)), sizes, dim, index % sizes[dim], index % sizes[dim] + 1, 1, g.dtype
-    )
+    first = index % sizes[dim]
+    return _among_zeros(op.Unsqueeze(g, integers(dim)), dim, (first, sizes[dim] - first - 1), g.dtype)
 
 
-def entries_backward(
-    g: Value, sizes: Sequence[Any], dim: int, start: int, end: int, step: int, dtype: ir.DataType | None = None
-) -> Value:
+def entries_backward(g: Value, sizes: Sequence[Any], dim: int, start: int, end: int, step: int) -> Value:
     """`slice_backward`, the derivative of entries side by side: zeros around g."""
-    size = sizes[dim]
-    refused = {
-        f"ONNX export does not know a derivative of every {step} entries; export to --format pt2 or c": step != 1
-    }
-    refuse(refused)
-    start, end = (min(max(k + size if k < 0 else k, 0), size) for k in (start, end))
-    return op.Pad(g, integers(start, size - end), constant(0.0, dtype or g.dtype), integers(dim))
+    if step != 1:
+        raise InputError(f"ONNX export does not know a slice_backward of step {step}; export to --format pt2 or c")
+    first, last, _ = slice(start, end).indices(sizes[dim])
+    return _among_zeros(g, dim, (first, sizes[dim] - last), g.dtype)
 
 
-def diagonal_matrix(x: Value, offset: int = 0, dim1: int = -2, dim2: int = -1) -> Value:
+def _among_zeros(g: Value, dim: int, counts: tuple[int, int], dtype: ir.DataType) -> Value:
+    return op.Pad(g, integers(*counts), constant(0.0, dtype), integers(dim))
+
+
+def diagonal_matrix(x: Value, *places: int) -> Value:
     """`diag_embed`."""
-    refuse(
-        {
-            "ONNX export knows diag_embed of the main diagonal only; export to --format pt2 or c": (offset, dim1, dim2)
-            != (0, -2, -1)
-        }
-    )
+    if places:
+        raise InputError(f"ONNX export does not know a diag_embed at {places}; export to --format pt2 or c")
     return op.Mul(op.Unsqueeze(x, integers(-1)), constant(np.eye(x.shape[-1]), x.dtype))
 
 
@@ -178,8 +188,10 @@ def inverse(A: Value, **_: Any) -> list[Value]:
 OPERATIONS: dict[Any, Callable[..., Any]] = {
     aten.__and__.Tensor: op.And,
     aten.__or__.Tensor: op.Or,
+    aten.add.Tensor: weighted(op.Add),
     aten.addcmul.default: added_product,
     aten.atanh.default: atanh,
+    aten.bmm.default: products,
     aten.diag_embed.default: diagonal_matrix,
     aten.expm1.default: expm1,
     aten.full_like.default: filled_like,
@@ -196,6 +208,7 @@ OPERATIONS: dict[Any, Callable[..., Any]] = {
     aten.sigmoid_backward.default: sigmoid_backward,
     aten.slice_backward.default: entries_backward,
     aten.split_with_sizes.default: split,
+    aten.sub.Tensor: weighted(op.Sub),
     aten.tanh_backward.default: tanh_backward,
     aten.threshold_backward.default: threshold_backward,
 }
