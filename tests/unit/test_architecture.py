@@ -17,11 +17,14 @@ RUNTIME = {"torch", "numpy", "matplotlib", "PIL", "tqdm", "herglotz"} | set(
 # Extras that only some users install, with the files that may import them: inside functions, but for those of `ABOVE`.
 EXTRAS = {
     "onnx": ("export/lower/onnx*.py", "export/load.py"),
+    "onnx_ir": ("export/lower/onnx*.py",),
     "onnxruntime": ("export/lower/onnx*.py", "export/load.py"),
+    "onnxscript": ("export/lower/onnx*.py",),
     "sklearn": ("regressor.py",),
     "gymnasium": ("environment.py",),
 }
-ABOVE = ("environment.py", "regressor.py")  # they stand above the rooms, and are loaded where they are asked for
+# These stand above the rooms, or are written in onnxscript, and are loaded where they are asked for.
+ABOVE = ("environment.py", "regressor.py", "onnx_graph.py", "onnx_operations.py")
 FILES = sorted(SOURCE.rglob("*.py"))
 
 

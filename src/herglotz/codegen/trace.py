@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -297,26 +297,3 @@ def _without_writing(func: Any) -> Any:
     if not name.endswith("_") or other is None:
         raise InputError(f"{func} writes in place, which files cannot step; use the form that returns a new tensor")
     return other
-
-
-def assembled(
-    batch: int,
-    inputs: Sequence[fx.Node],
-    calls: Sequence[fx.Node],
-    results: Any,  # nodes
-    constants: Mapping[fx.Node, Tensor],
-) -> Graph:
-    """These calls as a graph of these inputs, with those of the constants that it reads."""
-    graph, new = fx.Graph(), {}
-    read = {*results, *(y for x in calls for y in x.all_input_nodes)}
-    used = [x for x in constants if x in read]
-    for x in (*inputs, *used):
-        new[x] = graph.placeholder(f"x{len(new)}")
-        new[x].meta = dict(x.meta)
-    axis = next((new[x] for x in inputs if x.meta["example"].shape), None)
-    for x in calls:
-        # The batch is that of these inputs: where a graph is cut, those of the first part may be of all steps.
-        new[x] = graph.node_copy(x, lambda y, own=x.target == aten.sym_size.int: axis if own else new[y])
-    graph.output(tuple(new[x] for x in results))
-    graph.eliminate_dead_code()
-    return Graph(graph, [constants[x] for x in used], batch)

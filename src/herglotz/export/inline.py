@@ -9,6 +9,7 @@ import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from weakref import WeakValueDictionary
 
 import torch
 from torch import Tensor, fx, nn
@@ -18,7 +19,8 @@ from herglotz.codegen.trace import Example, Graph
 
 _library = torch.library.Library("herglotz", "DEF")
 _library.define("graph(Tensor[] arguments, int key) -> Tensor[]")
-_graphs: dict[int, Graph] = {}  # those that stand as an operator now
+# Those that an operator of a program stands for, as long as something holds them.
+_graphs: WeakValueDictionary[int, Graph] = WeakValueDictionary()
 
 
 @torch.library.register_fake("herglotz::graph", lib=_library)
@@ -26,7 +28,7 @@ def _fake(arguments: list[Tensor], key: int) -> list[Tensor]:
     """Empty outputs of the right shapes."""
     graph = _graphs[key]
     batch = next(x for x in arguments if x.ndim).shape[0]
-    outputs = (x.meta["example"] for x in _results(graph))
+    outputs = (x.meta["example"] for x in results_of(graph))
     return [
         arguments[0].new_empty_strided(_sized(shape, graph, batch), _sized(strides, graph, batch), dtype=dtype)
         for shape, strides, dtype in outputs
@@ -58,7 +60,6 @@ def inlined(program: ExportedProgram) -> ExportedProgram:
                 _inline(module.graph, node, _graphs[node.args[1]], values)
         module.graph.eliminate_dead_code()
         module.recompile()
-    _graphs.clear()
     return program
 
 
@@ -79,7 +80,7 @@ def _inline(outer: fx.Graph, call: fx.Node, graph: Graph, values: dict[Any, Any]
                 if key not in values:
                     values[key] = _value(known, graph, batch, mode)
                 new[node].meta = {"val": values[key]}
-    results = [new[x] for x in _results(graph)]
+    results = [new[x] for x in results_of(graph)]
     for user in [x for x in call.users if not x.users]:
         outer.erase_node(user)
     for user in list(call.users):
@@ -108,5 +109,11 @@ def _sized(sizes: tuple[int, ...], graph: Graph, batch: Any) -> list[Any]:
     return [batch * (x // graph.batch) if x and x % graph.batch == 0 else x for x in sizes]
 
 
-def _results(graph: Graph) -> tuple[fx.Node, ...]:
+def graph_of_key(key: int) -> Graph:
+    """The graph that the operator of this key stands for."""
+    return _graphs[key]
+
+
+def results_of(graph: Graph) -> tuple[fx.Node, ...]:
+    """The nodes that a graph gives."""
     return graph.code.output_node().args[0]  # pyright: ignore[reportReturnType]

@@ -12,7 +12,6 @@ from torch._higher_order_ops.scan import scan_op
 from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.export.equation import Equations, dense
-from herglotz.export.parts import parted
 from herglotz.export.step import CARRIED, CONVERGED, STATE, Layout, StepGraphs, Values, unfinished
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.stepping.linearise import eliminate
@@ -54,20 +53,11 @@ def _moved(found: Values, held: Values) -> Values:
 
 
 class RolloutModule(nn.Module):
-    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside, Newton's of at most `iterations`.
+    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside, Newton's of at most `iterations`."""
 
-    With `hoists`, what h and u alone decide is evaluated before the loop, for all steps at once, and what a step
-    reports behind it: an ONNX file then takes half the time for a step without iteration at B = 1. Compiled code does
-    not gain from it, and nothing may follow the loop there: inductor of torch 2.13 gives the names of buffers twice.
-    """
-
-    def __init__(self, graphs: StepGraphs, iterations: int, hoists: bool = True):
+    def __init__(self, graphs: StepGraphs, iterations: int):
         super().__init__()
-        self.graphs, self.iterations, self.hoists = graphs, iterations, hoists
-        parts = list(graphs.parts())
-        cut = [parted(*part) for part in parts] if hoists else []
-        self.rows = nn.ModuleList(first for first, _ in cut)
-        self.steps: Any = nn.ModuleList([rest for _, rest in cut] if hoists else [whole for whole, _ in parts])
+        self.graphs, self.iterations = graphs, iterations
 
     def forward(
         self,
@@ -81,50 +71,28 @@ class RolloutModule(nn.Module):
 
         Entry k is what step k = 1 … K gives, and NaN from a failed step on.
         """
-        graphs, layout, rows = self.graphs, self.graphs.layout, self._rows(h, *u)
+        graphs, layout = self.graphs, self.graphs.layout
         carry = [dense(x) for x in graphs.start(q, p, s)]
-        given = [[h, *u], *rows], [[s.shape[0]], *(graph.constants for graph in (*self.steps, graphs.report))]
-        xs, fixed = (list(chain(*x)) for x in given)
+        parts = [*((graphs.begin, graphs.iterate) if layout.iterates else ()), graphs.finish, graphs.report]
+        given = [[s.shape[0]], *(graph.constants for graph in parts)]
 
         def step(*x: Any) -> list[Tensor]:
             places = iter(x)
             carry = tuple(islice(places, layout.size))
-            (h, *u), *made = (list(islice(places, len(y))) for y in given[0])
-            (size,), *constants = (tuple(islice(places, len(y))) for y in given[1])
+            h, *u = islice(places, 1 + graphs.inputs)
+            (size,), *constants = (tuple(islice(places, len(y))) for y in given)
             # The sum keeps the batch size a symbol of this graph, which inductor needs to allocate the outputs.
             h = h + torch.zeros(size, dtype=h.dtype, device=h.device)
-            more = [(*x, *y) for x, y in zip(made, constants, strict=False)]
             found: Values = ()
             if layout.iterates:
-                begin, iterate, _ = self.steps
-                steps = (lambda *x: begin.call(*x, *more[0])), iterate.call, more[1]
-                found = solved(*steps, layout, self.iterations, h, tuple(u), carry)
-            new = self.steps[-1].call(h, *u, *carry, *found, *more[-1])
+                begin, iterate = (lambda *x: graphs.begin.call(*x, *constants[0])), graphs.iterate.call
+                found = solved(begin, iterate, constants[1], layout, self.iterations, h, tuple(u), carry)
+            new = graphs.finish.call(h, *u, *carry, *found, *constants[-2])
             rows = (*new[:STATE], *new[layout.size :])
-            if not self.hoists:
-                rows = graphs.report.call(h, *carry[:STATE], *rows, *constants[-1])
+            rows = graphs.report.call(h, *carry[:STATE], *rows, *constants[-1])
             return [dense(y) for y in (*new[: layout.size], *rows)]
 
-        new = tuple(scan_op(step, carry, xs, fixed)[layout.size :])
-        return self._reported(q, p, s, h, new) if self.hoists else new
-
-    def _rows(self, h: Tensor, *u: Tensor) -> list[list[Tensor]]:
-        """What h and u alone decide in each part of a step, (K, B, ...)."""
-        if not self.hoists:
-            return [[]] * len(self.steps)
-        flat = _flat(h, *u)
-        return [[y.reshape(*h.shape, *y.shape[1:]) for y in graph(*flat)] for graph in self.rows]
-
-    def _reported(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, new: Values) -> Values:
-        """What all steps report, from the first state and what the loop gave."""
-        before = (torch.cat([x[None], y[:-1]]) for x, y in zip((q, p, s), new, strict=False))
-        said = self.graphs.report(*_flat(h, *before, *new))
-        return tuple(x.reshape(*h.shape, *x.shape[1:]) for x in said)
-
-
-def _flat(*stacked: Tensor) -> Values:
-    """Steps and samples (K, B, ...) as samples of one batch."""
-    return tuple(x.reshape(-1, *x.shape[2:]) for x in stacked)
+        return tuple(scan_op(step, carry, [h, *u], list(chain(*given)))[layout.size :])
 
 
 class StepModule(nn.Module):

@@ -28,11 +28,12 @@ EXAMPLE_STEPS = 13  # of the traced rollout; the number of steps stays free
 
 
 def programs_of(
-    model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str], hoists: bool = True
+    model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str], inlines: bool = True
 ) -> dict[str, ExportedProgram]:
     """Those programs of `model` (a differentiable step), `rollout`, `linearise`, `init`, `legendre` that are named.
 
-    Each holds for any batch size; `entries` is the file's metadata, `hoists` that of `RolloutModule`.
+    Each holds for any batch size; `entries` is the file's metadata. Without `inlines`, the traced graphs in a program
+    stay operators (`herglotz.export.inline.opaque`).
     """
     equations = Equations.of(model)
     graphs = StepGraphs(equations.model, entries["box"], entries.get("h_range"))
@@ -41,23 +42,26 @@ def programs_of(
     iterations, unrolled = entries["newton_iterations"], entries.get("unrolled", False)
     one_step = partial(StepModule, equations, graphs, iterations, unrolled=unrolled)
     make = {
-        "model": lambda: _program(one_step(), (q, p, s, *more)),
-        "linearise": lambda: _program(one_step(linearised=True), (q, p, s, *more)),
-        "rollout": lambda: _program(RolloutModule(graphs, iterations, hoists), (q, p, s, *stacked), stacked=True),
-        "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
-        "legendre": lambda: _program(LegendreModule(equations), (q, p, s, more[0])),
+        "model": lambda: (one_step(), (q, p, s, *more)),
+        "linearise": lambda: (one_step(linearised=True), (q, p, s, *more)),
+        "rollout": lambda: (RolloutModule(graphs, iterations), (q, p, s, *stacked)),
+        "init": lambda: (InitModule(equations), (q, p, s, *more)),
+        "legendre": lambda: (LegendreModule(equations), (q, p, s, more[0])),
     }
-    return {name: make[name]() for name in names}
+    return {name: _program(*make[name](), stacked=name == "rollout", inlines=inlines) for name in names}
 
 
-def _program(module: nn.Module, arguments: tuple[Tensor, ...], stacked: bool = False) -> ExportedProgram:
+def _program(module: nn.Module, arguments: tuple[Tensor, ...], stacked: bool, inlines: bool) -> ExportedProgram:
     """Export a module of (q, p, s, h, *u) for any batch size; if `stacked`, h and u have a free axis of steps first."""
     one = {0: Dim.DYNAMIC}
     late = {0: Dim.DYNAMIC, 1: Dim.DYNAMIC} if stacked else one
     inputs = ((late,),) if len(arguments) > 4 else ()  # what arrives through *u is a tuple of its own
     with torch.no_grad(), opaque(module):
         program = torch.export.export(module, arguments, dynamic_shapes=(one, one, one, late, *inputs))
-    return _slim(inlined(program))
+    if inlines:
+        return _slim(inlined(program))
+    program.graph_module.meta["holds"] = module  # and with it the graphs that the operators stand for
+    return program
 
 
 def _slim(program: ExportedProgram) -> ExportedProgram:

@@ -15,13 +15,13 @@ round a small step away; where dry friction can hold a coordinate it is the z of
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from herglotz.codegen.trace import Graph, traced
+from herglotz.codegen.trace import traced
 from herglotz.export.box import Box, report
 from herglotz.export.equation import Terms, dense, example, inverse, length, step_equation
 from herglotz.export.metadata import TOLERANCE
@@ -243,12 +243,3 @@ class StepGraphs(nn.Module):
         rows = [y + 1 for y in (q, p, s, s + 1)]
         solved = (s + 3, (s > 0).to(torch.uint8)) if layout.iterates else ()
         self.report = traced(partial(report, Box.of(box, model, h_range)), (h, q, p, s, *rows, *solved))
-
-    def parts(self) -> Iterator[tuple[Graph, list[bool]]]:
-        """Begin and iterate where a step has them, and finish, each with whether an input is h or u."""
-        layout, u = self.layout, [True] * self.inputs
-        state, found, here = ([False] * size for size in (STATE, CARRIED * layout.iterates, layout.field))
-        if layout.iterates:
-            yield self.begin, [*state, True, *u] if layout.sticks else [True, False]
-            yield self.iterate, [*state, True, *found, *here, *u, *[False] * 2 * layout.sticks]
-        yield self.finish, [True, *u, *[False] * layout.size, *found]

@@ -21,7 +21,8 @@ class Questions:
     """The answers so far: the model, and what the data were found to be."""
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
-        self.wanted, self.holds = wanted, holds  # the search of all data, and the holds of inputs that may be tried
+        self.wanted = wanted  # the search of all data
+        self.holds = [wanted.data.hold, *holds] if holds else []  # of inputs that may be tried
         self.hold, self.input_terms = "", ()
         # The search of the part, its sensors' zeros taken off where these differ; the model; the zeros.
         self.read: Search = wanted.part
@@ -49,22 +50,39 @@ class Questions:
         return self.differ is not None
 
     def how_inputs_hold(self) -> bool:
-        """Another hold of the inputs, where the model asks for one and none was taken."""
-        if self.best is None or self.hold or self.wanted.part.longer > 1:
+        """Another hold of the inputs, where the model asks for one."""
+        if self.best is None or not (hold := self.other_hold(self.read, self.best)):
             return False
-        if not (hold := self.read.held(self.best, self.holds)):
-            return False
-        self.wanted, self.read = (x.of(replace(x.data, hold=hold)) for x in (self.wanted, self.read))
-        self.hold, self.best = hold, self.read.again(self.best)
+        self.held(hold)
         return True
 
+    def other_hold(self, read: Search, best: Trial) -> str:
+        """The hold that a model asks for in the place of the one it has; "" where it asks for none."""
+        if self.wanted.part.longer > 1:  # inputs are means over several samples, which say little of holds of one
+            return ""
+        return read.held(best, [hold for hold in self.holds if hold != read.data.hold])
+
+    def held(self, hold: str) -> None:
+        """The data with this hold of their inputs, and the model in them."""
+        self.wanted, self.read = (x.of(replace(x.data, hold=hold)) for x in (self.wanted, self.read))
+        self.hold, self.best = hold, self.best and self.read.again(self.best)
+
     def how_inputs_act(self) -> None:
-        """Terms anew with squares, sizes and rates of the inputs, where the model asks for some."""
-        if self.best is None or not (terms := self.read.input_terms(self.best)):
-            return
-        read = self.read.driven_by(terms)
-        if (found := _searched(read)) is not None and found.replaces(self.best):
-            self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
+        """Terms anew with other terms of the inputs, where the model asks for some.
+
+        A hold that stood for them is given up where the model with them asks for another one, and they are asked for
+        once more.
+        """
+        for once_more in (False, True):
+            if self.best is None or not (terms := self.read.input_terms(self.best)):
+                return
+            read = self.read.driven_by(terms)
+            if (found := _searched(read)) is None or not found.replaces(self.best):
+                return
+            if once_more or not (hold := self.other_hold(read, found)):
+                self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
+                return
+            self.held(hold)
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.
@@ -74,8 +92,7 @@ class Questions:
         if self.best is None or (found := self.read.with_functions(self.best)) is self.best:
             return
         self.best = found
-        others = [] if self.wanted.part.longer > 1 else [hold for hold in self.holds if hold != self.hold]
-        later = self.read.held(found, others)
+        later = self.other_hold(self.read, found)
         wanted = self.wanted.of(replace(self.wanted.data, hold=later)) if later else self.wanted
         if (again := wanted.part.again(found)) is None:
             return
@@ -87,9 +104,9 @@ class Questions:
         """The model of a part fitted to all data, with what more these ask for."""
         if self.wanted.part is self.wanted:
             return
-        longer = self.wanted.part.longer > 1  # inputs are means over several samples, which say little of holds of one
+        longer = self.wanted.part.longer > 1
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
-        if longer and self.best is not None and (hold := self.read.held(self.best, self.holds)):
+        if longer and self.best is not None and (hold := self.read.held(self.best, self.holds[1:])):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
 

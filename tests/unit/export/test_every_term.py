@@ -7,6 +7,7 @@ test_c_levels.py have it.
 
 import shutil
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import fields
 from itertools import pairwise
 from typing import Any
@@ -20,6 +21,7 @@ from herglotz.export import ExportedStepper
 from herglotz.export.c_header import c_source, described
 from herglotz.export.c_stepper import compiled
 from herglotz.export.equation import Equations
+from herglotz.export.inline import inlined
 from herglotz.export.lower.onnx import OUTPUTS, graph_of
 from herglotz.export.metadata import describe
 from herglotz.export.programs import programs_of, quiet
@@ -121,8 +123,8 @@ def formats_of(model) -> dict[str, ExportedStepper]:
     entries = describe(model, H, None, (), 30, {"h_range": None})
     names = ("q", "p", "s", "h", *(("u",) if model.inputs else ()))
     with quiet():
-        programs = programs_of(model, entries, ("linearise", "legendre"))
-        program, legendre = programs["linearise"], programs["legendre"]
+        program, legendre = programs_of(model, entries, ("linearise", "legendre"), inlines=False).values()
+        pt2 = [inlined(deepcopy(x)) for x in (program, legendre)]
         content = graph_of(program, names, (*OUTPUTS[:-1], "jacobian"), {})
         outputs = ("L_v", "L_vv", "grip", "grip_by_v")[: 4 if model.capabilities.sticking else 2]
         second = graph_of(legendre, ("q", "v", "s", "h"), outputs, {})
@@ -143,7 +145,7 @@ def formats_of(model) -> dict[str, ExportedStepper]:
         return ExportedStepper({"rollout": linearise, "linearise": linearise, "legendre": legendre}, entries, kind=kind)
 
     header = c_source(model, described(model, entries, "model", "float64", None), "stepper.h")
-    pt2 = [x.module(check_guards=False) for x in (program, legendre)]
+    pt2 = [x.module(check_guards=False) for x in pt2]
     onnx = [program_of(content, names), program_of(second, ("q", "v", "s", "h"))]
     return {"c": compiled(header), "pt2": file("pt2", *pt2), "onnx": file("onnx", *onnx)}
 

@@ -38,7 +38,7 @@ def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     compiler("CXX")
     with quiet(), torch.no_grad(), tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
         package = str(Path(folder, "code.pt2"))
-        programs = programs_of(model, entries, tuple(AOTI), hoists=False)
+        programs = programs_of(model, entries, tuple(AOTI))
         package_aoti(package, {AOTI[name]: _compiled(program, settings) for name, program in programs.items()})
         content = sealed_zip(Path(package).read_bytes())
         Path(package).write_bytes(content)

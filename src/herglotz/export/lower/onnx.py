@@ -6,14 +6,10 @@ import base64
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torch import Tensor
 from torch.export import ExportedProgram
-from torch.export.graph_signature import InputKind
 
 from herglotz.data.seal import sealed_onnx
 from herglotz.errors import InputError, refuse
-from herglotz.export.lower.onnx_table import write
-from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of, needed, reads
 from herglotz.export.metadata import KEY, to_json
 from herglotz.export.programs import programs_of, quiet, writes
 from herglotz.models import ContactLagrangian
@@ -40,6 +36,8 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any], *, unroll: in
     """
     try:
         import onnx  # noqa: F401
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
     except ImportError as error:
         raise InputError(f"ONNX export needs {error.name}; install it with: pip install 'herglotz[export]'") from None
     if unroll is not None:
@@ -47,7 +45,7 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any], *, unroll: in
         entries = entries | {"newton_iterations": unroll, "unrolled": True}
     text, main = to_json(entries), "rollout" if unroll is None else "model"
     with quiet():
-        programs = programs_of(model, entries, (main, "linearise", "init", "legendre"))
+        programs = programs_of(model, entries, (main, "linearise", "init", "legendre"), inlines=False)
     u = ("u",) if entries["inputs"] else ()
     said = OUTPUTS if entries["box"] is not None else OUTPUTS[:-1]
     further = {"init": (("q0", "q1", "s0", "h"), ("p", "s")), "linearise": (("q", "p", "s", "h"), (*said, "jacobian"))}
@@ -65,54 +63,63 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any], *, unroll: in
 def graph_of(
     program: ExportedProgram, inputs: Sequence[str], outputs: Sequence[str], properties: Mapping[str, str]
 ) -> bytes:
-    """A program as a serialised ONNX model; K steps and B samples are free sizes."""
-    import onnx
-    from onnx import helper
+    """A program as a serialised ONNX model; K steps and B samples are free sizes.
 
-    values, shapes = _placeholders(program, inputs)
-    writer = Writer(Constants(), described(shapes[inputs[0]]).dtype)
-    values = [writer.stored(x, described(shapes[x]).shape) if isinstance(x, str) else x for x in values]
-    found = write(writer, program.graph_module, values)
-    places: Any = next(x for x in program.graph.nodes if x.op == "output").args[0]
-    for name, x, place in zip(outputs, found, places, strict=True):
-        writer.emit("Identity", writer.plain(x, described(place).shape), to=name)
-    described_outputs = dict(zip(outputs, places, strict=True))
-    nodes = needed(writer.nodes, outputs)
-    read = set().union(*map(reads, nodes))
-    graph = helper.make_graph(
-        nodes, "herglotz",
-        [_info(name, described(x)) for name, x in shapes.items()],
-        [_info(name, described(x)) for name, x in described_outputs.items()],
-        [x for x in writer.constants.tensors if x.name in read],
-    )  # fmt: skip
-    proto = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="herglotz")
-    proto.ir_version = min(proto.ir_version, 10)
+    Its traced graphs are operators (`herglotz.export.inline.opaque`), which `onnx_graph.translated` writes: torch.onnx
+    evaluates every operation three times with symbolic shapes, which took four fifths of an export.
+    """
+    import torch.onnx
+    from onnx import helper
+    from onnx_ir import Shape, passes
+    from onnx_ir.passes import common
+
+    from herglotz.export.lower.onnx_graph import translated
+    from herglotz.export.lower.onnx_operations import OPERATIONS
+
+    # Nothing around the graphs is to be decomposed: torch would trace both loops twice more to find that out.
+    program.run_decompositions = lambda _: program  # pyright: ignore[reportAttributeAccessIssue]
+    table = {**OPERATIONS, torch.ops.herglotz.graph.default: translated}
+    try:
+        with quiet():
+            made: Any = torch.onnx.export(
+                program, dynamo=True, optimize=False, verbose=False, opset_version=OPSET,
+                input_names=inputs, output_names=outputs, custom_translation_table=table,
+            )  # fmt: skip
+    except torch.onnx.OnnxExporterError as error:
+        raise _reason(error) from error
+    for node in made.model.graph.all_nodes():
+        node.metadata_props.clear()  # where the node stands in the source: most of the file, and full of local paths
+    constants = common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)
+    outside = common.LiftSubgraphInitializersToMainGraphPass()
+    tidied = constants, outside, common.DeduplicateInitializersPass(), common.IdentityEliminationPass()
+    passes.Sequential(*tidied, common.RemoveUnusedNodesPass())(made.model)
+    for value in (*made.model.graph.inputs, *made.model.graph.outputs):
+        free = iter(("K", "B")[-sum(not isinstance(x, int) for x in value.shape) :])
+        value.shape = Shape([x if isinstance(x, int) else next(free) for x in value.shape])
+    proto = made.model_proto
+    del proto.graph.value_info[:]
+    proto.producer_name, proto.ir_version = "herglotz", min(proto.ir_version, 10)
     helper.set_model_props(proto, dict(properties))
-    onnx.checker.check_model(proto)
-    return proto.SerializeToString()
+    return _runnable(proto.SerializeToString())
 
 
-def _placeholders(program: ExportedProgram, inputs: Sequence[str]) -> tuple[list[Any], dict[str, Any]]:
-    """What the placeholders of a program stand for: known tensors, or the names of the file's inputs."""
-    values, named = [], {}
-    left = iter(inputs)
-    known = {**program.state_dict, **program.constants}
-    nodes = (x for x in program.graph.nodes if x.op == "placeholder")
-    for node, spec in zip(nodes, program.graph_signature.input_specs, strict=True):
-        if spec.kind == InputKind.USER_INPUT:
-            name = next(left)
-            named[name] = node
-            values.append(name)
-        else:
-            values.append(known[str(spec.target)])
-    return values, named
+def _runnable(content: bytes) -> bytes:
+    """A model that onnxruntime has every operation of: many it has in float32 only."""
+    import onnxruntime as ort
+
+    options = ort.SessionOptions()
+    options.graph_optimization_level, options.log_severity_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL, 4
+    try:
+        ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions have no common class
+        raise InputError(f"ONNX export: {error}; export to --format pt2 or c") from error
+    return content
 
 
-def _info(name: str, value: Tensor) -> Any:
-    """The description of an input or output: free sizes are called K (steps) and B (samples)."""
-    from onnx import helper
-
-    free = iter(("K", "B")[-sum(not isinstance(x, int) for x in value.shape) :])
-    return helper.make_tensor_value_info(
-        name, kind_of(value.dtype), [x if isinstance(x, int) else next(free) for x in value.shape]
-    )
+def _reason(error: Exception) -> InputError:
+    """The first cause: what one of our own operations refuses, or what torch.onnx lacks."""
+    while isinstance(error.__cause__, Exception):
+        error = error.__cause__
+    if isinstance(error, InputError):
+        return error
+    return InputError(f"ONNX export: {error}; export to --format pt2 or c")

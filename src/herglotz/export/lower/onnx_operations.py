@@ -1,0 +1,214 @@
+"""Operations of a traced graph in ONNX that torch.onnx has not, or writes with numbers of 32 bits or as slow nodes.
+
+An entry of `OPERATIONS` takes the arguments of the operation of torch, tensors as values of the ONNX graph, and gives
+its result, or a list of its results.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import onnx_ir as ir
+import torch
+from onnxscript.onnx_opset import opset20
+
+from herglotz.errors import InputError
+
+aten = torch.ops.aten
+op: Any = opset20
+Value = Any  # an `onnx_ir.Value`, whose operators onnxscript writes down
+
+
+def constant(value: Any, dtype: ir.DataType) -> Value:
+    """A number or an array of this dtype. torch.onnx would make a number of Python one of 32 bits first."""
+    return op.Constant(value=ir.tensor(value, dtype=dtype))
+
+
+def integers(*values: int) -> Value:
+    """Axes, indices, a shape."""
+    return op.Constant(value_ints=list(values))
+
+
+def weighted(kind: Callable[..., Value]) -> Callable[..., Value]:
+    """`add` or `sub` of x and α y."""
+
+    def written(x: Value, y: Value | float, alpha: float = 1) -> Value:
+        y = constant(y, x.dtype) if isinstance(y, (int, float)) else y
+        return kind(x, y if alpha == 1 else op.Mul(constant(alpha, x.dtype), y))
+
+    return written
+
+
+def subtracted_from(x: Value, number: float, alpha: float = 1) -> Value:
+    """`rsub`: number − α x."""
+    return op.Sub(constant(number, x.dtype), x if alpha == 1 else op.Mul(constant(alpha, x.dtype), x))
+
+
+def added_product(x: Value, a: Value, b: Value, value: float = 1) -> Value:
+    """`addcmul`: x + value · a · b."""
+    product = op.Mul(a, b)
+    if value == -1:
+        return op.Sub(x, product)
+    return op.Add(x, product if value == 1 else op.Mul(constant(value, x.dtype), product))
+
+
+def filled_like(x: Value, number: float, dtype: int = -1, **_: Any) -> Value:
+    """`full_like`."""
+    return op.Expand(constant(number, x.dtype if dtype == -1 else ir.DataType(dtype)), op.Shape(x))
+
+
+def finite(x: Value) -> Value:
+    """Whether |x| < ∞, which is false of NaN too."""
+    return op.Less(op.Abs(x), constant(math.inf, x.dtype))
+
+
+def without_nan(x: Value, nan: float = 0.0, posinf: float | None = None, neginf: float | None = None) -> Value:
+    """`nan_to_num`."""
+    largest, y = float(np.finfo(x.dtype.numpy()).max), x
+    for infinity, number in ((math.inf, posinf), (-math.inf, neginf)):
+        found = math.copysign(largest, infinity) if number is None else number
+        y = op.Where(op.Equal(x, constant(infinity, x.dtype)), constant(found, x.dtype), y)
+    return op.Where(op.IsNaN(x), constant(nan, x.dtype), y)
+
+
+def log1p(x: Value, dtype: ir.DataType | None = None) -> Value:
+    """log(1 + x) = x log(u)/(u − 1) with u = 1 + x rounded (Kahan), x where u = 1."""
+    one = constant(1.0, dtype or x.dtype)
+    u = op.Add(one, x)
+    same = op.Equal(u, one)
+    return op.Where(same, x, op.Div(op.Mul(x, op.Log(u)), op.Where(same, one, op.Sub(u, one))))
+
+
+def expm1(x: Value) -> Value:
+    """e^x − 1 = 2t/(1 − t), t = tanh(x/2), where x is small."""
+    one, two = constant(1.0, x.dtype), constant(2.0, x.dtype)
+    t = op.Tanh(op.Div(x, two))
+    small = op.Div(op.Mul(two, t), op.Sub(one, t))
+    return op.Where(op.Less(op.Abs(x), constant(0.5, x.dtype)), small, op.Sub(op.Exp(x), one))
+
+
+def atanh(x: Value) -> Value:
+    """Artanh x = log(1 + 2x/(1 − x))/2: onnxruntime has it in float32 only."""
+    ratio = op.Div(op.Mul(constant(2.0, x.dtype), x), subtracted_from(x, 1.0))
+    return op.Mul(constant(0.5, x.dtype), log1p(ratio, x.dtype))
+
+
+def log_sigmoid(x: Value) -> list[Value]:
+    """`log_sigmoid_forward`: log σ(x) = min(x, 0) − log(1 + d), d = e^{−|x|}, and d, which torch keeps."""
+    decay = op.Exp(op.Neg(op.Abs(x)))
+    return [op.Sub(op.Min(x, constant(0.0, x.dtype)), log1p(decay, x.dtype)), decay]
+
+
+def log_sigmoid_backward(g: Value, x: Value, _: Value) -> Value:
+    """Its derivative g σ(−x)."""
+    return op.Mul(g, op.Sigmoid(op.Neg(x)))
+
+
+def sigmoid_backward(g: Value, y: Value) -> Value:
+    """The derivative g y (1 − y), y = σ(x)."""
+    return op.Mul(g, op.Mul(y, subtracted_from(y, 1.0)))
+
+
+def tanh_backward(g: Value, y: Value) -> Value:
+    """The derivative g (1 − y²), y = tanh x."""
+    return op.Mul(g, op.Sub(constant(1.0, y.dtype), op.Mul(y, y)))
+
+
+def threshold_backward(g: Value, x: Value, threshold: float) -> Value:
+    """The derivative of relu: g where x lies above the threshold, else 0."""
+    return op.Where(op.Greater(x, constant(threshold, x.dtype)), g, constant(0.0, x.dtype))
+
+
+def product(a: Value, b: Value) -> Value:
+    """`mm`. onnxruntime turns a number beside a MatMul into an attribute of 32 bits, and beside a Gemm it does not."""
+    return op.Gemm(a, b)
+
+
+def products(a: Value, b: Value) -> Value:
+    """`bmm`, for which there is no Gemm."""
+    return op.Einsum(a, b, equation="bij,bjk->bik")
+
+
+def product_with_vector(a: Value, b: Value) -> Value:
+    """`mv`."""
+    return op.Squeeze(op.Gemm(a, op.Unsqueeze(b, integers(1))), integers(1))
+
+
+def split(x: Value, sizes: Sequence[int], dim: int = 0) -> list[Value]:
+    """`split_with_sizes`: torch.onnx makes a sequence of it, which onnxruntime copies."""
+    ends = np.cumsum(sizes).tolist()
+    return [
+        op.Slice(x, integers(end - size), integers(end), integers(dim)) for size, end in zip(sizes, ends, strict=True)
+    ]
+
+
+def entry_backward(g: Value, sizes: Sequence[Any], dim: int, index: int) -> Value:
+    """`select_backward`, the derivative of one entry of an axis: zeros around g."""
+    first = index % sizes[dim]
+    return _among_zeros(op.Unsqueeze(g, integers(dim)), dim, (first, sizes[dim] - first - 1), g.dtype)
+
+
+def entries_backward(g: Value, sizes: Sequence[Any], dim: int, start: int, end: int, step: int) -> Value:
+    """`slice_backward`, the derivative of entries side by side: zeros around g."""
+    if step != 1:
+        raise InputError(f"ONNX export does not know a slice_backward of step {step}; export to --format pt2 or c")
+    first, last, _ = slice(start, end).indices(sizes[dim])
+    return _among_zeros(g, dim, (first, sizes[dim] - last), g.dtype)
+
+
+def _among_zeros(g: Value, dim: int, counts: tuple[int, int], dtype: ir.DataType) -> Value:
+    return op.Pad(g, integers(*counts), constant(0.0, dtype), integers(dim))
+
+
+def diagonal_matrix(x: Value, *places: int) -> Value:
+    """`diag_embed`."""
+    if places:
+        raise InputError(f"ONNX export does not know a diag_embed at {places}; export to --format pt2 or c")
+    return op.Mul(op.Unsqueeze(x, integers(-1)), constant(np.eye(x.shape[-1]), x.dtype))
+
+
+def inverse(A: Value, **_: Any) -> list[Value]:
+    """`linalg_inv_ex` of mass matrices (..., n, n) by Gauss and Jordan, without row exchanges, and its status, 0."""
+    n = A.shape[-1]
+    eye, rows, columns, J = np.eye(n), integers(-2), integers(-1), A
+    for k in range(n):
+        ends = integers(k), integers(k + 1)
+        column = op.Slice(J, *ends, columns)
+        pivot = op.Slice(column, *ends, rows)
+        others = op.Mul(J, constant(1 - eye[k : k + 1], A.dtype))
+        cleared = op.Add(others, constant(np.outer(eye[k], eye[k]), A.dtype))
+        row = op.Div(op.Slice(cleared, *ends, rows), pivot)
+        J = op.Sub(cleared, op.Mul(op.Sub(column, constant(eye[k][:, None], A.dtype)), row))
+    return [J, op.Constant(value_int=0)]
+
+
+OPERATIONS: dict[Any, Callable[..., Any]] = {
+    aten.__and__.Tensor: op.And,
+    aten.__or__.Tensor: op.Or,
+    aten.add.Tensor: weighted(op.Add),
+    aten.addcmul.default: added_product,
+    aten.atanh.default: atanh,
+    aten.bmm.default: products,
+    aten.diag_embed.default: diagonal_matrix,
+    aten.expm1.default: expm1,
+    aten.full_like.default: filled_like,
+    aten.isfinite.default: finite,
+    aten.linalg_inv_ex.default: inverse,
+    aten.log1p.default: log1p,
+    aten.log_sigmoid_backward.default: log_sigmoid_backward,
+    aten.log_sigmoid_forward.default: log_sigmoid,
+    aten.mm.default: product,
+    aten.mv.default: product_with_vector,
+    aten.nan_to_num.default: without_nan,
+    aten.rsub.Scalar: subtracted_from,
+    aten.select_backward.default: entry_backward,
+    aten.sigmoid_backward.default: sigmoid_backward,
+    aten.slice_backward.default: entries_backward,
+    aten.split_with_sizes.default: split,
+    aten.sub.Tensor: weighted(op.Sub),
+    aten.tanh_backward.default: tanh_backward,
+    aten.threshold_backward.default: threshold_backward,
+}
