@@ -73,11 +73,11 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
     if not every:
         return ()
     found = _climbed(search, every)
-    if found is None:
+    if found is None or not found.replaces(trial):
         return ()
     if any(map(saturation, _taken(found, every))):
         every = _sharpened(search, found, every)
-    while len(taken := _taken(found, every)) < len(every):  # terms that made up for others leave with those
+    while 0 < len(taken := _taken(found, every)) < len(every):  # terms that made up for others leave with those
         fewer = _climbed(search, taken)
         if fewer is None or found.replaces(fewer):
             break

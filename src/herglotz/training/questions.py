@@ -21,8 +21,7 @@ class Questions:
     """The answers so far: the model, and what the data were found to be."""
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
-        self.wanted = wanted  # the search of all data
-        self.holds = [wanted.data.hold, *holds] if holds else []  # of inputs that may be tried
+        self.wanted, self.holds = wanted, holds  # the search of all data, and the holds of inputs that may be tried
         self.hold, self.input_terms = "", ()
         # The search of the part, its sensors' zeros taken off where these differ; the model; the zeros.
         self.read: Search = wanted.part
@@ -30,59 +29,33 @@ class Questions:
         self.differ: tuple[Tensor, Tensor] | None = None
         asked = False
         if self.best is None or not self.best.at_the_noise:
-            self.best = wanted.part.full  # which lacks no term that zeros, or another hold, could stand for
+            self.best = wanted.part.full  # which lacks no term that zeros could stand for
             asked = self.best is not None and self.best.whole
-            if asked and self.what_data_are():
+            if asked and self.zeros():
                 self.read.full = self.best
         self.best = _searched(self.read)
-        if not asked and self.what_data_are():  # what stood for it has bent the terms
+        if not asked and self.zeros():  # what stood for zeros has bent the terms
             self.best = self.read.better(self.best, _searched(self.read))
 
-    def what_data_are(self) -> bool:
-        """Whether the model asks for zeros of sensors or another hold of the inputs, which are taken then."""
-        return any([self.zeros(), self.how_inputs_hold()])
-
     def zeros(self) -> bool:
-        """Zeros of sensors that differ between recordings, where the model asks for some and none are known."""
-        if self.best is None or self.differ is not None:
-            return False
+        """Zeros of sensors that differ between recordings, where the model asks for some."""
         self.read, self.best, self.differ = self.read.with_zeros(self.best)
         return self.differ is not None
 
-    def how_inputs_hold(self) -> bool:
-        """Another hold of the inputs, where the model asks for one."""
-        if self.best is None or not (hold := self.other_hold(self.read, self.best)):
-            return False
-        self.held(hold)
-        return True
-
-    def other_hold(self, read: Search, best: Trial) -> str:
-        """The hold that a model asks for in the place of the one it has; "" where it asks for none."""
-        if self.wanted.part.longer > 1:  # inputs are means over several samples, which say little of holds of one
-            return ""
-        return read.held(best, [hold for hold in self.holds if hold != read.data.hold])
-
-    def held(self, hold: str) -> None:
-        """The data with this hold of their inputs, and the model in them."""
+    def how_inputs_hold(self) -> None:
+        """Another hold of the inputs where the model asks for one, and terms anew."""
+        if self.best is None or self.wanted.part.longer > 1 or not (hold := self.read.held(self.best, self.holds)):
+            return
         self.wanted, self.read = (x.of(replace(x.data, hold=hold)) for x in (self.wanted, self.read))
-        self.hold, self.best = hold, self.best and self.read.again(self.best)
+        self.hold, self.best = hold, self.read.better(self.read.again(self.best), _searched(self.read))
 
     def how_inputs_act(self) -> None:
-        """Terms anew with other terms of the inputs, where the model asks for some.
-
-        A hold that stood for them is given up where the model with them asks for another one, and they are asked for
-        once more.
-        """
-        for once_more in (False, True):
-            if self.best is None or not (terms := self.read.input_terms(self.best)):
-                return
-            read = self.read.driven_by(terms)
-            if (found := _searched(read)) is None or not found.replaces(self.best):
-                return
-            if once_more or not (hold := self.other_hold(read, found)):
-                self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
-                return
-            self.held(hold)
+        """Terms anew with other terms of the inputs, where the model asks for some."""
+        if self.best is None or not (terms := self.read.input_terms(self.best)):
+            return
+        read = self.read.driven_by(terms)
+        if (found := _searched(read)) is not None and found.replaces(self.best):
+            self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.
@@ -92,7 +65,8 @@ class Questions:
         if self.best is None or (found := self.read.with_functions(self.best)) is self.best:
             return
         self.best = found
-        later = self.other_hold(self.read, found)
+        others = [] if self.wanted.part.longer > 1 else [hold for hold in self.holds if hold != self.hold]
+        later = self.read.held(found, others)
         wanted = self.wanted.of(replace(self.wanted.data, hold=later)) if later else self.wanted
         if (again := wanted.part.again(found)) is None:
             return
@@ -104,9 +78,9 @@ class Questions:
         """The model of a part fitted to all data, with what more these ask for."""
         if self.wanted.part is self.wanted:
             return
-        longer = self.wanted.part.longer > 1
+        longer = self.wanted.part.longer > 1  # inputs are means over several samples, which say little of holds of one
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
-        if longer and self.best is not None and (hold := self.read.held(self.best, self.holds[1:])):
+        if longer and self.best is not None and (hold := self.read.held(self.best, self.holds)):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
 

@@ -283,7 +283,7 @@ class Search:
         best, found = trial, ""
         for hold in [] if trial.at_the_noise else holds:
             other = self.of(replace(self.data, hold=hold)).again(trial)
-            if other is not None and other.fits_better(best):
+            if other is not None and other.replaces(best):
                 best, found = other, hold
         return found
 
