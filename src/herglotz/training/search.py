@@ -28,7 +28,7 @@ from herglotz.training.named_terms import DRY
 from herglotz.training.offers import standing
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.sensor_zeros import differing_zeros
+from herglotz.training.sensor_zeros import clear, differing_zeros
 from herglotz.training.strengths import likeliest, needed, of_terms
 from herglotz.training.task import LEAST_GRIP
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
@@ -270,7 +270,7 @@ class Search:
         `sure`: a part of these recordings has been found to have them, and the score is not asked.
         """
         differ = best and self.zeros(best)
-        if best is None or differ is None:
+        if best is None or differ is None or not (sure or bool(clear(*differ).any())):
             return self, best, None
         read = self.of(measured(self.data, differ[0].flatten().tolist()))
         other, more = read.again(best), (len(self.data) - 1) * self.data.dof

@@ -36,9 +36,9 @@ class FoundZeros(NamedTuple):
     rms: float
 
 
-def clearly(found: FoundZeros) -> FoundZeros:
-    """With 0 for the zeros that are not clearly there."""
-    return found._replace(z=torch.where(found.z.abs() > CLEARLY * found.deviations, found.z, 0.0))
+def clear(z: Tensor, deviations: Tensor) -> Tensor:
+    """Which zeros are clearly there."""
+    return z.abs() > CLEARLY * deviations
 
 
 def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...]:
@@ -58,7 +58,7 @@ def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_st
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
     target = WithZeros(problem, torch.arange(problem.P), shared=True)
     found = _fitted(target, problem.parameters.get(), data)
-    return None if found is None else tuple(clearly(found).z.tolist())
+    return None if found is None else tuple(torch.where(clear(found.z, found.deviations), found.z, 0.0).tolist())
 
 
 def _fitted(target: WithZeros, theta: Tensor, begin: Trajectories) -> FoundZeros | None:
@@ -85,10 +85,10 @@ def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
 def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor] | None:
     """Zeros (B, n) that recordings have beside the reference, and deviations, where the fit of a problem ends at x.
 
-    None where zeros lead nowhere, or none of them is clearly there.
+    None where zeros lead nowhere.
     """
     found = fitted(WithZeros(problem), x)
-    if found is None or not bool(clearly(found).z.any()):
+    if found is None:
         return None
     rows = [b for b in range(len(problem.data)) if b != reference_of(problem.data)]
     z, deviations = (x.new_zeros(len(problem.data), problem.n) for _ in range(2))
