@@ -29,12 +29,14 @@ class Questions:
         self.differ: tuple[Tensor, Tensor] | None = None
         asked = False
         if self.best is None or not self.best.at_the_noise:
-            self.best = wanted.part.full  # which lacks no term that zeros could stand for
+            self.best = wanted.part.full  # which lacks no term that zeros, or another hold, could stand for
             asked = self.best is not None and self.best.whole
-            if asked and self.zeros():
+            if asked and any([self.zeros(), self.how_inputs_hold(alike=True)]):
                 self.read.full = self.best
         self.best = _searched(self.read)
         if not asked and self.zeros():  # what stood for zeros has bent the terms
+            self.best = self.read.better(self.best, _searched(self.read))
+        if not asked and self.how_inputs_hold():
             self.best = self.read.better(self.best, _searched(self.read))
 
     def zeros(self) -> bool:
@@ -42,19 +44,23 @@ class Questions:
         self.read, self.best, self.differ = self.read.with_zeros(self.best)
         return self.differ is not None
 
-    def how_inputs_hold(self) -> None:
-        """Another hold of the inputs where the model asks for one, and terms anew."""
-        if self.best is None or self.wanted.part.longer > 1 or not (hold := self.read.held(self.best, self.holds)):
-            return
+    def how_inputs_hold(self, *, alike: bool = False) -> bool:
+        """Another hold of the inputs where the model asks for one; `alike`: by the residuals of its fits themselves."""
+        if self.best is None or self.wanted.part.longer > 1:
+            return False
+        if not (hold := self.read.held(self.best, self.holds, alike=alike)):
+            return False
         self.wanted, self.read = (x.of(replace(x.data, hold=hold)) for x in (self.wanted, self.read))
-        self.hold, self.best = hold, self.read.better(self.read.again(self.best), _searched(self.read))
+        self.hold, self.best = hold, self.read.again(self.best)
+        return True
 
     def how_inputs_act(self) -> None:
         """Terms anew with other terms of the inputs, where the model asks for some."""
         if self.best is None or not (terms := self.read.input_terms(self.best)):
             return
         read = self.read.driven_by(terms)
-        if (found := _searched(read)) is not None and found.replaces(self.best):
+        found = _searched(read)
+        if found is not None and found.replaces(self.best) and read.finalist(found, (self.best, found)) is found:
             self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
 
     def functions(self) -> None:

@@ -278,12 +278,15 @@ class Search:
             return self, best, None
         return read, other, differ
 
-    def held(self, trial: Trial, holds: Sequence[str]) -> str:
-        """The hold of the inputs that the same model asks for; "" where none of these is better."""
+    def held(self, trial: Trial, holds: Sequence[str], *, alike: bool = False) -> str:
+        """The hold of the inputs that the same model asks for; "" where none of these is better.
+
+        `alike`: by the residuals of the fits themselves, of a model that lacks no term.
+        """
         best, found = trial, ""
         for hold in [] if trial.at_the_noise else holds:
             other = self.of(replace(self.data, hold=hold)).again(trial)
-            if other is not None and other.replaces(best):
+            if other is not None and (other.fits_better(best) if alike else other.replaces(best)):
                 best, found = other, hold
         return found
 
