@@ -88,8 +88,7 @@ class Search:
     def full(self) -> Trial | None:
         """The model of the whole dictionary over the longest segments that it follows."""
         fitter = self.fitter(Variant(self.order))
-        found = self.grown(fitter, [offer.name for offer in fitter.offers])
-        return found and (self.again(found, anew=True) or found)
+        return self.grown(fitter, [offer.name for offer in fitter.offers])
 
     @inside()
     def run(self) -> Trial | None:
@@ -120,12 +119,9 @@ class Search:
         read, best, zeros = self.with_zeros(found and self.again(found), sure=differ)
         return read, best and read.settled(best), zeros
 
-    def again(self, found: Trial, *, anew: bool = False) -> Trial | None:
-        """The model of a trial fitted to these data, from its values; None where it does not follow them.
-
-        A fit to the same data stays, unless it is asked for `anew`: many numbers take more iterations than few.
-        """
-        if found.fitter.data is self.data and not anew:
+    def again(self, found: Trial) -> Trial | None:
+        """The model of a trial fitted to these data, from its values; None where it does not follow them."""
+        if found.fitter.data is self.data:
             return found
         fitter = self.fitter(found.fitter.variant.crossing(self.data.typical_step / found.fitter.data.typical_step))
         if found.fitter.data.lengths == self.data.lengths:
