@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.models.drag import AIR
 from herglotz.models.feature_potential import baseline_features, baseline_is_named
-from herglotz.models.features import lengths
+from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.models.translations import differences, directions, unchanged
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
@@ -118,6 +118,68 @@ def kinks(data: Trajectories) -> tuple[str, ...]:
     away, beyond = sorted((abs(float(data.q.min())), abs(float(data.q.max()))))
     crossed = float(data.q.min()) < 0 < float(data.q.max()) and away > SIDE * beyond
     return ("|q1| q1", "|q1|^3") if data.dof == 1 and not any(data.angles) and crossed else ()
+
+
+def chains(data: Trajectories) -> list[tuple[str, ...]]:
+    """Fewer features for joints: those of a planar chain of links, by angles between neighbours and by absolute ones.
+
+    Between neighbours the mass of speeds i and j turns with sums of the angles behind the first of the two, and weight
+    with the sums of all angles up to a joint; by absolute angles the mass turns with q_i − q_j alone. Where the chain
+    hangs on slides, the mass of a slide and a joint turns with the angle of a link; by absolute angles no other mass
+    and no friction is shared. Joints that springs alone connect have potentials of q_i − q_j, and no mass between them.
+    """
+    if data.dof < 2 or not any(data.angles):
+        return []
+    joints = [i for i, angle in enumerate(data.angles) if angle]
+    across, every = _by_slides(data.angles)
+    absolute = _where(lambda f: _form(f) == _difference(f), every) + _where(_of_own, across)
+    if across and len(joints) == 1:
+        return [absolute]
+    between = _where(lambda f: _of_neighbours(f, joints), every) + _where(lambda f: _row(f, joints), across)
+    return [between, absolute] if across else [between, absolute, _where(_of_springs, every)]
+
+
+def _where(rule: Callable[[Product], bool], terms: Sequence[tuple[str, Product]]) -> tuple[str, ...]:
+    return tuple(name for name, f in terms if rule(f))
+
+
+def _of_springs(f: Product) -> bool:
+    """Whether it is a potential of the difference of two angles."""
+    return not f.velocities and sorted(_form(f).values()) == [-1.0, 1.0]
+
+
+def _by_slides(angles: Sequence[bool]) -> tuple[list[tuple[str, Product]], list[tuple[str, Product]]]:
+    """The dictionary of joints: terms of the speeds of a slide and a joint, and those of joints alone."""
+    every = [(name, parse(name, angles)[0]) for name in revolute(angles)]
+    across = [(name, f) for name, f in every if len({angles[i] for i in f.velocities}) == 2]
+    return across, [(name, f) for name, f in every if all(angles[i] for i in f.velocities)]
+
+
+def _form(f: Product) -> dict[int, float]:
+    return {i: w for i, w in enumerate(f.form) if w}
+
+
+def _row(f: Product, joints: Sequence[int]) -> bool:
+    """Whether the angle is a sum of all joints up to one: that of a link, by the angles between neighbours."""
+    return list(_form(f).items()) == [(i, 1.0) for i in joints[: len(_form(f))]]
+
+
+def _of_own(f: Product) -> bool:
+    """Whether the angle is that of the one joint whose speed a term has beside a slide's."""
+    return len(_form(f)) == 1 and set(_form(f)) <= set(f.velocities) and set(_form(f).values()) == {1.0}
+
+
+def _of_neighbours(f: Product, joints: Sequence[int]) -> bool:
+    """Whether a chain has this term by the angles between neighbours: a sum of neighbouring angles."""
+    on = [joints.index(i) for i in _form(f)]
+    row = set(_form(f).values()) == {1.0} and on == list(range(on[0], on[-1] + 1))
+    return row and on[0] == (joints.index(min(f.velocities)) + 1 if f.velocities else 0)
+
+
+def _difference(f: Product) -> dict[int, float]:
+    """q_i − q_j of the two speeds of a term."""
+    i, j = sorted(f.velocities) if len(set(f.velocities)) == 2 else (0, 0)
+    return {} if i == j else {i: 1.0, j: -1.0}
 
 
 def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:

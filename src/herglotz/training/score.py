@@ -67,15 +67,13 @@ def scores(
     return [Score(own, count, numbers, chosen, error) for own, numbers, chosen, error in rest]
 
 
-def fitted_score(
-    problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float, zeros: int = 0
-) -> Score:
+def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int = 0) -> Score:
     """The score by the residuals of the fit itself, block by block, of models that are alike but for a few numbers.
 
     What leaving out a block does to a model of many numbers, to first order, says more of these than of the few.
     """
     (losses,), (rms,) = _losses(problem.misfit(path)[None], blocks(problem.data), floor)
-    return Score(losses, problem.data.q.numel(), numbers, choices, float(rms), zeros)
+    return Score(losses, problem.data.q.numel(), problem.P, 0, float(rms), zeros)
 
 
 def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float) -> Score:

@@ -24,7 +24,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.moves import Moves
-from herglotz.training.named_terms import DRY
+from herglotz.training.named_terms import DRY, chains
 from herglotz.training.offers import standing
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
@@ -96,9 +96,12 @@ class Search:
         best = self.first
         part(MORE_TERMS)
         ends = [best]
-        if not (best and best.at_the_noise) and (full := self.full) and (best is None or full.length >= best.length):
-            ends.append(self.settled(full, swapped=True))
-            best = self.better(best, ends[-1])
+        fitter, full = self.fitter(Variant(self.order)), None if best and best.at_the_noise else self.full
+        own = {offer.name for offer in fitter.offers}
+        for start in (full, *(self.grown(fitter, fitter.simple | own.intersection(x)) for x in chains(self.data))):
+            if start is not None and (best is None or start.length >= best.length):
+                ends.append(self.settled(start, swapped=True))
+                best = self.better(best, ends[-1])
         if best is None:
             return None
         part(FEWER_TERMS)

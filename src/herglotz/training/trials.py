@@ -153,9 +153,8 @@ class Trial:
         """Whether it replaces a model that has the same offers, with so many zeros of sensors beside its numbers."""
         if self.length != simple.length:
             return self.length > simple.length
-        floor, count = self.fitter.floor, len(self.taken)
-        its = fitted_score(simple.problem, simple.path, simple.problem.P, count, floor)
-        own = fitted_score(self.problem, self.path, self.problem.P, count, floor, zeros)
+        its = fitted_score(simple.problem, simple.path, self.fitter.floor)
+        own = fitted_score(self.problem, self.path, self.fitter.floor, zeros)
         return own.replaces(its, self.fitter.offered)
 
     @property

@@ -10,6 +10,7 @@ from tests import runge_kutta
 from herglotz.data import Trajectories
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
+from herglotz.training.named_terms import chains
 from herglotz.training.search import Search
 
 STEP, PARTS = 0.008, 4
@@ -51,3 +52,27 @@ def test_an_arm_with_motors_is_found_by_its_own_terms():
     weight = {"potential.stiffness[0]", "cos(q1 + q2)"}
     friction = {"friction.viscous[0]", "friction.viscous[1]"}
     assert found.taken == moving | weight | friction | {"friction.input_map[0]", "friction.input_map[3]"}
+
+
+def test_chains_of_three_links():
+    # fails if a mass turns with an angle before both of its joints, weight with no sum of angles from the
+    # base, or joints that springs alone connect have masses between them
+    data = Trajectories.of(torch.arange(9.0), torch.rand(9, 3), angles=(True,) * 3)
+    between, absolute, twisted = map(set, chains(data))
+    assert twisted == {f"{f}(q{i} - q{j})" for f in ("cos", "sin") for i, j in ((1, 2), (1, 3), (2, 3))}
+    assert len(between) == 20
+    assert {"cos(q1 + q2 + q3)", "cos(q2 + q3) v1 v3", "cos(q3) v2 v2"} <= between
+    assert not {"cos(q1) v1 v1", "cos(q2) v2 v2", "cos(q2 + q3)", "cos(q3) v1 v2"} & between
+    assert absolute == {f"{f}(q{i} - q{j}) v{i} v{j}" for f in ("cos", "sin") for i, j in ((1, 2), (1, 3), (2, 3))}
+
+
+def test_chains_that_hang_from_a_slide():
+    # fails if the mass of a slide turns with its own angle or with none, or one that a cart and a pole lack is kept
+    q = torch.rand(9, 3)
+    (one,) = chains(Trajectories.of(torch.arange(9.0), q[:, :2], angles=(False, True)))
+    assert set(one) == {"cos(q2) v1 v2", "sin(q2) v1 v2"}
+    between, absolute = chains(Trajectories.of(torch.arange(9.0), q, angles=(False, True, True)))
+    assert {"cos(q2) v1 v2", "cos(q2 + q3) v1 v2", "cos(q2 + q3) v1 v3", "cos(q3) v2 v3"} <= set(between)
+    assert not {"cos(q3) v1 v3", "cos(q2) v2 v2", "cos(q3) v1 v1"} & set(between)
+    pairs = {(1, 2): "q2", (1, 3): "q3", (2, 3): "q2 - q3"}
+    assert set(absolute) == {f"{f}({w}) v{i} v{j}" for f in ("cos", "sin") for (i, j), w in pairs.items()}
