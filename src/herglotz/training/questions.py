@@ -1,9 +1,8 @@
 """What a search asks of data beside their terms: one question after the other, of the model that the last one left.
 
 Damping by s belongs to the terms. Zeros of sensors and how inputs hold come before everything else that may stand for
-them. Whether functions say what named terms do not, and by which terms inputs act, follows: terms of inputs make up for
-functions of the state where these follow from one another. Of long recordings a part is asked, and all samples at the
-end.
+them. By which terms inputs act, and whether functions say what named terms do not, follows. Of long recordings a part
+is asked, and all samples at the end.
 """
 
 from __future__ import annotations
@@ -56,14 +55,13 @@ class Questions:
         return True
 
     def how_inputs_act(self) -> None:
-        """Terms anew with other terms of the inputs, where the model asks for some, and functions with them."""
+        """Terms anew with other terms of the inputs, where the model asks for some."""
         if self.best is None or not (terms := self.read.input_terms(self.best)):
             return
         read = self.read.driven_by(terms)
         found = _searched(read)
         if found is not None and found.replaces(self.best) and read.finalist(found, (self.best, found)) is found:
             self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
-            self.functions()
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.

@@ -138,7 +138,7 @@ def search(
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if asked.best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
-    for question in (asked.functions, asked.how_inputs_act, asked.all_data):
+    for question in (asked.how_inputs_act, asked.functions, asked.all_data):
         question()
     found, differ = asked.best, asked.differ
     if found is None:

@@ -152,7 +152,7 @@ def test_the_zeros_of_a_part_are_those_of_all(asked):
     assert found.zeros == pytest.approx((0.0, 0.1))
     assert seen == [
         ("part", "zeros"), ("part'", "hold of full"), ("part'", "run"), ("part'", "line"),
-        ("part'", "functions"), ("part'", "terms"), ("whole", "of_part, True"),
+        ("part'", "terms"), ("part'", "functions"), ("whole", "of_part, True"),
     ]  # fmt: skip
     on_a_line, seen = asked(zeros=zeros, line=True)
     assert not on_a_line.turning
@@ -192,7 +192,7 @@ def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(ask
     found, seen = asked(**{"functions": True, "hold of f1": "first"})
     assert found.hold == "first"
     assert [question for _, question in seen if "hold" in question] == ["hold of full", "hold of f1"]
-    assert seen[-2:] == [("whole'", "zeros"), ("whole'", "terms")]
+    assert seen[-1] == ("whole'", "zeros")
     found, seen = asked(**{"functions": True, "hold of full": "smooth"})
     assert found.hold == "smooth"
     found, seen = asked(**{"hold of full": "smooth"})
