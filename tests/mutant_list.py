@@ -277,6 +277,7 @@ MUTANTS = [
     ("models/feature_potential.py", ' and not config.translations', ''),
     ("training/named_terms.py", 'one_rate=True, springs=False', 'one_rate=True'),
     ("training/named_terms.py", '(*baseline_features(data.angles, zero, zero)[0], *pairs', '(*pairs'),
+    ("training/named_terms.py", 'NamedTerms(absolute, dry=True, apart=True)', 'NamedTerms(absolute, dry=True)'),
     ("training/problems/shooting.py", 'mass * self.joint_weight[self.n : 2 * self.n]', 'self.joint_weight[self.n : 2 * self.n]'),
     ("training/problems/smoothing.py", 'self.mass * v', 'v'),
     ("training/equation_terms.py", 'decay = -model.damping.rate * self._masses()[i, i]', 'decay = -model.damping.rate'),

@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
+from herglotz.data.windows import Triples
 
 DEGREES = (4, 6)  # even: at the middle of a window an odd power says nothing about position and acceleration
 WIDTHS = (7, 9, 11, 15, 21, 29, 41, 57, 81, 113, 161)  # odd, each about √2 times the one before
 EXCESS = 1.2  # squared residuals beyond so many times the least are motion that the polynomials miss
+NEAR = 0.02  # of a window's half width: steps so short that the rule's own error does not count
 MOST = 2000  # windows that the choice looks at
 
 
@@ -27,6 +29,13 @@ class LocalPolynomials:
     coefficients: Tensor  # (N, degree + 1, n)
     half: Tensor  # (N,) half the time that the window spans
     centred: Tensor  # (N,) bool: the window has as many samples before t_k as behind
+    rows: Tensor  # (N, width) samples of the window
+
+    def at(self, x: Tensor | float) -> Tensor:
+        """Positions at x of every window, (N, n)."""
+        x = torch.as_tensor(x, dtype=self.half.dtype).expand_as(self.half)
+        powers = torch.stack([x**k for k in range(self.coefficients.shape[1])], -1)
+        return (powers[..., None] * self.coefficients).sum(1)
 
 
 def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
@@ -48,13 +57,31 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     half, A = _design(data, rows, degree)
     coefficients = _inverse(A) @ data.q[rows].double()
     middle = rows[:, width // 2] == torch.arange(data.samples)
-    return LocalPolynomials(width, coefficients, half, middle)
+    return LocalPolynomials(width, coefficients, half, middle, rows)
 
 
-def smoothed(data: Trajectories) -> Trajectories:
-    """The recordings with positions on local polynomials; as they are where they have none."""
-    local = local_polynomials(data)
-    return data if local is None else replace(data, q=local.coefficients[:, 0].to(data.q))
+def smoothed(data: Trajectories, local: LocalPolynomials | None = None) -> Trajectories:
+    """The recordings with positions on local polynomials, by default their own; as they are where they have none."""
+    local = local or local_polynomials(data)
+    return data if local is None else replace(data, q=local.at(0.0).to(data.q))
+
+
+def smooth_triples(data: Trajectories, local: LocalPolynomials) -> tuple[Triples, Tensor | None]:
+    """Three positions on each polynomial, a short time apart, and the inputs (T, m) averaged over its window."""
+    every = local.centred.nonzero()[:, 0]
+    q0, q1, q2 = (local.at(x)[every] for x in (-NEAR, 0.0, NEAR))
+    h = NEAR * local.half[every]
+    u = None
+    if data.u is not None:
+        rows = local.rows[every]
+        t = data.t[rows].double()
+        middle = (t[:, 1:] + t[:, :-1]) / 2 - data.t[every].double()[:, None]
+        weight = (1 - (middle / local.half[every][:, None]).square()).clamp_min(0).square() * t.diff(dim=1)
+        u = (weight[..., None] * data.u[rows[:, :-1]].double()).sum(1) / weight.sum(1, keepdim=True)
+    like = data.q
+    q0, q1, q2, h = (x.to(like) for x in (q0, q1, q2, h))
+    found = Triples(q0, q1, q2, h, h, every)
+    return found, None if u is None else u.to(like)
 
 
 def _quality(data: Trajectories, width: int, degree: int) -> tuple[float, float]:

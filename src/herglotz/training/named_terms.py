@@ -120,8 +120,18 @@ def kinks(data: Trajectories) -> tuple[str, ...]:
     return ("|q1| q1", "|q1|^3") if data.dof == 1 and not any(data.angles) and crossed else ()
 
 
-def chains(data: Trajectories) -> list[tuple[str, ...]]:
-    """Fewer features for joints: those of a planar chain of links, by angles between neighbours and by absolute ones.
+def central(data: Trajectories, every: NamedTerms) -> list[NamedTerms]:
+    """One power of the distance each, with the friction and the forces across the velocity of `every`.
+
+    Powers of r are so much alike over most motions that a linear problem of all of them says little of each.
+    """
+    across = tuple(x for x in every.features if "v" in x)
+    of_r = distances(data) if every.springs else ()
+    return [every.joined(NamedTerms((name,))).only((name, *across, *every.drag, DRY)) for name in of_r]
+
+
+def chains(data: Trajectories) -> list[NamedTerms]:
+    """Fewer terms for joints: those of a planar chain of links, by the angles between neighbours and by absolute ones.
 
     Between neighbours the mass of speeds i and j turns with sums of the angles behind the first of the two, and weight
     with the sums of all angles up to a joint; by absolute angles the mass turns with q_i − q_j alone. Where the chain
@@ -134,9 +144,10 @@ def chains(data: Trajectories) -> list[tuple[str, ...]]:
     across, every = _by_slides(data.angles)
     absolute = _where(lambda f: _form(f) == _difference(f), every) + _where(_of_own, across)
     if across and len(joints) == 1:
-        return [absolute]
+        return [NamedTerms(absolute, dry=True, apart=True)]
     between = _where(lambda f: _of_neighbours(f, joints), every) + _where(lambda f: _row(f, joints), across)
-    return [between, absolute] if across else [between, absolute, _where(_of_springs, every)]
+    turning = [NamedTerms(between, dry=True), NamedTerms(absolute, dry=True, apart=bool(across))]
+    return turning if across else [*turning, NamedTerms(_where(_of_springs, every), dry=True, apart=True)]
 
 
 def _where(rule: Callable[[Product], bool], terms: Sequence[tuple[str, Product]]) -> tuple[str, ...]:

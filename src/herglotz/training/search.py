@@ -17,20 +17,23 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import with_input_terms
 from herglotz.data.roughness import part_of
 from herglotz.data.sensors import measured
+from herglotz.data.smoothing import local_polynomials
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.acting_inputs import asked_terms
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
+from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
-from herglotz.training.named_terms import DRY, chains
+from herglotz.training.named_terms import DRY, candidates, special, started
 from herglotz.training.offers import standing
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import clear, differing_zeros
 from herglotz.training.strengths import likeliest, needed, of_terms
-from herglotz.training.task import LEAST_GRIP
+from herglotz.training.task import LEAST_GRIP, build_model
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
@@ -73,7 +76,7 @@ class Search:
 
     @cached_property
     def first(self) -> Trial | None:
-        """The better one of the models that the simplest grows into, where offers join on the way and where none do.
+        """What the simplest model grows into, the better one of where offers join on the way and where none do.
 
         Where inputs follow from the state, terms that join over short segments make up for one another.
         """
@@ -96,19 +99,18 @@ class Search:
         best = self.first
         part(MORE_TERMS)
         ends = [best]
-        fitter, full = self.fitter(Variant(self.order)), None if best and best.at_the_noise else self.full
-        own = {offer.name for offer in fitter.offers}
-        for start in (full, *(self.grown(fitter, fitter.simple | own.intersection(x)) for x in chains(self.data))):
-            if start is not None and (best is None or start.length >= best.length):
-                ends.append(self.settled(start, swapped=True))
-                best = self.better(best, ends[-1])
+        fitter = self.fitter(Variant(self.order))
+        ends.append((start := self.linear_start(fitter)) and self.climbed(fitter, *start))
+        if not (best and best.at_the_noise) and (full := self.full) and (best is None or full.length >= best.length):
+            ends.append(self.settled(full, swapped=True))
+        for end in ends[1:]:
+            best = self.better(best, end)
         if best is None:
             return None
         part(FEWER_TERMS)
         every = [offer.name for offer in best.fitter.offers]
         down = best.fitter.fit(every, best.values, best.length, best, 2 * ITERATIONS)
-        down = down and best.fitter.grow(down)
-        ends.append(None if down is None else self.settled(self.finer(down), swapped=True))
+        ends.append(down and self.settled(self.finer(best.fitter.grow(down)), swapped=True))
         best = self.better(best, ends[-1])
         if best is not None and best is not ends[-1]:
             ends.append(best := self.settled(best, swapped=True))
@@ -170,6 +172,18 @@ class Search:
                 winner, least = end, found
         return winner
 
+    def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
+        """Offers and values that one linear problem of smoothed accelerations gives; None where it gives none."""
+        local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
+        every = every.only(set(every.names) - set(special(self.data)))
+        start = None if local is None else start_of(self.data, self.base, every, local)
+        if start is None:
+            return None
+        base = started(self.base, self.data, start.values, fitter.settings)
+        numbers = ParameterVector(build_model(base, fitter.settings, "none"))
+        values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
+        return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
+
     def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float], joining=True) -> Trial | None:
         """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
@@ -185,7 +199,7 @@ class Search:
     def grown(self, fitter: Fitter, taken: Iterable[str]) -> Trial | None:
         """A model as it is over the longest segments that it follows."""
         trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        return None if trial is None else self.finer(fitter.grow(self.finer(trial)))
+        return trial and self.finer(fitter.grow(self.finer(trial)))
 
     def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
         """The better one of two models."""
@@ -256,8 +270,8 @@ class Search:
 
         None where the model is at the noise, unless the settings ask for zeros, or where the fit leads nowhere.
         """
-        asked = self.config.find_zeros or (self.config.find_zeros is None and not trial.at_the_noise)
-        if len(self.data) == 1 or not asked:
+        wanted = self.config.find_zeros
+        if len(self.data) == 1 or not (wanted or (wanted is None and not trial.at_the_noise)):
             return None
         names = trial.problem.parameters.numbers
         problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
@@ -278,10 +292,7 @@ class Search:
         return read, other, differ
 
     def held(self, trial: Trial, holds: Sequence[str], *, alike: bool = False) -> str:
-        """The hold of the inputs that the same model asks for; "" where none of these is better.
-
-        `alike`: by the residuals of the fits themselves, of a model that lacks no term.
-        """
+        """The hold that the same model asks for; "" for none. `alike`: by the residuals of the fits themselves."""
         best, found = trial, ""
         for hold in [] if trial.at_the_noise else holds:
             other = self.of(replace(self.data, hold=hold)).again(trial)

@@ -1,4 +1,4 @@
-"""The liveliest samples, seals and hints: small parts of the readers and of smoothing."""
+"""Averages of inputs, the liveliest samples, seals and hints: small parts of the readers and of smoothing."""
 
 import io
 
@@ -8,11 +8,24 @@ import torch
 
 from herglotz.data import Trajectories
 from herglotz.data.seal import ONNX_ENTRY, SIZE, check_seal, sealed_bytes, sealed_onnx, sealed_text, sealed_zip
-from herglotz.data.smoothing import _quality, local_polynomials
+from herglotz.data.smoothing import _quality, local_polynomials, smooth_triples
 from herglotz.data.splits import RUN, liveliest_rows
 from herglotz.errors import InputError
 
 F64 = torch.float64
+
+
+def test_inputs_are_averaged_over_the_window():
+    # fails if the weights do not divide out, or the input of another step than each own is taken: one that grows with
+    # time averages to the middle, half a step back, as an input holds for the step that it begins
+    t = torch.arange(60, dtype=torch.float64) * 0.1
+    data = Trajectories.of(t, t.sin()[:, None], (60,), u=t[:, None])
+    local = local_polynomials(data)
+    assert local is not None
+    triples, u = smooth_triples(data, local)
+    assert u is not None
+    torch.testing.assert_close(u[:, 0], t[local.centred] - 0.05, rtol=0, atol=1e-12)
+    assert len(triples) == int(local.centred.sum())
 
 
 def test_the_liveliest_run_is_taken_whole():
