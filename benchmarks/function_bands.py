@@ -29,7 +29,7 @@ from herglotz.data import Trajectories
 from herglotz.training import LearnedFunction, Run, fit, laplace, learned_functions
 
 MOTIONS, SAMPLES, STEP, NOISE = 3, 300, 0.08, 0.005
-LEVEL = 0.9
+LEVEL = 0.9  # share of the truth that bands are to hold
 FUNCTIONS = ("potential", "force", "friction", "damping", "mass")
 KINDS = ("well", "quartic", "saturating", "ring", "wire")
 

@@ -22,10 +22,10 @@ from herglotz.training.offers import INPUTS
 from herglotz.training.trials import Trial, Variant
 
 LEVELS = 24  # of an input, tried between a twentieth of its largest value and that
-LOWEST = 0.05
+LOWEST = 0.05  # of the largest value of an input: the least level that is tried
 AROUND = 1.5  # factor to either side of its first guess within which a level is sharpened
 ROUNDS = 16  # of golden sections, which leave 0.05 % of that range
-GOLDEN = (5**0.5 - 1) / 2
+GOLDEN = (5**0.5 - 1) / 2  # of an interval, to its inner point
 
 
 class Driven(Protocol):
