@@ -72,8 +72,9 @@ def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int 
 
     What leaving out a block does to a model of many numbers, to first order, says more of these than of the few.
     """
-    (losses,), (rms,) = _losses(problem.misfit(path)[None], blocks(problem.data), floor)
-    return Score(losses, problem.data.q.numel(), problem.P, 0, float(rms), zeros)
+    block = torch.where(problem.data.complete, blocks(problem.data), -1)
+    (losses,), (rms,) = _losses(problem.misfit(path)[None], block, floor)
+    return Score(losses, int((problem.weight > 0).sum()), problem.P, 0, float(rms), zeros)
 
 
 def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float) -> Score:

@@ -1,6 +1,8 @@
 """A law that is nonlinear in s, L = v²/2 − V − γ s − β s², found from positions by a fit with default settings."""
 
 import math
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -108,3 +110,9 @@ def test_damping_of_a_plain_kind_is_left_as_it_is():
         run = fit(simulate(name, trajectories=2, steps=150, noise=0.003, seed=1), progress=False)
         assert run.model.config.dissipation == ()
         assert math.isfinite(run.metrics["train_rms"])
+
+
+def test_no_damping_by_s_is_asked_for_beside_friction_that_holds():
+    # fails if a search begins that can only end in a model of both, which there is none of
+    best, config = SimpleNamespace(at_the_noise=False), SimpleNamespace(translations=(), sticking=True)
+    assert with_dissipation(cast(Any, SimpleNamespace(config=config)), cast(Any, best)) is best

@@ -19,7 +19,7 @@ from herglotz.training.held_out import HeldOut, blocks
 from herglotz.training.look import look
 from herglotz.training.moves import BLOCKS, MEMORY, Moves
 from herglotz.training.offers import Offer
-from herglotz.training.score import Score
+from herglotz.training.score import Score, fitted_score
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
@@ -418,6 +418,20 @@ def test_a_block_that_is_lost_weighs_no_more_than_it_may():
     found = there(fitter.fit({"q1^2"}, {}, 5, None))
     found.path.x[-1, -1, 0] = 1e12
     assert bool(torch.isfinite(found.score.losses).all())
+
+
+def test_a_missing_position_has_no_share_in_the_score_of_a_fit():
+    # fails if what stands for a blank cell counts where zeros of sensors, or another hold, are asked for
+    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
+    found = there(searched(data).fitter(Variant(2)).fit({"q1^2"}, {}, 5, None))
+    problem, path = found.problem, found.path
+    q, observed = problem.data.q.clone(), torch.ones_like(problem.data.q)
+    q[40], observed[40] = 1e3, 0.0
+    problem.data = replace(problem.data, q=q, observed=observed)
+    problem._weigh()
+    score = fitted_score(problem, path, 1e-8)
+    assert score.rms < 0.1
+    assert score.count == len(q) - 1
 
 
 def test_a_search_of_many_samples_is_made_of_some(monkeypatch):
