@@ -1,6 +1,7 @@
 """The search over offers: what it takes, what it leaves, and what its score says."""
 
 import math
+import os
 import sys
 from dataclasses import replace
 from itertools import pairwise
@@ -12,7 +13,7 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, Plan, fit
+from herglotz.training import FitConfig, Plan, fit, flow
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.found_model import settings
 from herglotz.training.held_out import HeldOut, blocks
@@ -418,6 +419,41 @@ def test_a_block_that_is_lost_weighs_no_more_than_it_may():
     found = there(fitter.fit({"q1^2"}, {}, 5, None))
     found.path.x[-1, -1, 0] = 1e12
     assert bool(torch.isfinite(found.score.losses).all())
+
+
+@pytest.mark.parametrize(("zero", "deviation", "better"), [(0.2, 1e-6, None), (0.001, 0.01, True)])
+def test_zeros_are_clearly_there_and_make_the_fit_better(zero, deviation, better, monkeypatch):
+    # fails if zeros with which the fit misses more are taken, or those within their deviations
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
+    search = searched(replace(data, p=None, s=None), find_zeros=True)
+    fitter = search.fitter(Variant(2))
+    best = there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
+    found = torch.tensor([[0.0], [zero]], dtype=torch.float64), torch.tensor([[0.0], [deviation]], dtype=torch.float64)
+    monkeypatch.setattr(search, "zeros", lambda _: found)
+    if better is not None:
+        monkeypatch.setattr(type(best), "fits_better", lambda *_: better)
+    assert search.with_zeros(best) == (search, best, None)
+
+
+def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
+    # fails if blocks that are left out to first order decide of very many numbers, or residuals of a few
+    search = searched(simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3))
+    other = SimpleNamespace(fits_better=lambda _: True, replaces=lambda _: False)
+    monkeypatch.setattr(search, "of", lambda _: SimpleNamespace(again=lambda _: other))
+    trial = cast(Any, SimpleNamespace(at_the_noise=False))
+    assert search.held(trial, ["first"], alike=True) == "first"
+    assert search.held(trial, ["first"]) == ""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_child_has_threads_of_its_own():
+    # fails if a process that was forked waits for threads that only its parent has
+    flow._pool(2).submit(int).result()
+    child = os.fork()
+    if child == 0:
+        os._exit(flow._pool.cache_info().currsize)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 def test_a_missing_position_has_no_share_in_the_score_of_a_fit():
