@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -18,7 +19,7 @@ from herglotz.data.input_terms import SATURATIONS, all_input_terms, saturation
 from herglotz.data.smoothing import smoothed
 from herglotz.least_squares import least_squares
 from herglotz.training.acceleration_terms import acceleration_terms, for_each
-from herglotz.training.offers import INPUTS
+from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.trials import Trial, Variant
 
 LEVELS = 24  # of an input, tried between a twentieth of its largest value and that
@@ -72,24 +73,42 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
     every = offered_terms(search.data)
     if not every:
         return ()
-    found = _climbed(search, every)
+    found = _with(search, every, trial)
     if found is None or not found.replaces(trial):
         return ()
     if any(map(saturation, _taken(found, every))):
         every = _sharpened(search, found, every)
     while 0 < len(taken := _taken(found, every)) < len(every):  # terms that made up for others leave with those
-        fewer = _climbed(search, taken)
+        fewer = _with(search, taken, trial)
         if fewer is None or found.replaces(fewer):
             break
         found, every = fewer, taken
     return taken if found.gain(trial, sum(map(bool, map(saturation, taken)))) > 0 else ()
 
 
-def _climbed(search: Driven, terms: Sequence[str]) -> Trial | None:
-    """The simplest model with what joins it over ever longer segments, these terms of the inputs being offers, too."""
+def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
+    """A model with these terms of the inputs among its offers, which join a trial that is near the data.
+
+    Else they join the simplest model over ever longer segments.
+    """
     other = search.driven_by(terms)
+    if trial.near and (same := other.again(_beside(trial, len(terms)))) is not None:
+        return other.settled(other.finer(same), swapped=True)
     fitter = other.fitter(Variant(search.order))
     return other.climbed(fitter, fitter.simple, {})
+
+
+def _beside(trial: Trial, more: int) -> Trial:
+    """The trial with the names that its numbers of inputs have where there are so many more inputs."""
+    columns = len(trial.fitter.data.input_labels)
+
+    def renamed(name: str) -> str:
+        stem, _, place = name.partition("[")
+        row, column = divmod(int(place.rstrip("]") or 0), columns) if stem in (INPUTS, ZEROS) else (0, 0)
+        return {INPUTS: f"{INPUTS}[{row * (columns + more) + column}]", ZEROS: f"{ZEROS}[{column}]"}.get(stem, name)
+
+    values = {renamed(name): x for name, x in trial.values.items()}
+    return replace(trial, taken=frozenset(map(renamed, trial.taken)), values=values)
 
 
 def _taken(found: Trial, every: Sequence[str]) -> tuple[str, ...]:

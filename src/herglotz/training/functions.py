@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement, groupby
 from typing import NamedTuple
@@ -81,13 +81,18 @@ def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Ban
     return [band for name, waves in found.items() for band in _octaves(name, waves)]
 
 
-def terms_with(every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
-    """The terms with all waves of these functions, which take the place of powers in the potential but the lowest."""
-    gone = replaced(terms.features, (), angles)
-    kept = [text for text in terms.features if text not in gone]
+def terms_with(
+    every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...], kept: Collection[str] = ()
+) -> NamedTerms:
+    """The terms with all waves of these functions, which take the place of powers in the potential but the lowest.
+
+    Those that are `kept` stay.
+    """
+    gone = replaced(terms.features, (), angles).difference(kept)
+    left = [text for text in terms.features if text not in gone]
     waves = {brakes: [text for own in every if own.brakes == brakes for text in own.texts] for brakes in (False, True)}
     still = NamedTerms(tuple(waves[False]), tuple(waves[True]))
-    return replace(terms, features=tuple(kept)).joined(still)
+    return replace(terms, features=tuple(left)).joined(still)
 
 
 def replaced(features: Iterable[str], drag: Iterable[str], angles: tuple[bool, ...]) -> set[str]:

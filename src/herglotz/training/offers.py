@@ -18,6 +18,7 @@ ALWAYS = ("kinetic.log_diagonal", "kinetic.base.log_diagonal", "damping.rate")
 SHAPES = {"friction.coulomb": "friction.log_smooth", "friction.breakaway": "friction.log_stribeck"}
 ON = {"friction.breakaway": "friction.coulomb"}  # what is an excess of another offer is none without it
 INPUTS = "friction.input_map"  # gains of all inputs, row by row
+ZEROS = "friction.input_zero"  # of all inputs
 SIMPLE = ("potential.stiffness", "potential.tilt", INPUTS)  # of the simplest model, beside `ALWAYS`
 
 

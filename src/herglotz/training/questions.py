@@ -13,6 +13,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from herglotz.training.dissipation import with_dissipation
+from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
 from herglotz.training.trials import Trial
 
@@ -68,7 +69,7 @@ class Questions:
 
         Functions may be what recordings seemed to differ by, and tell a hold that terms did not.
         """
-        if self.best is None or (found := self.read.with_functions(self.best)) is self.best:
+        if self.best is None or (found := with_functions(self.read, self.best)) is self.best:
             return
         self.best = found
         others = [] if self.wanted.part.longer > 1 else [hold for hold in self.holds if hold != self.hold]

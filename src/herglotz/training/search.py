@@ -22,8 +22,6 @@ from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.acting_inputs import asked_terms
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.functions import bands
-from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import DRY, candidates, special, started
@@ -32,7 +30,7 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import clear, differing_zeros
-from herglotz.training.strengths import likeliest, needed, of_terms
+from herglotz.training.strengths import likeliest, needed
 from herglotz.training.task import LEAST_GRIP, build_model
 from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
 
@@ -134,23 +132,6 @@ class Search:
         first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
         other = fitter.fit(found.taken, found.values, first, None)
         return None if other is None else self.finer(fitter.leap(other))
-
-    @inside()
-    def with_functions(self, best: Trial) -> Trial:
-        """A model of functions that join one by one or, where some do, all at once, without masses and with them."""
-        if best.at_the_noise or self.config.translations:
-            return best
-        part(MORE_TERMS)
-        fitter = self.fitter(Variant(self.order, functions=tuple(bands(self.over, self.base))))
-        if len(fitter.start) > MAX_PARAMETERS:  # no kernel holds them
-            return best
-        every, other = frozenset({*fitter.simple, *fitter.functions}), self.climbed(fitter, fitter.simple, {})
-        for taken in dict.fromkeys((frozenset(x for x in every if not x.startswith("mass")), every)):
-            if other is None or not (other.whole and (other.at_the_noise or not other.taken & set(fitter.functions))):
-                other = self.better(other, self.climbed(fitter, taken, {}, joining=False))
-        if other is not None and not other.taken & set(fitter.functions):
-            other = of_terms(other, self.fitter(replace(other.fitter.variant, functions=())), 2 * ITERATIONS)
-        return best if other is None else self.braking(self.finalist(self.better(best, other) or best, (best, other)))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
         """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.

@@ -55,6 +55,7 @@ class Variant:
     sticking: bool = False
     functions: tuple[Band, ...] = ()  # of the coordinates, beside named terms
     dissipation: tuple[str, ...] = ()  # powers of s in L
+    kept: frozenset[str] = frozenset()  # offers that stay where functions could stand for them
 
     def crossing(self, times: float) -> Variant:
         """The same with about as long model steps, where recorded steps are so many times as long."""
@@ -113,6 +114,11 @@ class Trial:
     def whole(self) -> bool:
         """Whether it follows whole trajectories."""
         return not self.problem.jointed
+
+    @property
+    def near(self) -> bool:
+        """Whether it follows whole trajectories so closely that its linear motion says which offers are worth a fit."""
+        return self.whole and self.rms <= FOLLOWED * self.fitter.spread
 
     @property
     def at_the_noise(self) -> bool:
@@ -185,7 +191,7 @@ class Fitter:
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
         every_band, terms = variant.functions, candidates(data, config.translations)
-        terms = terms_with(every_band, terms, data.angles) if every_band else terms
+        terms = terms_with(every_band, terms, data.angles, variant.kept) if every_band else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}

@@ -15,6 +15,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.features import parse
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
+from herglotz.training.function_search import with_functions
 from herglotz.training.functions import FRICTION, PLANE, REACH, bands, prior_spreads
 from herglotz.training.moves import Moves
 from herglotz.training.problems.prior import Gaussian, prior_of
@@ -49,7 +50,7 @@ def ended(search):
     """The model that a search ends in."""
     named = search.run()
     assert named is not None
-    return search.with_functions(named)
+    return with_functions(search, named)
 
 
 STARTS = [(0.9, 0.0), (-0.7, 0.6), (0.5, -0.9), (-0.4, 0.2)]
@@ -116,15 +117,17 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
 def test_waves_of_a_part_are_those_of_all(monkeypatch):
     # fails if the waves that a search finds in a part of a long recording have another interval in the whole of it
     asked = []
-    monkeypatch.setattr("herglotz.training.search.bands", lambda data, base: asked.append(data) or bands(data, base))
+    monkeypatch.setattr(
+        "herglotz.training.function_search.bands", lambda data, base: asked.append(data) or bands(data, base)
+    )
     monkeypatch.setattr("herglotz.training.search.PART", 170)
     data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     named = search.part.run()
     assert named is not None
     monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
-    search.part.with_functions(named)
-    search.part.of(search.part.data).with_functions(named)
+    with_functions(search.part, named)
+    with_functions(search.part.of(search.part.data), named)
     assert all(over is data for over in asked)
     of = next(variant for variant in search.part.fitters if variant.functions)
     assert {variant.functions for variant in search.part.fitters} == {(), of.functions}
@@ -194,7 +197,7 @@ def without_named_terms(search):
     named = search.fitter(Variant(2))
     first = named.fit(named.simple, {}, named.lengths[0], None)
     assert first is not None
-    return search.with_functions(first)
+    return with_functions(search, first)
 
 
 def test_a_damper_that_no_dictionary_holds_is_learned_as_friction_by_speed():
@@ -315,7 +318,7 @@ def test_no_functions_where_named_terms_are_at_the_noise():
     found = search.run()
     assert found is not None
     assert found.taken == {"cos(q1)"}
-    assert search.with_functions(found) is found
+    assert with_functions(search, found) is found
     assert not any(variant.functions for variant in search.fitters)
     assert search.fitter(Variant(2)).functions == {}
 

@@ -12,7 +12,7 @@ import torch
 from herglotz.data import simulate
 from herglotz.data.smoothing import local_polynomials
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, trajectory_fit
+from herglotz.training import FitConfig, questions, trajectory_fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.linear_terms import SINGULAR, LinearStart, LinearTerms, start_of
@@ -193,6 +193,7 @@ def asked(monkeypatch):
     def ask(**told):
         seen = []
         monkeypatch.setattr(module, "Search", partial(Asked, told=told, seen=seen))
+        monkeypatch.setattr(questions, "with_functions", lambda search, best: search.with_functions(best))
         return search(data, base, config, outliers=False, holds=["first", "smooth"]), seen
 
     return ask
