@@ -92,13 +92,13 @@ def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
     Else they join the simplest model over ever longer segments.
     """
     other = search.driven_by(terms)
-    if trial.near and (same := other.again(_beside(trial, len(terms)))) is not None:
+    if trial.near and (same := other.again(beside(trial, len(terms)))) is not None:
         return other.settled(other.finer(same), swapped=True)
     fitter = other.fitter(Variant(search.order))
     return other.climbed(fitter, fitter.simple, {})
 
 
-def _beside(trial: Trial, more: int) -> Trial:
+def beside(trial: Trial, more: int) -> Trial:
     """The trial with the names that its numbers of inputs have where there are so many more inputs."""
     columns = len(trial.fitter.data.input_labels)
 

@@ -9,13 +9,15 @@ import pytest
 import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import saturation
-from herglotz.training.acting_inputs import offered_terms
+from herglotz.training.acting_inputs import beside, offered_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.look import look
+from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.plan import Plan
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
+from herglotz.training.trials import Trial
 
 H = 0.04
 
@@ -94,6 +96,27 @@ def test_a_plan_repeats_the_terms(runs):
     )
     assert again.data.input_labels == run.data.input_labels
     assert str(again.equation()) == str(run.equation())
+
+
+def test_gains_keep_their_coordinate_where_inputs_join():
+    # fails if the gains of two inputs on two coordinates, row by row, are those of others where three terms join them
+    numbers = {
+        "friction.input_map[1]": 1.0,
+        "friction.input_map[2]": 2.0,
+        "friction.input_zero[1]": 3.0,
+        "cos(q1)": 4.0,
+    }
+    data: Any = SimpleNamespace(input_labels=(("f1", "N"), ("f2", "N")))
+    trial = Trial(SimpleNamespace(data=data), frozenset(numbers), numbers, None, None)  # pyright: ignore[reportArgumentType]
+    found = beside(trial, 3)
+    assert found.values == {
+        "friction.input_map[1]": 1.0, "friction.input_map[5]": 2.0, "friction.input_zero[1]": 3.0, "cos(q1)": 4.0,
+    }  # fmt: skip
+    assert found.taken == frozenset(found.values)
+    # a single gain has no place in its name
+    data.input_labels = (("f1", "N"),)
+    single = Trial(SimpleNamespace(data=data), frozenset(), {INPUTS: 1.0, ZEROS: 2.0}, None, None)  # pyright: ignore[reportArgumentType]
+    assert beside(single, 1).values == {f"{INPUTS}[0]": 1.0, f"{ZEROS}[0]": 2.0}
 
 
 def test_inputs_that_act_as_recorded_have_no_terms():

@@ -311,6 +311,29 @@ def test_a_potential_of_both_coordinates_is_learned(monkeypatch):
     assert found.rms < 1.2 * found.fitter.precision
 
 
+def test_functions_join_a_model_that_is_near_the_data(monkeypatch):
+    # fails if a model of functions is made anew where named terms miss the motion by a hundredth, or if the named terms
+    # that functions could stand for are lost, so that no fit begins near the data
+    monkeypatch.setattr("herglotz.training.function_search._anew", lambda _: pytest.fail("made anew"))
+    dent = lambda q: (q - 0.4) * np.exp(-(((q - 0.4) / 0.3) ** 2) / 2)  # noqa: E731
+    data = recorded(lambda q, v: -np.sin(q) + dent(q) - 0.1 * v, STARTS, angle=True)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    named = search.run()
+    assert named is not None
+    assert named.near
+    assert not named.at_the_noise
+    found = with_functions(search, named)
+    assert found.at_the_noise
+    assert found.taken & set(found.fitter.functions)
+    assert found.fitter.variant.kept == named.taken
+    # of powers those stay that are kept
+    data = recorded(lambda q, v: -q - 2 * q**3 - 0.1 * v, STARTS, angle=False)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    kept = search.fitter(Variant(2, functions=tuple(bands(data, search.base)), kept=frozenset({"q1^4"})))
+    assert "q1^4" in {offer.name for offer in kept.offers}
+    assert "q1^3" not in {offer.name for offer in kept.offers}
+
+
 def test_no_functions_where_named_terms_are_at_the_noise():
     # fails if functions are tried for every recording: they would take the place of the law
     data = recorded(lambda q, v: -np.sin(q) - 0.1 * v, [(2.0, 0.0), (0.5, 1.0)], angle=True)
