@@ -125,17 +125,14 @@ def assign(
     wanted = _dated(wanted.by_name(cells, names), names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
-    guesses = [_guess(name, unit, wanted, place) for name, unit in zip(names, units, strict=True)]
-    if wanted.motion and wanted.coordinates is None and not any(guess.role == "q" for guess in guesses):
-        # Volts of a sensor are the motion where no other column is.
-        guesses = [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
-    roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "rate", "q", "dropped")}
-    for i, guess in enumerate(guesses):
-        roles[guess.role].append(i)
+    guesses = _guesses(names, units, wanted)
+    roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
     clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))
     u = wanted.in_order(roles["input"], names)
-    q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
-    q = q if wanted.coordinates is None else tuple(place[x] for x in as_names(wanted.coordinates))
+    if wanted.coordinates is None:
+        q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
+    else:
+        q = tuple(place[x] for x in as_names(wanted.coordinates))
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
@@ -159,6 +156,14 @@ def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
 def as_names(names: Names) -> Sequence[str]:
     """Names, of which one may be given by itself."""
     return (names,) if isinstance(names, str) else names
+
+
+def _guesses(names: Sequence[str], units: Sequence[str], wanted: Wanted) -> list[Guess]:
+    """The role of every column; volts of a sensor are the motion if no other column is."""
+    guesses = [_guess(name, unit, wanted, names) for name, unit in zip(names, units, strict=True)]
+    if wanted.motion and wanted.coordinates is None and all(guess.role != "q" for guess in guesses):
+        return [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
+    return guesses
 
 
 def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Guess:

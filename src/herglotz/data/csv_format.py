@@ -11,6 +11,7 @@ from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.csv_dialect import Rows, cells_of, in_commas
@@ -144,30 +145,32 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     angle is written too, although `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit
     cannot stand in the header (it has a comma, or means another column).
     """
-    q = trajectories.names
-    header = ["trajectory", f"t[{trajectories.time_unit}]"]
-    header += [f"{name}[{unit}]" for name, unit in zip(q, trajectories.units, strict=True)]
-    parts = [trajectories.t[:, None], trajectories.q]
-    if trajectories.v is not None:  # left aside by `read_csv`, as all rates are
-        rate = [f"{unit}/{trajectories.time_unit}".removesuffix("/1") for unit in trajectories.units]
-        header += [f"{name}_dot[{unit}]" for name, unit in zip(q, rate, strict=True)]
-        parts.append(trajectories.v)
-    if trajectories.s is not None:
-        header, parts = [*header, "s"], [*parts, trajectories.s[:, None]]
-    if trajectories.p is not None:
-        header, parts = header + [f"p_{name}" for name in q], [*parts, trajectories.p]
-    if trajectories.u is not None:
-        header, parts = header + [f"u_{i}" for i in range(trajectories.u.shape[1])], [*parts, trajectories.u]
+    header, table = _table(trajectories)
     _check_header(Path(path), header, trajectories)
-    table = np.concatenate([x.detach().cpu().numpy().astype(np.float64) for x in parts], axis=1)
-    if trajectories.observed is not None:
-        table[:, 1 : 1 + len(q)][trajectories.observed.cpu().numpy() == 0] = np.nan
     names = trajectories.trajectory.tolist()
     said = trajectories.arrival._asdict().items()
     comments = [*comments, *(f"{name}: {value}" for name, value in said if value not in ("", None))]
     lines = [f"# {line}" for text in comments for line in text.splitlines()] + [",".join(header)]
     lines += [",".join([str(b), *map(repr, row)]) for b, row in zip(names, table.tolist(), strict=True)]
     write_atomically(path, ("\n".join(lines) + "\n").encode())
+
+
+def _table(data: Trajectories) -> tuple[list[str], np.ndarray]:
+    """The header's cells, and the numbers below all cells but the first, which is the trajectory's."""
+    q = data.q if data.observed is None else data.q.where(data.observed > 0, torch.nan)
+    rates = [f"{unit}/{data.time_unit}".removesuffix("/1") for unit in data.units]
+    blocks = [
+        ([f"t[{data.time_unit}]"], data.t),
+        ([f"{name}[{unit}]" for name, unit in zip(data.names, data.units, strict=True)], q),
+        # `read_csv` leaves all rates aside.
+        ([f"{name}_dot[{unit}]" for name, unit in zip(data.names, rates, strict=True)], data.v),
+        (["s"], data.s),
+        ([f"p_{name}" for name in data.names], data.p),
+        ([f"u_{i}" for i in range(0 if data.u is None else data.u.shape[1])], data.u),
+    ]
+    header = ["trajectory", *(name for names, x in blocks if x is not None for name in names)]
+    parts = [x.detach().cpu().double().reshape(data.samples, -1) for _, x in blocks if x is not None]
+    return header, torch.cat(parts, 1).numpy()
 
 
 def _parse_rows(
@@ -189,10 +192,17 @@ def _parse_rows(
             cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
         values.append([parse[i](cells[i], f"{path}, row {at}, column '{columns.names[i]}'") for i in columns.numeric])
         labels.append("" if columns.trajectory is None else cells[columns.trajectory])
-    if any(labels) and not all(labels):
-        at = rows[labels.index("")][0]
-        raise InputError(f"{path}, row {at}, column 'trajectory': blank, but other rows name a trajectory; fill it in")
-    return [at for at, _ in rows], labels if any(labels) else None, values
+    return [at for at, _ in rows], _labels(path, rows, labels), values
+
+
+def _labels(path: Path, rows: Sequence[tuple[int, str]], labels: list[str]) -> list[str] | None:
+    """The trajectory of each row; None where no row names one."""
+    if not any(labels):
+        return None
+    if not all(labels):
+        where = f"{path}, row {rows[labels.index('')][0]}, column 'trajectory'"
+        raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
+    return labels
 
 
 def _check_kinds(path: Path, columns: Columns, rows: Sequence[tuple[int, str]]) -> None:

@@ -17,7 +17,7 @@ from herglotz.data.column_roles import kind_of
 from herglotz.data.csv_columns import is_number, name_and_unit
 from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
-from herglotz.errors import refuse
+from herglotz.errors import check_coordinates, refuse
 from herglotz.least_squares import least_squares
 
 POLAR = "polar"  # role of an angle that was made, in the table of columns
@@ -119,9 +119,7 @@ def _check(data: Trajectories, pairs: Sequence[Pair]) -> None:
     where = data.source or "data"
     named = [name for pair in pairs for name in (pair.x, pair.y)]
     for pair in pairs:
-        for name in pair.columns:
-            known = ", ".join(data.names)
-            refuse({f"{where}: polar names {name!r}, but the coordinates are {known}": name not in data.names})
+        check_coordinates(data.source, "polar", pair.columns, data.names)
         units = {data.units[data.names.index(name)] for name in pair.columns}
         refuse({f"{where}: polar: {', '.join(pair.columns)} are not in one unit, but in {', '.join(units)}":
                 len(units) > 1})  # fmt: skip
@@ -205,18 +203,13 @@ def _with_angles(
     kept = [k for k, name in enumerate(data.names) if name in made or name not in of]
     labels = [(made[data.names[k]][0], "rad", True) if data.names[k] in made
               else (data.names[k], data.units[k], data.angles[k]) for k in kept]  # fmt: skip
-    observed = data.observed
-    if observed is not None:  # an angle is where all positions that it is made of are
-        parts = {name: [data.names.index(x) for x in _pair(spec).columns] for name, _, spec in rows}
-        places = [parts.get(label[0], [k]) for k, label in zip(kept, labels, strict=True)]
-        observed = torch.stack([observed[:, own].prod(1) for own in places], 1)
+    names, units, turning = zip(*labels, strict=True)
     q = torch.stack([made[data.names[k]][1] if data.names[k] in made else data.q[:, k] for k in kept], 1)
     columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
-    names, units, turning = zip(*labels, strict=True)
     return replace(
         data,
         q=q,
-        observed=observed,
+        observed=_observed(data, kept, names, rows),
         v=None,
         names=names,
         units=units,
@@ -224,6 +217,17 @@ def _with_angles(
         columns=(*columns, *rows),
         notes=(*data.notes, *notes),
     )
+
+
+def _observed(
+    data: Trajectories, kept: Sequence[int], names: Sequence[str], rows: Sequence[tuple[str, str, str]]
+) -> Tensor | None:
+    """Where each coordinate was read, (N, n): an angle where all positions that make it were."""
+    if data.observed is None:
+        return None
+    parts = {name: [data.names.index(x) for x in _pair(spec).columns] for name, _, spec in rows}
+    places = [parts.get(name, [k]) for k, name in zip(kept, names, strict=True)]
+    return torch.stack([data.observed[:, own].prod(1) for own in places], 1)
 
 
 def circle(x: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.missing import interpolated, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
-from herglotz.errors import InputError, refuse
+from herglotz.errors import InputError, check_coordinates, refuse
 
 TAKEN_FOR_DEGREES = "taken for deg"  # in the place of a unit that the header had not, or had wrong
 DEGREES = ("deg", "°", "degree", "degrees", TAKEN_FOR_DEGREES)
@@ -316,9 +316,7 @@ class Trajectories:
     def with_angles(self, angles: str | Iterable[str]) -> Trajectories:
         """Return the set with exactly these coordinates marked as angles; a unit "1" among them becomes "rad"."""
         wanted = (angles,) if isinstance(angles, str) else tuple(angles)
-        where = self.source or "trajectories"
-        wrong = [name for name in wanted if name not in self.names]
-        refuse({f"{where}: angles names {name!r}, but the coordinates are {self.names}": name for name in wrong})
+        check_coordinates(self.source, "angles", wanted, self.names)
         flags = tuple(name in wanted for name in self.names)
         units = tuple("rad" if a and unit == "1" else unit for a, unit in zip(flags, self.units, strict=True))
         return replace(self, angles=flags, units=units)
