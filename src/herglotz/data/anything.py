@@ -28,6 +28,9 @@ from herglotz.telling import tell
 
 TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
 AS_THEY_ARE = Wanted(coordinates=())  # coordinates of arrays, which no header names
+OF_TRAJECTORIES = (
+    "trajectories have their columns already; angles, degrees, polar, input_terms and sensors alone change them"
+)
 OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "polar", "input_terms",
            "sensor_zeros", "sensor_scales")  # fmt: skip
 
@@ -92,35 +95,28 @@ def as_trajectories(
         If arrays come without times, or as `load` and `read_csv` do.
     """
     names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
-    coordinates, data = names["coordinates"], _by_field(data)
-    meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms}
+    meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms, "like": like}
+    sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
+    data = _by_field(data)
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
-    if isinstance(data, Trajectories):
-        wrong = (
-            "trajectories have their columns already; angles, degrees, polar, input_terms and sensors alone change them"
-        )
-        refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
-        found = data
-    elif isinstance(data, (str, Path)):
+    if isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
-        sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
-        return _shown(load(data, like=like, show=False, **meant, **sensors, **columns))
-    elif hasattr(data, "columns") and h is not None:
-        found = _array(np.asarray(data), h, time, {**names, "coordinates": coordinates or [*map(str, data.columns)]})
-    elif hasattr(data, "columns") or isinstance(data, Mapping):
+        return _shown(load(data, show=False, **meant, **sensors, **columns))
+    if isinstance(data, Trajectories):
+        refuse({OF_TRAJECTORIES: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
+        changed = any(x is not None for x in (degrees, polar, input_terms))
+        found = as_told(data, AS_THEY_ARE, **meant) if changed else data
+    elif _is_table(data, h):
         wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
-        found = as_told(_table(data, wanted), wanted, **meant, like=like)
+        found = as_told(_table(data, wanted), wanted, **meant)
         found = found if like is None else angles_like(found, like)
         return _shown(_marked(measured(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
-        options = {"h": h, "time": time, **names, **meant, "like": like}
-        return measured(_of_each(data, options), sensor_zeros)
+        return measured(_of_each(data, {"h": h, "time": time, **names, **meant}), sensor_zeros)
     else:
-        found = _array(data, h, time, names)
-    if not isinstance(data, Trajectories) or any(x is not None for x in (degrees, polar, input_terms)):
-        found = as_told(found, AS_THEY_ARE, **meant, like=like)
+        found = as_told(_array(data, h, time, names), AS_THEY_ARE, **meant)
     return _noted(_marked(measured(found, sensor_zeros, sensor_scales), angles), data)
 
 
@@ -141,16 +137,26 @@ def _by_field(data: Any) -> Any:
     return {name: data[name] for name in fields} if fields else data
 
 
+def _is_table(data: Any, h: float | None) -> bool:
+    """Whether data are named columns with their own time: a dict, or a DataFrame for which no step h is given."""
+    return h is None if hasattr(data, "columns") else isinstance(data, Mapping)
+
+
 def _is_list_of_recordings(data: Any) -> bool:
     if isinstance(data, (np.ndarray, Tensor)):
         return data.ndim == 3
-    if _is_series(data):
+    if _is_series(data) or hasattr(data, "columns"):
         return False
     return isinstance(data, Sequence) and len(data) > 0 and not isinstance(data[0], Number)
 
 
 def _is_series(data: Any) -> bool:
     return hasattr(data, "index") and not callable(data.index)
+
+
+def _name_of(series: Any) -> str | None:
+    name = getattr(series, "name", None)
+    return None if name is None else str(name)
 
 
 def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
@@ -172,10 +178,12 @@ def _table(data: Any, wanted: Wanted) -> Trajectories:
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:
     called = names["coordinates"]
-    if _is_series(data) and getattr(data, "name", None) is not None:
-        called = called or str(data.name)
-    if h is None and time is None and _is_series(data) and type(data.index).__name__ != "RangeIndex":
-        time = data.index
+    if hasattr(data, "columns"):
+        data, called = np.asarray(data), called or [*map(str, data.columns)]
+    elif _is_series(data):
+        called = called or _name_of(data)
+        if h is None and time is None and type(data.index).__name__ != "RangeIndex":
+            time = data.index
     q = torch.from_numpy(_floats("positions", data))
     _check_array(
         q, called, timeless=(h is None) == (time is None), of_tables=names["group"] is not None or names["drop"]

@@ -129,10 +129,7 @@ def assign(
     roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
     clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))
     u = wanted.in_order(roles["input"], names)
-    if wanted.coordinates is None:
-        q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
-    else:
-        q = tuple(place[x] for x in as_names(wanted.coordinates))
+    q = _coordinates(wanted, names, roles["q"]) or (() if wanted.motion else u[:1])
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
@@ -143,6 +140,13 @@ def assign(
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
     found = Columns(names, units, clock, q, trajectory, action, p, u, wanted.hold)
     return replace(found, notes=_warnings(found, guesses, wanted))
+
+
+def _coordinates(wanted: Wanted, names: Sequence[str], found: Sequence[int]) -> tuple[int, ...]:
+    """The columns of coordinates: those that the user names, in the user's order, or those that were found."""
+    if wanted.coordinates is None:
+        return wanted.in_order(found, names)
+    return tuple(names.index(x) for x in as_names(wanted.coordinates))
 
 
 def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:

@@ -196,19 +196,18 @@ def _with_angles(
     notes: Sequence[str],
 ) -> Trajectories:
     """The set with these angles in the place of the first column of each pair, without its other columns."""
-    made = {pair.x: (name, angle) for pair, (name, *_), angle in zip(pairs, rows, angles, strict=True)}
-    every = [(pair, name) for pair, (name, *_) in zip(pairs, rows, strict=True)]
-    of = {column: name for pair, name in every for column in pair.columns}
-    of |= {column: name for pair, name in every for column in (pair.x, pair.y)}
+    made = {pair.x: (row[0], angle) for pair, row, angle in zip(pairs, rows, angles, strict=True)}
+    # A column is of the pair that has the column as a position, rather than of one that has the column as its centre.
+    of = {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in pair.columns}
+    of |= {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in (pair.x, pair.y)}
     kept = [k for k, name in enumerate(data.names) if name in made or name not in of]
-    labels = [(made[data.names[k]][0], "rad", True) if data.names[k] in made
-              else (data.names[k], data.units[k], data.angles[k]) for k in kept]  # fmt: skip
-    names, units, turning = zip(*labels, strict=True)
-    q = torch.stack([made[data.names[k]][1] if data.names[k] in made else data.q[:, k] for k in kept], 1)
+    old = {name: (name, data.q[:, k], data.units[k], data.angles[k]) for k, name in enumerate(data.names)}
+    new = {x: (name, angle, "rad", True) for x, (name, angle) in made.items()}
+    names, q, units, turning = zip(*((old | new)[data.names[k]] for k in kept), strict=True)
     columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
     return replace(
         data,
-        q=q,
+        q=torch.stack(q, 1),
         observed=_observed(data, kept, names, rows),
         v=None,
         names=names,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.models.model import ContactLagrangian, numbers_of
 
 
@@ -53,17 +53,20 @@ def combined(model: ContactLagrangian, name: str, values: Mapping[str, float]) -
     """
     every = numbers_of(model)
     chosen(model, list(values))
-    if not re.fullmatch(r"[A-Za-z]\w*", name) or any(re.match(rf"{name}(\W|$)", x) for x in (*every, *lines(model))):
+    words = {re.split(r"\W", x)[0] for x in (*every, *lines(model))}
+    if not re.fullmatch(r"[A-Za-z]\w*", name) or name in words:
         raise InputError(f"'{name}' must be a word of letters, digits and _ that the model's numbers do not begin with")
     moved = {key: x for key, x in values.items() if values_of(model, [key]) != [x]}
-    parameters = {every[key][0] for key in moved}
-    taken = sorted(x for x in parameters if any(x in line.ends for line in lines(model).values()))
-    networks = [key for key in moved if ".network." in key]
-    if not moved or taken or networks:
-        why = f"nothing differs for {name}" if not moved else f"{(taken or networks)[0]} cannot be moved by {name}"
-        raise InputError(f"{why}; give other values of numbers that are no weights of a network, each by one name")
+    parameters = sorted({every[key][0] for key in moved})
+    moved_already = {parameter for line in lines(model).values() for parameter in line.ends}
+    fixed = [key for key in moved if every[key][0] in moved_already or ".network." in key]
+    remedy = "give other values of numbers that are no weights of a network, each by one name"
+    refuse({
+        f"nothing differs for {name}; {remedy}": not moved,
+        f"{fixed[0] if fixed else ''} cannot be moved by {name}; {remedy}": fixed,
+    })  # fmt: skip
     end = with_values(model, moved)
-    ends = {x: tuple(m.get_parameter(x).detach().clone() for m in (model, end)) for x in sorted(parameters)}
+    ends = {x: tuple(m.get_parameter(x).detach().clone() for m in (model, end)) for x in parameters}
     new: Any = copy.deepcopy(model)
     new.lines = {**lines(model), name: Line(0.0, ends)}  # pyright: ignore[reportArgumentType]
     return new
