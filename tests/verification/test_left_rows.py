@@ -29,9 +29,10 @@ def test_the_left_rows_pass(L_d, n):
 
 @pytest.mark.parametrize("wrong", ["scaled", "shifted", "slope"])
 @pytest.mark.parametrize("check", [hamilton_jacobi, left_hamilton_jacobi])
-def test_both_Hamilton_Jacobi_rows_reject_a_wrong_S(check, wrong):
+@pytest.mark.parametrize(("L_d", "n"), [(OSCILLATOR, 1), (nonlinear, 2)])
+def test_both_Hamilton_Jacobi_rows_reject_a_wrong_S(L_d, n, check, wrong):
     # fails if the residual is zero for any S, e.g. because H is built from the same S
-    known = subject((nonlinear, states(2)), H, 16, 0)
+    known = subject((L_d, states(n)), H, 16, 0)
     f = fan(known, 4, 0)
     assert check(known, f, 1e-10).passed
     change = {

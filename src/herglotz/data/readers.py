@@ -17,7 +17,6 @@ from herglotz.data.degrees import in_told_degrees
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
-from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
@@ -45,9 +44,6 @@ class Format:
 
 # The first format that fits reads the file: a special case of a suffix stands before the general one.
 FORMATS = (
-    Format(
-        "IBM double pendulum, six marker columns (.csv)", ".csv", read_ibm_double_pendulum, False, looks_like_markers,
-    ),
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
     Format(
         "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
