@@ -53,9 +53,9 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     other column is a coordinate. A warning names every role that is a guess. A column may be named with its unit. Times
     may be dates in ISO 8601, which become seconds since the first row. Lines that start with # and blank lines are
     skipped, but for `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which give the hold of
-    the inputs between samples, and their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `#
-    scale: 1 0.5`, which make q = scale · (reading − zero) of the coordinates, in their order (`herglotz.data.sensors`).
-    A coordinate in rad is taken for an angle.
+    the inputs between samples, and their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and
+    `# scale: 1 0.5`, which make q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`). A
+    coordinate in rad is taken for an angle.
 
     Returns
     -------
