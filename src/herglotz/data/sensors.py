@@ -1,4 +1,4 @@
-"""What sensors read: of each coordinate y = zero + q / scale, so that q = scale · (y − zero)."""
+"""Readings of sensors: y = zero + q / scale of each coordinate, so that q = scale · (y − zero)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from herglotz.errors import InputError, refuse
 def measured(
     data: Trajectories,  # readings, in the units of their columns
     zeros: Sequence[float] | None = (),  # n numbers, in degrees where the table has degrees; empty or None: 0
-    scales: Sequence[float] | None = (),  # what one unit of each reading is worth, n numbers; empty or None: 1
+    scales: Sequence[float] | None = (),  # position for a unit of each reading, n numbers; empty or None: 1
 ) -> Trajectories:
     """The positions q = scale · (y − zero) of readings y, and v = scale · ẏ; p and s stay as they are recorded.
 
-    B recordings that differ have B · n numbers, recording after recording. Raise InputError if there is another number
-    of them, one is not finite, or a scale is 0.
+    B recordings may have B · n numbers, recording after recording. Raise InputError for another count of numbers, for a
+    number that is not finite, or for a scale of 0.
     """
     read, worth = ([] if x is None else np.atleast_1d(x).tolist() for x in (zeros, scales))
     if not read and not worth:
