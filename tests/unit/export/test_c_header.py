@@ -361,21 +361,13 @@ def test_a_file_that_is_not_ours(tmp_path):
 
 
 @needs_compiler
-def test_wrong_states_are_refused(tmp_path):
-    # fails if a wrong dtype or shape reaches C, where it would read other memory
-    path = export_c(damped(2, "linear"), tmp_path / "stepper.h", h=0.1)
-    compiled = load_c(path)
+def test_gradients_and_a_box_that_is_not_there_are_refused(tmp_path):
+    # fails if a gradient ends in C without a word, or "no box" reads as "never outside"
+    compiled = load_c(export_c(damped(2, "linear"), tmp_path / "stepper.h", h=0.1))
     assert isinstance(compiled, ExportedStepper)
     q, p, s = states_of(2, 3)
-    for state, h, message in (
-        (State(q.float(), p.float(), s.float()), 0.1, "must be torch.float64"),
-        (State(q[:, :1], p, s), 0.1, "need shapes"),
-        (State(q.clone().requires_grad_(), p, s), 0.1, "without gradient"),
-        (State(q, p, s), 0.0, "h must be"),
-        (State(q, p, s), torch.full((2,), 0.1), "match the batch"),
-    ):
-        with pytest.raises(InputError, match=message):
-            compiled.step(state, h)
+    with pytest.raises(InputError, match="without gradient"):
+        compiled.step(State(q.clone().requires_grad_(), p, s), 0.1)
     with pytest.raises(InputError, match="records no box"):
         compiled.outside_box(State(q, p, s))
 
