@@ -1,4 +1,4 @@
-"""Recordings in the form in which the user has them: files, DataFrames, dicts, Series, arrays, lists of these."""
+"""Recordings in the form that the user has: files, DataFrames, dicts, Series, arrays, lists of these."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse
 from herglotz.telling import tell
 
-TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
+TRANSPOSED = 4  # times as many coordinates as samples: so short a recording of a chain determines no model
 AS_THEY_ARE = Wanted(coordinates=())  # coordinates of arrays, which no header names
 OF_TRAJECTORIES = (
     "trajectories have their columns already; angles, degrees, polar, input_terms and sensors alone change them"
@@ -52,37 +52,37 @@ def as_trajectories(
     sensor_scales: Sequence[float] | None = (),
     like: Trajectories | None = None,
 ) -> Trajectories:
-    """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
+    """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of these.
 
-    A dict of columns or a structured array is read like a DataFrame, and what each column was taken for is printed on
-    stderr, as by `load`. A list holds one recording an entry, unless its entries are numbers: that is one recording of
-    one coordinate. Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time`
-    gives them; the index of a DataFrame is a column, unless it merely counts the rows.
+    A dict of columns or a structured array is read like a DataFrame, and the role of each column is printed on stderr,
+    as by `load`. Every entry of a list is a recording; a list of numbers is a single recording of a single coordinate.
+    Angles come unwrapped, as from `load`. The index of a Series is the time, unless `h` or `time` is given; the index
+    of a DataFrame is a column, unless the index merely counts the rows.
 
     Parameters
     ----------
     data
-        One of these, or `Trajectories`.
+        Any of the forms above, or `Trajectories`.
     h
         Time between the samples of arrays, in s or the unit of your choice: the model has the same.
     time
-        Of a table the name of its column; of an array the times (N,): numbers, dates or durations.
+        Of a table the name of the column; of an array the times (N,): numbers, dates or durations.
     coordinates
-        Of a table the columns; of an array what to call its columns, `name` or `name[unit]`.
+        Of a table the columns; of an array the names of the columns, `name` or `name[unit]`.
     inputs
         Of a table the columns, () for none; of an array the inputs (N,) or (N, m).
     drop, group
-        Columns of a table that are left aside; the column that numbers its trajectories.
+        Columns of a table that are left aside; the column that numbers the trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
     degrees, polar, input_terms
-        Coordinates in degrees whose header does not say so; pairs of positions that become one angle each; terms of
-        inputs that act beside them: as in `load`.
+        Coordinates in degrees whose header does not say so; pairs of positions that become an angle each; terms of
+        inputs that act beside the inputs: as in `load`.
     sensor_zeros, sensor_scales
         q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
         for none.
     like
-        Another recording: columns of a table that have its names mean the same.
+        Another recording: columns with the same names have the same roles.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 
 
 def _lists(told: dict[str, Any]) -> dict[str, Any]:
-    """What is said of columns, with a list for each array or index of names, as a DataFrame's columns are."""
+    """The settings of the columns, with a list for each array or index of names, as a DataFrame's columns are."""
     hold = {role: hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU" for role, x in told.items()}
     return {role: x.tolist() if hold[role] else x for role, x in told.items()}
 
@@ -212,7 +212,7 @@ def _check_array(q: Tensor, called: Names | None, *, timeless: bool, of_tables: 
 
 
 def _labels(called: Names | None) -> dict[str, Any]:
-    """What names of coordinates say, as cells of a header do: `x[m]` is x, in m. Nothing where there are none."""
+    """Names and units from names of coordinates, as from cells of a header: `x[m]` is x, in m. Empty without names."""
     if called is None:
         return {}
     heads = [name_and_unit(name) for name in as_names(called)]
@@ -235,14 +235,14 @@ def _marked(data: Trajectories, angles: Any) -> Trajectories:
 
 
 def _noted(found: Trajectories, data: Any) -> Trajectories:
-    """The same; notes that were not of the data already are printed."""
+    """Print the notes that the data did not have; return `found`."""
     for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
         tell(f"{found.source or 'trajectories'}: {note}")
     return found
 
 
 def _shown(data: Trajectories) -> Trajectories:
-    """The same; what each column of its table was taken for is printed, after all that was said of the columns."""
+    """Print the role of each column of the table, after all notes on the columns; return `data`."""
     if data.columns:
         tell(data.table())
     return data
