@@ -40,7 +40,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def no_such_file(path: Path) -> str:
-    """What to say of a file that is not there, and which file beside it was meant."""
+    """The message on a missing file, with the file of a similar name in the same folder."""
     try:
         beside = [file.name for file in path.parent.iterdir()]
     except OSError:

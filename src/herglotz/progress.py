@@ -34,7 +34,7 @@ class FitBar(ProgressBar):
     iterations: as many again as were done, or the rest of the bound.
     """
 
-    under_way: FitBar | None = None  # which `beat` draws
+    under_way: FitBar | None = None  # the bar that `beat` draws
 
     def __init__(self, **options: Any):
         self.enclosing = self.span = (0.0, 1.0)

@@ -106,7 +106,7 @@ def _compile(words: list[str], sources: Mapping[str, str], flags: Sequence[str])
 
 
 def _processor() -> str:
-    """What -march=native depends on: a home folder may be shared by machines."""
+    """The processor, on which -march=native depends: machines may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -48,7 +48,7 @@ class Graph(nn.Module):
         super().__init__()
         self.code = code
         self.batch = batch
-        self.operator: Callable[..., Any] | None = None  # what `herglotz.export.inline` puts in its place
+        self.operator: Callable[..., Any] | None = None  # the replacement by `herglotz.export.inline`
         for i, value in enumerate(constants):
             self.register_buffer(f"constant_{i}", value)
 

@@ -116,7 +116,7 @@ def _check_labels(where: str, labels: Any, n: int) -> None:
     if not all(labels.units) or not labels.time_unit:
         raise InputError(f"{where}: a unit is empty ({labels.units}, {labels.time_unit!r}); write '1' for none")
     for text in (*labels.names, *labels.units, labels.time_unit):
-        if any(unicodedata.category(x) in ("Cc", "Cs") for x in text):  # they can be neither drawn nor written
+        if any(unicodedata.category(x) in ("Cc", "Cs") for x in text):  # can be neither drawn nor written
             raise InputError(f"{where}: {text!r} has control characters or half a character; rename it")
     for name, unit, angle in zip(labels.names, labels.units, labels.angles, strict=True):
         if angle and unit != "rad":
