@@ -16,7 +16,7 @@ H = 0.00625  # s: the model's own step
 FACTOR = ((1.0, 0.0), (0.00031584926745, 0.23984877))  # C of the mass m = C Cᵀ
 COUPLING, STIFFNESS, RATE = 0.11501273180, 1.12807918135, 0.00105678298
 VISCOUS, DRAG = (0.30569501943, 0.00761698943), -0.00528029567
-INPUTS = (0.76955898360, 0.00029280290)
+INPUTS = (0.76955898360, 0.00029280290)  # input map of the friction term
 ITERATIONS = 3  # of Newton from q1 = q0: a fourth changes a step by rounding alone
 
 

@@ -44,7 +44,7 @@ SYSTEMS = {
       <actuator><motor joint="x"/></actuator></mujoco>""",
 }
 COORDINATES = {"pendulum": ("theta[rad]",), "cart-pole": ("x[m]", "theta[rad]")}
-FORCE = {"pendulum": 3.0, "cart-pole": 6.0}
+FORCE = {"pendulum": 3.0, "cart-pole": 6.0}  # largest input of the motor
 Row = dict[str, Any]
 
 

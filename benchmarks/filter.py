@@ -214,13 +214,17 @@ def constant_acceleration(y: Array, h: float, sigma: float, jerk: float) -> Arra
     return np.array(found)
 
 
+def accelerated(y: Array, h: float, sensor: Array, jerk: float) -> Array:
+    """Velocities (N, n) of the same filter for each coordinate, with the standard deviations of its sensor, (n,)."""
+    columns = zip(y.T, sensor, strict=True)
+    return np.stack([constant_acceleration(x, h, sigma, jerk) for x, sigma in columns], -1)
+
+
 def measured(folder: Path) -> dict[str, Any]:
     """NIS and errors of velocities over the windows that did not train."""
     data = load(folder / "uw_double_pendulum" / "uw_double_pendulum_estimation.csv", show=False)
     run = fit(data.select(TRAIN), train_fraction=1.0, progress=False)
-    parts = [data.select([b]) for b in range(len(data))]
-    fine = [x.q.double().numpy() for x in parts]
-    test = [q for b, q in enumerate(fine) if b not in TRAIN]
+    test = [data.select([b]).q.double().numpy() for b in range(len(data)) if b not in TRAIN]
     h = data.typical_step
     model, steps, noise = run.model.double(), round(STRIDE * h / run.h), noise_of(run)
     sensor = np.array(noise.position)
@@ -238,15 +242,11 @@ def measured(folder: Path) -> dict[str, Any]:
     truth = [reference(q, h)[::STRIDE] for q in test]
     late = slice(10, -2)
     ours = np.concatenate([(followed(q, noise.adaptation).v - v)[late] for q, v in zip(test, truth, strict=True)])
-    rivals: dict[float, Array] = {}
+    rms: dict[float, float] = {}
     for jerk in 10.0 ** np.arange(1.0, 6.01, 0.25):
-        misses = []
-        for q, v in zip(test, truth, strict=True):
-            columns = zip(q[::STRIDE].T, sensor, strict=True)
-            own = [constant_acceleration(x, STRIDE * h, sigma, jerk) for x, sigma in columns]
-            misses.append((np.stack(own, -1) - v)[late])
-        rivals[jerk] = np.concatenate(misses)
-    rms = {jerk: float(np.sqrt(np.mean(x**2))) for jerk, x in rivals.items()}
+        rivals = [accelerated(q[::STRIDE], STRIDE * h, sensor, jerk) for q in test]
+        misses = [(rival - v)[late] for rival, v in zip(rivals, truth, strict=True)]
+        rms[jerk] = float(np.sqrt(np.mean(np.concatenate(misses) ** 2)))
     best = min(rms, key=lambda jerk: rms[jerk])
     width = 1.96 * 2 / math.sqrt(len(found))
     return {

@@ -82,6 +82,23 @@ def _compiled_once():
         yield
 
 
+@pytest.fixture(scope="session")
+def registered_once():
+    """torch.onnx collects its operations once for all graphs: that took 0.3 s of each graph, and a file has four."""
+    registry = pytest.importorskip("torch.onnx._internal.exporter._registration").ONNXRegistry
+    made = functools.cache(registry.from_torchlib)
+
+    def copied(**options):
+        found, known = registry(), made(**options)
+        found._opset_version = known.opset_version
+        found.functions = {target: list(functions) for target, functions in known.functions.items()}
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "from_torchlib", staticmethod(copied))
+        yield
+
+
 @pytest.fixture
 def optimised_c(monkeypatch):
     """C as the package compiles it."""

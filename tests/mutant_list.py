@@ -80,7 +80,8 @@ MUTANTS = [
     ("scenes/motion.py", "L.D1 + L.D3[..., None] * L.D2, L.L", "L.D1, L.L"),
     ("scenes/rules.py", "h * L(q1, v, s0 + x)", "h * L(q1, v, s0)"),
     ("scenes/parachute.py", "B**2 - 4 * (B - a) * p", "B**2 - 4 * (B + a) * p"),
-    ("scenes/linear_drag.py", "h * expm1w(-gamma * h) / (2 * m)", "h * expm1w(gamma * h) / (2 * m)"),
+    ("scenes/linear_drag.py", "h * expm1w(gamma * h) / (2 * m)", "h * expm1w(-gamma * h) / (2 * m)"),
+    ("scenes/scene.py", "-H_plus(q1, p0, s1, -h)", "-H_plus(q1, p0, s1, h)"),
     ("scenes/reference.py", "lagrangian(*path(t[..., 0]), s)", "lagrangian(*path(t[..., 0]), 0 * s)"),
     # models
     ("models/model.py", "(c - 1.0) * (s0 - h / 2 * t.V0)", "(c - 1.0) * s0"),

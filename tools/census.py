@@ -15,6 +15,9 @@ counts another revision as well and prints before → after; `--list` names ever
   a package counts as from the file that defines it.
 * Uncalled names: public functions and classes of a module that nothing names but their own file, re-exports and tests.
 * Bare constants: names in capitals with a number in their value and no comment beside or above.
+* Hanging comments: comments of src behind code, without shapes, which begin with a bracket, and words for tools.
+* Words and lines of src: pronouns in the heads of files, of 100 words; letters of a line that is not blank; decisions,
+  which are complexity without the 1 of each function, of 100 lines.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ import json
 import re
 import subprocess
 import tarfile
+import tokenize
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,20 +46,24 @@ BUDGETS = {
     "mechanics, theory, stepping": (("mechanics", "theory", "stepping"), 5400),
     "scenes": (("scenes", "systems"), 2000),
     "models": (("models",), 1900),
-    "data": (("data",), 1500),
+    "data": (("data",), 3300),
     "training": (("training",), 3800),
-    "export": (("export",), 4000),
+    "export": (("export",), 5000),
     "tune, verify, plots, cli": (("tune", "verify", "plots", "cli"), 3700),
     "train/": (("train/",), 650),
-    "benchmarks/": (("benchmarks/",), 4000),
+    "benchmarks/": (("benchmarks/",), 4500),
     "tools/, data/, examples/": (("tools/", "data/", "examples/"), 350),
 }
-# Of issue 14, with the budgets above.
-GOALS = {"src": 21_000, "outside tests": 26_000, "complexity": 15, "Newton loops": 3, "rollout drivers": 2}
-GOALS["circles"] = 0
+# Of issues 14 and 43, with the budgets above.
+GOALS = {
+    "src": 30_000, "outside tests": 36_500, "tests": 29_000, "complexity": 15, "Newton loops": 3, "rollout drivers": 2,
+    "circles": 0, "hanging comments": 150, "pronouns": 3.0, "letters a line": 46, "decisions": 9.0,
+}  # fmt: skip
 BRANCHES = (ast.If, ast.IfExp, ast.For, ast.AsyncFor, ast.While, ast.ExceptHandler, ast.comprehension, ast.match_case)
 SOLVE = re.compile(r"(^|_)(solve|solver|solve_ex|inv_ex|pseudo_inverse)$")  # names that solve a linear problem
 STEP = re.compile(r"^(?!.*(optim|schedule)).*\.(step|take|advance)$")
+NO_PROSE = re.compile(r"#\s*(\(|noqa|type:|pyright:|fmt:)")  # comments for shapes and for tools
+PRONOUNS = re.compile(r"\b(it|they|them|one|ones|such|what|whose|those)\b", re.I)
 C_NEWTON = re.compile(r"^\s*(?:static |inline |int |void )+\w*_solve\((?!real)", re.M)
 C_ROLLOUT = re.compile(r"^\s*(?:static |inline |int |long |void )+\w*_rollout\(", re.M)
 
@@ -220,6 +228,27 @@ def bare_constants(tree: ast.Module, text: str) -> Iterator[str]:
             yield target.id
 
 
+def hanging(text: str) -> list[int]:
+    """Lines of a Python file with prose behind code."""
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    comments = (t for t in tokens if t.type == tokenize.COMMENT and t.line[: t.start[1]].strip())
+    return [t.start[0] for t in comments if not NO_PROSE.match(t.string)]
+
+
+def words(code: Files, trees: dict[str, ast.Module]) -> dict[str, float]:
+    """Pronouns of 100 words in the heads of src's files, mean letters of a line, and decisions of 100 lines."""
+    ours = {path: tree for path, tree in trees.items() if path.startswith("src/")}
+    heads = " ".join(ast.get_docstring(tree) or "" for tree in ours.values())
+    lines = [line for path in ours for line in code[path].splitlines()]
+    full = [len(line) for line in lines if line.strip()]
+    decisions = sum(complexity(tree) - 1 for tree in ours.values())
+    return {
+        "pronouns": round(100 * len(PRONOUNS.findall(heads)) / max(1, len(re.findall(r"\w+", heads))), 1),
+        "letters a line": round(sum(full) / max(1, len(full)), 1),
+        "decisions": round(100 * decisions / max(1, len(lines)), 1),
+    }
+
+
 def in_text(path: str, text: str) -> Iterator[tuple[str, str]]:
     """Kind and place of what is found in the text of a file of src, C or C in Python."""
     for kind, pattern in (("Newton loops", C_NEWTON), ("rollout drivers", C_ROLLOUT)):
@@ -236,6 +265,7 @@ def in_tree(path: str, text: str, tree: ast.Module) -> Iterator[tuple[str, str]]
         if ours and drives(f):
             yield "rollout drivers", place
     yield from (("bare constants", f"{path} {name}") for name in bare_constants(tree, text))
+    yield from (("hanging comments", f"{path}:{line}") for line in (hanging(text) if ours else ()))
     if ours and room(path) != "training":
         yield from (("Newton loops", f"{path}:{loop}") for loop in newton_loops(tree, text))
 
@@ -249,12 +279,21 @@ def census(files: Files) -> dict[str, Any]:
     functions = ((p, f) for p, tree in trees.items() for f in ast.walk(tree) if isinstance(f, FUNCTIONS))
     most = max(((complexity(f), f"{p}:{f.lineno} {f.name}") for p, f in functions), default=(0, ""))
     counts = {"complexity": most[0], **{kind: len(x) for kind, x in found.items()}}
-    return {"lines": lines_of(code), "counts": counts, "most complex": most[1], "found": found}
+    lines = lines_of(code)
+    lines["tests"] = sum(text.count("\n") for p, text in files.items() if p.startswith("tests/") and p.endswith(".py"))
+    return {"lines": lines, "counts": counts | words(code, trees), "most complex": most[1], "found": found}
 
 
 def findings(code: Files, trees: dict[str, ast.Module]) -> dict[str, list[str]]:
     """Places by kind, of all that is found file by file."""
-    kinds = ("long functions", "wide functions", "Newton loops", "rollout drivers", "bare constants")
+    kinds = (
+        "long functions",
+        "wide functions",
+        "Newton loops",
+        "rollout drivers",
+        "bare constants",
+        "hanging comments",
+    )
     found: dict[str, list[str]] = {kind: [] for kind in kinds}
     for path, text in code.items():
         pairs = list(in_text(path, text)) if path.startswith("src/") else []

@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.judging import job
 from benchmarks.judging.catalogue import named
 
-ABSENT = 4
+ABSENT = 4  # exit code: the input data are not on this machine
 
 
 def main(name: str, folder: str) -> int:

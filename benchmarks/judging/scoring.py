@@ -70,18 +70,7 @@ def scored(of: Job, folder: Path) -> dict[str, Any]:
     n = run.data.dof
     size = _each(of.size, n) if of.size else run.data.q.double().numpy().reshape(-1, n).std(0)
     degrees = math.pi / 180 if of.in_degrees and run.data.units[0] == "rad" else 1.0
-    groups: dict[str, tuple[Pairs, Array]] = {}
-    if of.later:
-        data = run.data
-        groups["later"] = pairs_of(run.prediction, data.q, data.lengths, run.train_lengths), _scale(of, None, n)
-    for trial in of.trials:
-        name = Path(trial.data).stem + (f" {trial.horizon:g}" if trial.horizon else "")
-        try:
-            found = run.predict(trial.data, **trial.settings)
-            parts = pairs_of(found.prediction, found.data.q, found.data.lengths, found.train_lengths)
-        except Exception as error:  # what a version says of a recording is a result
-            row["trouble"], parts = f"predict {name}: {error}", [(np.full((1, n), np.nan), np.zeros((1, n)))]
-        groups[name] = parts, _scale(of, trial, n)
+    groups, row["trouble"] = _predicted(of, run)
     groups = {name: pair for name, pair in groups.items() if pair[0]}
     row["groups"] = {name: errors(parts, unit * degrees) for name, (parts, unit) in groups.items()}
     relative = [rms(errors(parts, size)) for parts, _ in groups.values()]
@@ -89,6 +78,23 @@ def scored(of: Job, folder: Path) -> dict[str, Any]:
     spread = [float(np.sqrt(np.mean(np.square(size / (unit * degrees))))) for _, unit in groups.values()]
     row["spread"] = min(spread, default=None)
     return row | {"error": max(worst, default=None), "relative": max(relative, default=None)}
+
+
+def _predicted(of: Job, run: Any) -> tuple[dict[str, tuple[Pairs, Array]], str]:
+    """Predictions of each group with the unit of their errors, and what the last prediction failed by."""
+    groups: dict[str, tuple[Pairs, Array]] = {}
+    data, n, trouble = run.data, run.data.dof, ""
+    if of.later:
+        groups["later"] = pairs_of(run.prediction, data.q, data.lengths, run.train_lengths), _scale(of, None, n)
+    for trial in of.trials:
+        name = Path(trial.data).stem + (f" {trial.horizon:g}" if trial.horizon else "")
+        try:
+            found = run.predict(trial.data, **trial.settings)
+            parts = pairs_of(found.prediction, found.data.q, found.data.lengths, found.train_lengths)
+        except Exception as error:  # what a version says of a recording is a result
+            trouble, parts = f"predict {name}: {error}", [(np.full((1, n), np.nan), np.zeros((1, n)))]
+        groups[name] = parts, _scale(of, trial, n)
+    return groups, trouble
 
 
 def _scale(of: Job, trial: Trial | None, n: int) -> Array:

@@ -147,10 +147,11 @@ def double_pendulum(folder: Path, seed: int) -> Job:
 
 def ibm(folder: Path) -> Job:
     """The measured chaotic double pendulum at 100 Hz: runs 2 and 3 train, windows of run 4 are predicted for 0.5 s."""
+    from benchmarks.ibm_double_pendulum import read_ibm_double_pendulum
     from benchmarks.judging.recorded import DATA, _here
-    from herglotz.data import load
 
-    runs = [load(_here(DATA / "ibm_double_pendulum" / f"{k}.csv"), show=False).thinned(4) for k in (2, 3, 4)]
+    files = (_here(DATA / "ibm_double_pendulum" / f"{k}.csv") for k in (2, 3, 4))
+    runs = [read_ibm_double_pendulum(file).thinned(4) for file in files]
     save(folder / "train.csv", Trajectories.cat(runs[:2]))
     save(folder / "test.csv", runs[2])
     trials = [Trial("test.csv", windows=60, horizon=0.5)]

@@ -58,16 +58,18 @@ def report(result: dict[str, Any]) -> str:
     ]  # fmt: skip
     lines += [*table(("group", "rows", "at the noise", "false", "CPU, s"), _groups(rows)), ""]
     head = ("row", "error", "unit", "of the spread", "verdict", "false", "exit", "CPU, s", "MB")
-    cells = [
-        (row["name"], shown(row["error"]) if row["asks"] else "", row["unit"],
-         shown(row["relative"], 2) if row["asks"] else "", row["verdict"], row["false"],
-         "" if row["exit"] is None else row["exit"], f"{row['cpu_s']:.1f}", row["peak_mb"])
-        for row in rows
-    ]  # fmt: skip
-    lines += table(head, cells)
+    lines += table(head, [_row(row) for row in rows])
     left = [row for row in result["rows"] if "cpu_s" not in row]
     lines += ["", *(f"* {row['name']}: {row.get('skipped') or row.get('trouble')}" for row in left)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _row(row: Row) -> tuple[Any, ...]:
+    """A line of the table of one run."""
+    error, relative = (shown(row["error"]), shown(row["relative"], 2)) if row["asks"] else ("", "")
+    code = "" if row["exit"] is None else row["exit"]
+    return (row["name"], error, row["unit"], relative, row["verdict"], row["false"], code,
+            f"{row['cpu_s']:.1f}", row["peak_mb"])  # fmt: skip
 
 
 def _group(name: str) -> str:
@@ -156,25 +158,31 @@ def compared(old: dict[str, Any], new: dict[str, Any], floor: float = FLOOR) -> 
     names = [*before, *(name for name in after if name not in before)]
     said = {name: complaints(before.get(name), after.get(name), floor) for name in names}
     worse = {name: words for name, words in said.items() if words}
-    measured = [name for name in names if all("cpu_s" in rows.get(name, {}) for rows in (before, after))]
-    times = [after[name]["cpu_s"] / before[name]["cpu_s"] for name in measured]
-    ratios = [_error_ratio(before[name], after[name], floor) for name in measured]
-    errors = [by for by in ratios if 0 < by < math.inf]
     cells = [_cells(name, before.get(name), after.get(name), said[name], floor) for name in names]
-    total = [sum(rows[name]["cpu_s"] for name in measured) / 60 for rows in (before, after)]
     lines = [
         f"# The judge: {old['commit']} → {new['commit']}",
         "",
         f"{len(worse)} of {len(names)} rows are worse: an error above {WORSE:g} times the old one and outside",
         f"{CLEARLY:g} standard errors over recordings, a verdict that got false, {SLOWER:g} times and {LONGER:g} s",
         f"slower, or missing. Errors below {floor:g} of the spread count as that. Medians of the ratios:",
-        f"{shown(_median(errors))} of error, {shown(_median(times))} of time; {total[0]:.1f} → {total[1]:.1f} min.",
+        _medians(
+            [(before[row["name"]], row) for row in measured(list(after.values())) if row["name"] in before], floor
+        ),
         "",
         *(f"* worse: {name}: {'; '.join(words)}" for name, words in worse.items()),
         "",
     ]
     head = ("row", "error", "ratio", "verdict", "CPU, s", "ratio", "worse")
     return "\n".join([*lines, *table(head, cells)]) + "\n", len(worse)
+
+
+def _medians(pairs: Sequence[tuple[Row, Row]], floor: float) -> str:
+    """Median ratios of errors and of times over rows of both runs that were measured, and the total times."""
+    pairs = [pair for pair in pairs if len(measured(pair)) == 2]
+    times = _median([b["cpu_s"] / a["cpu_s"] for a, b in pairs])
+    errors = _median([by for by in (_error_ratio(a, b, floor) for a, b in pairs) if 0 < by < math.inf])
+    old, new = (sum(pair[k]["cpu_s"] for pair in pairs) / 60 for k in range(2))
+    return f"{shown(errors)} of error, {shown(times)} of time; {old:.1f} → {new:.1f} min."
 
 
 def _median(values: Sequence[float]) -> float | None:

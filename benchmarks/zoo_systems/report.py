@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import table
+from benchmarks.judging.tables import number, shown, table
 from benchmarks.zoo_systems.mechanisms import Array
 from benchmarks.zoo_systems.systems import ZooSystem
 
@@ -49,16 +49,6 @@ def _worst(found: Predictions, unit: Array) -> float:
 
 Row = dict[str, Any]
 METHODS = {"ours": "ours", "sindy": "SINDy", "neural_ode": "neural ODE", "known": "known"}
-
-
-def shown(score: float | None) -> str:
-    """An error for people."""
-    return "not reached" if score is None else f"{score:.3g}"
-
-
-def number(score: float | None) -> float:
-    """An error for comparisons."""
-    return float("inf") if score is None else score
 
 
 def shares(rows: Sequence[Row]) -> dict[str, float]:
@@ -101,17 +91,19 @@ def report(rows: Sequence[Row], zoo: str, flags: str) -> str:
         "Medians: " + ", ".join(f"{name} {value:.3g}" for name, value in medians.items()) + f"; {cpu:.0f} s.",
         "",
     ]
-    cells = []
-    for row in rows:
-        ours = row["ours"]
-        how = "/".join(str(ours[name]) for name in ("level", "objective") if name in ours)
-        cells.append([
-            row["index"], row["name"], f"{row['trajectories']} × {row['samples'] // row['trajectories']}",
-            f"**{row['outcome']}**" if row["outcome"] == SILENT else row["outcome"],
-            *(f"{shown(row[name]['score'])} ({shown(row[name]['relative'])})" for name in methods),
-            *([f"{row['attainable']:.3g}"] if attained else []),
-            f"{ours['cpu_s']:.0f}", f"{how} {ours['said'] or ours.get('verdict') or ''}".strip().replace("|", "/"),
-        ])  # fmt: skip
     columns = [METHODS[name] for name in methods] + ["attainable"] * attained
     head = ("", "system", "samples", "outcome", *columns, "time, s", "what the fit said")
-    return "\n".join([*lines, *table(head, cells), ""])
+    return "\n".join([*lines, *table(head, [_cells(row, methods, attained) for row in rows]), ""])
+
+
+def _cells(row: Row, methods: Sequence[str], attained: bool) -> list[Any]:
+    """A line of the table."""
+    ours = row["ours"]
+    how = "/".join(str(ours[name]) for name in ("level", "objective") if name in ours)
+    return [
+        row["index"], row["name"], f"{row['trajectories']} × {row['samples'] // row['trajectories']}",
+        f"**{row['outcome']}**" if row["outcome"] == SILENT else row["outcome"],
+        *(f"{shown(row[name]['score'])} ({shown(row[name]['relative'])})" for name in methods),
+        *([f"{row['attainable']:.3g}"] if attained else []),
+        f"{ours['cpu_s']:.0f}", f"{how} {ours['said'] or ours.get('verdict') or ''}".strip(),
+    ]  # fmt: skip

@@ -35,43 +35,43 @@ except ImportError:
 
 Array = np.ndarray
 Mode = gymnasium.vector.AutoresetMode
-FAILED = 15  # bits of a status in C (docs/c.md); one more says that a state is outside the box
+FAILED = 15  # bits of a status in C (docs/c.md); the next bit marks a state outside the box
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
     """B copies of a learned system, (q, p, s) ↦ (q, p, s)′ under an input u that is held, stepped at once in C.
 
-    An observation is (q, v), 2n numbers in the units of the data and these over its unit of time; an angle lies within
+    An observation is (q, v), 2n numbers in the units of the data, per unit of time for v; an angle lies within
     half a turn of the middle of its recorded range. An action is u, m numbers in the units of the data; beyond the
-    bounds it saturates, as an actuator does. p = ∂L/∂v is made of v at a reset, and v of p after each step
+    bounds it saturates, as an actuator does. A reset computes p = ∂L/∂v from v, and each step v from p
     (`docs/c.md`).
 
     An environment ends (`terminated`) where a step fails and where a state leaves the box of the data that the model
-    was fitted to: beyond it the model extrapolates. `infos["status"]`, (B,), then has the `Status` of the step, plus 16
-    for the box, and `infos["_status"]` says of which environments. No observation is NaN: after a failed step it is
-    that of the last good state, and a position outside the box is put on its end.
+    was fitted to: beyond the box the model extrapolates. `infos["status"]`, (B,), then has the `Status` of the step,
+    plus 16 for the box, and `infos["_status"]` says of which environments. No observation is NaN: a failed step returns
+    that of the last good state, and a position outside the box is put on the boundary.
 
     Parameters
     ----------
     source
-        A run with inputs, the path of a C header that `run.export` or `export_c` wrote, or what `load_c` made of one.
+        A run with inputs, the path of a C header that `run.export` or `export_c` wrote, or the result of `load_c`.
     num_envs
         B.
     reward
-        (q, v, u) ↦ (B,) rewards, of arrays (B, n), (B, n) and (B, m): what is observed after the step, and the input
-        that acted during it, after saturation.
+        (q, v, u) ↦ (B,) rewards, of arrays (B, n), (B, n) and (B, m): the observation after the step, and the input
+        during the step, after saturation.
     reset
         (generator, count) ↦ (q, v), each (count, n), or (q, v, s) with s (count,): starts of new episodes, inside the
         box, drawn from the numpy generator that `env.reset(seed=…)` seeds. s is 0 by default.
     terminated
         (q, v, u) ↦ (B,) bool: where the task ends an episode; None: nowhere.
     exit_reward
-        Added to the reward, in its unit, where a failed step or the box ends an episode. Where rewards are costs, an
-        episode that ends early is a cheap one unless this is negative.
+        Added to the reward, in the same unit, if a failed step or the box ends an episode. If rewards are costs, an
+        early end is cheap unless `exit_reward` is negative.
     input_low, input_high
         (m,) bounds of u, in the units of the data; None: the range that was recorded.
     h
-        Step of the model, in the data's unit of time; None: its own.
+        Step of the model, in the data's unit of time; None: that of the model.
     steps_per_action
         Steps of h under one action.
     max_episode_steps
@@ -81,7 +81,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         by the next `step`, which ignores its action and gives the reward 0; by the same, with the last observation in
         `infos["final_obs"]`; or by `env.reset(options={"reset_mask": mask})`.
     dtype
-        "float32" or "float64", of observations and of the spaces; the model steps in its own.
+        "float32" or "float64", of observations and of the spaces; the model steps in the dtype of the header.
     trust_code
         As in `load_c`, for a header.
 
@@ -166,7 +166,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return self._observed.astype(self.dtype), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """One action each, (B, m): observations (B, 2n), rewards, terminated, truncated (B,), and infos."""
+        """Apply an action each, (B, m): observations (B, 2n), rewards, terminated, truncated (B,), and infos."""
         if not self._started:
             raise InputError("call reset before the first step")
         again = self._ended if self._some_ended else None  # in the step before
@@ -200,7 +200,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return observations, rewards, terminated, truncated, infos
 
     def _finish(self, observations: Array, info: dict[str, Any]) -> dict[str, Any]:
-        """Reset the environments that ended in this step; what was last seen of them, as gymnasium has it."""
+        """Reset the environments that ended in this step; return the last observations, as gymnasium does."""
         ended, last = self._ended, np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
             last[i] = observations[i]
@@ -252,7 +252,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._some_ended = bool(self._ended.any())
 
     def _rewards(self, q: Array, v: Array, u: Array) -> Array:
-        """What the user's function gives, checked."""
+        """The result of the user's function, checked."""
         rewards = self._answer("reward", self._reward(q, v, u), float)
         if not np.isfinite(rewards).all():
             row = int((~np.isfinite(rewards)).argmax())
@@ -284,7 +284,7 @@ def _check_counts(**counts: int | None) -> None:
 
 
 def _stepper_of(source: Any, trust_code: bool) -> ExportedStepper:
-    """The header of a run, a file or a stepper of one, compiled."""
+    """The compiled header of a run, a file or a stepper."""
     if isinstance(source, Run):
         with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
             return load_c(export_run(source, Path(folder, "environment.h")))
@@ -296,7 +296,7 @@ def _stepper_of(source: Any, trust_code: bool) -> ExportedStepper:
 
 
 def _library_of(stepper: ExportedStepper) -> CLibrary:
-    """Its compiled functions; what an environment cannot do without is refused."""
+    """The compiled functions; raise if a function that an environment needs is missing."""
     path, kind, metadata = stepper.path, stepper.kind, stepper.metadata
     terms = input_terms_of(metadata.get("columns", ()))
     refuse({

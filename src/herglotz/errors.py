@@ -1,6 +1,6 @@
 """The one exception a user's mistake raises; the command line turns it into one line and exit code 2."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -14,6 +14,13 @@ def refuse(wrong: dict[str, object]) -> None:
     for message, holds in wrong.items():
         if holds:
             raise InputError(message)
+
+
+def check_coordinates(where: str, option: str, wanted: Iterable[str], names: Sequence[str]) -> None:
+    """Raise InputError if an option names a coordinate that is none of `names`."""
+    for name in wanted:
+        if name not in names:
+            raise InputError(f"{where or 'data'}: {option} names {name!r}, but the coordinates are {', '.join(names)}")
 
 
 def check_start(q0: bool, v0: bool, p0: bool, dash: str = "") -> None:
@@ -33,7 +40,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def no_such_file(path: Path) -> str:
-    """What to say of a file that is not there, and which file beside it was meant."""
+    """The message on a missing file, with the file of a similar name in the same folder."""
     try:
         beside = [file.name for file in path.parent.iterdir()]
     except OSError:

@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-AGAIN = 0.2  # seconds between two drawings of a bar whose time goes on
+AGAIN = 0.2  # seconds between two drawings of a bar
 # How much of a fit's time is over where a part of it begins and ends: medians of 19 systems of `zoo.py --draw 9301`.
 LOOKING, FINDING, STAGES = (0.0, 0.05), (0.05, 0.65), (0.66, 0.98)
 FIRST_TERMS, MORE_TERMS, FEWER_TERMS = (0.0, 0.65), (0.65, 0.7), (0.7, 1.0)  # of FINDING
@@ -19,22 +19,22 @@ FIRST_TERMS, MORE_TERMS, FEWER_TERMS = (0.0, 0.65), (0.65, 0.7), (0.7, 1.0)  # o
 class ProgressBar(tqdm):
     """tqdm's bar without its monitor thread.
 
-    The thread draws bars that have not moved for ten seconds. Where it holds stderr while Python ends, as after Ctrl-C,
-    Python aborts with signal 6 in place of the command's exit code.
+    The thread draws bars that have not moved for ten seconds. If the thread holds stderr while Python ends, as after
+    Ctrl-C, Python aborts with signal 6 in place of the command's exit code.
     """
 
     monitor_interval = 0
 
 
 class FitBar(ProgressBar):
-    """One bar over a whole fit, with the time that it may still take.
+    """A bar over a whole fit, with an estimate of the time left.
 
-    How many parts a fit has is not known before its end. What is left follows from the share of the time that typical
-    fits have behind them where the part under way begins and ends, and within a stage from the time of its iterations:
-    as many again as there were, or as are left of its bound.
+    The number of parts of a fit is not known before the end. The time left follows from the share of the time that
+    typical fits have behind them where the part under way begins and ends, and within a stage from the time of the
+    iterations: as many again as were done, or the rest of the bound.
     """
 
-    under_way: FitBar | None = None  # which `beat` draws
+    under_way: FitBar | None = None  # the bar that `beat` draws
 
     def __init__(self, **options: Any):
         self.enclosing = self.span = (0.0, 1.0)
@@ -43,7 +43,7 @@ class FitBar(ProgressBar):
         self.start = time.time()
         form = "{desc}{percentage:3.0f}%|{bar}| {elapsed}, about {left} left{postfix}"
         super().__init__(total=1, bar_format=form, leave=False, dynamic_ncols=True, **options)
-        if not self.disable:  # a search makes fits of its own, whose bars are silent
+        if not self.disable:  # the fits inside a search have silent bars
             FitBar.under_way = self
 
     def part(self, span: tuple[float, float], name: str = "", most: int = 0) -> None:
@@ -63,7 +63,7 @@ class FitBar(ProgressBar):
         self.draw()
 
     def iterate(self) -> None:
-        """One more iteration of the part under way."""
+        """Count an iteration of the part under way."""
         self.iteration += 1
         self.beat()
 
@@ -89,7 +89,7 @@ class FitBar(ProgressBar):
         return {**found, "n": self.shown, "total": 1, "left": known}
 
     def draw(self) -> None:
-        """Draw the bar as it is now."""
+        """Draw the present bar."""
         self.drawn_at = time.monotonic()
         self.refresh()
 

@@ -1,4 +1,4 @@
-"""What stored entries must be: plain type hints, checked when a file is read, so that a wrong file is one message."""
+"""Types of stored entries, as plain type hints: reading a wrong file raises an error with a single message."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from herglotz.errors import InputError
 
 T = TypeVar("T")
 UNION = (Union, types.UnionType)
-LARGEST = 2**63 - 1  # of whole numbers: what torch takes; JSON has no bound, and 10^400 is no float either
+# Largest whole number that torch takes; JSON has no bound, and 10^400 is no float either.
+LARGEST = 2**63 - 1
 
 
 def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
@@ -40,7 +41,7 @@ def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
 def from_plain(cls: type[T], values: dict[str, Any]) -> T:
     """Build a settings dataclass from what `dataclasses.asdict` and JSON made of it (tuples come back as lists).
 
-    Raise InputError if a key is not one of its fields, or a value is not of its type.
+    Raise InputError if a key is no field, or a value has another type than the field.
     """
     unknown = set(values) - {f.name for f in fields(cls)}  # type: ignore[arg-type]
     if unknown:
@@ -72,7 +73,7 @@ def _alternatives(hint: Any) -> tuple[Any, ...]:
 
 
 def _needed(kind: Any) -> Collection[str]:
-    """The keys that must be there: of a dataclass those without a default."""
+    """The required keys: all keys of a `TypedDict`, the fields of a dataclass that have no default."""
     if is_typeddict(kind):
         return kind.__required_keys__
     return [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
@@ -96,7 +97,7 @@ def _match_each(values: Sequence[Any], hints: tuple[Any, ...]) -> bool:
 
 
 def _is_number(value: Any, hint: type) -> bool:
-    """Whether a value is a number of this type that torch takes; no truth value is one."""
+    """Whether a value is a number of this type that torch takes; a truth value is no number."""
     if isinstance(value, int):
         return not isinstance(value, bool) and abs(value) <= LARGEST
     return isinstance(value, hint)

@@ -1,4 +1,4 @@
-"""What is told while a result is made: how columns were read, how far a fit is."""
+"""Messages while a result is made: how columns were read, how far a fit is."""
 
 import sys
 

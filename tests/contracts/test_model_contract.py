@@ -301,6 +301,7 @@ def test_float32(settings):
     torch.testing.assert_close(P.D1.double(), exact.D1, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.usefixtures("registered_once")
 def test_an_onnx_file_steps_like_the_stepper(settings):
     # fails if a model has an operation that torch.onnx and our table lack, or a number in 32 bits
     pytest.importorskip("onnxscript")

@@ -84,6 +84,17 @@ def test_planted_functions_names_and_constants_are_found(found):
     assert found["found"]["bare constants"] == ["src/herglotz/stepping/newton.py BARE"]
 
 
+def test_prose_behind_code_and_pronouns_are_counted():
+    # fails if a shape or a word for a tool counts as prose, or words below the head of a file count
+    text = '"""It is what they are."""\n\nX = 1  # prose\nY = 2  # (N,) a shape\nZ = 3  # noqa: F401\n# such a line\n'
+    assert census.hanging(text) == [3]
+    path, tree = "src/herglotz/a.py", census.ast.parse(text)
+    found = census.words({path: text}, {path: tree})
+    assert found["pronouns"] == 60  # it, what, they of five words
+    assert found["decisions"] == 0
+    assert found["letters a line"] == round(sum(map(len, text.split("\n"))) / 5, 1)
+
+
 @pytest.mark.parametrize(
     ("body", "ways"),
     [("return a", 1), ("return a if a else b", 2), ("return a and b or c", 3), ("return [x for x in a if x]", 3),

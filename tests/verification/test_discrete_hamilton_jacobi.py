@@ -23,15 +23,7 @@ from herglotz.theory import (
     right_equations,
     right_step,
 )
-
-
-def nonlinear(q0, q1, s0, h):
-    """Golden 2-dof system of section 4, nonlinear in s."""
-    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
-    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
-    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
-
+from tests.lagrangians import bowl, nonlinear
 
 # L_d, h, q̂0
 CASES = {
@@ -151,9 +143,6 @@ def test_theorem_3_with_closed_forms_alone():
 def test_any_initial_function_will_do():
     # fails if the theorem needs a point source: any function with a section starts the recursion
     f = Fan("nonlinear")
-
-    def bowl(q):
-        return 0.6 * (q * q).sum(-1) + 0.1 * torch.cos(q.sum(-1)) + 0.2 * q[..., 0]
 
     S0, S1 = (Propagated(f.L_d, bowl, f.h, k) for k in (2, 3))
     assert largest(commutation_defect(f.flow, S0, S1, f.q0)) < 1e-10

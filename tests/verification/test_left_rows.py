@@ -3,32 +3,19 @@
 from dataclasses import replace
 
 import pytest
-import torch
 
 import herglotz.verify.legendre as rows
 from herglotz.scenes import scene
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import Stepper
 from herglotz.verify import verify
 from herglotz.verify.action import fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.legendre import left_formalism
 from herglotz.verify.sampled_rollout import sampled_rollout
 from herglotz.verify.subject import subject
+from tests.lagrangians import nonlinear, states
 
 H = 0.1
 OSCILLATOR = scene("damped_oscillator").L_d
-
-
-def nonlinear(q0, q1, s0, h):
-    """Golden 2-dof system of section 4, nonlinear in s."""
-    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
-    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
-    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
-
-
-def states(n=1, count=16):
-    x = torch.randn(count, 2 * n + 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
 
 
 @pytest.mark.parametrize(("L_d", "n"), [(OSCILLATOR, 1), (nonlinear, 2)])
@@ -42,9 +29,10 @@ def test_the_left_rows_pass(L_d, n):
 
 @pytest.mark.parametrize("wrong", ["scaled", "shifted", "slope"])
 @pytest.mark.parametrize("check", [hamilton_jacobi, left_hamilton_jacobi])
-def test_both_Hamilton_Jacobi_rows_reject_a_wrong_S(check, wrong):
+@pytest.mark.parametrize(("L_d", "n"), [(OSCILLATOR, 1), (nonlinear, 2)])
+def test_both_Hamilton_Jacobi_rows_reject_a_wrong_S(L_d, n, check, wrong):
     # fails if the residual is zero for any S, e.g. because H is built from the same S
-    known = subject((nonlinear, states(2)), H, 16, 0)
+    known = subject((L_d, states(n)), H, 16, 0)
     f = fan(known, 4, 0)
     assert check(known, f, 1e-10).passed
     change = {

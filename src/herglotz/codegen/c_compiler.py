@@ -19,8 +19,8 @@ from herglotz.data.files import write_atomically
 from herglotz.data.seal import check_seal, sealed_bytes
 from herglotz.errors import InputError
 
-# No -ffast-math: a shared library built with it flushes denormals of the whole process, and drops the compensation of
-# rounding. Fused multiply-adds are what -std=c99 alone would turn off.
+# No -ffast-math, which flushes denormals of the whole process that loads the library, and drops the compensation of
+# rounding. -ffp-contract keeps the fused multiply-adds that -std=c99 turns off.
 NATIVE = "-march=native"
 FLAGS = ("-std=c99", "-O3", NATIVE, "-fno-math-errno", "-ffp-contract=fast")
 SOURCE = "loops.c"
@@ -29,9 +29,9 @@ COMPILERS = {"CC": ("C", ("cc", "gcc", "clang"), "gcc"), "CXX": ("C++", ("g++", 
 
 
 def compiler(variable: str = "CC") -> list[str]:
-    """The compiler of C (or, of `COMPILERS`, another): what the variable names, or the first that is in the PATH.
+    """The compiler of C, or of another language of `COMPILERS`: the variable's value, or the first in the PATH.
 
-    Raise InputError if there is none.
+    Raise InputError if no compiler is found.
     """
     language, names, wanted = COMPILERS[variable]
     given = shlex.split(os.environ.get(variable, ""))
@@ -77,7 +77,7 @@ def portable_library(sources: Mapping[str, str]) -> bytes:
 
 
 def _is_whole(library: Path) -> bool:
-    """Whether a library is there as it was written: loading half of one would end the process."""
+    """Whether a library is whole: loading half a library would end the process."""
     try:
         check_seal(library.read_bytes(), library)
     except (OSError, InputError):
@@ -86,7 +86,7 @@ def _is_whole(library: Path) -> bool:
 
 
 def _compile(words: list[str], sources: Mapping[str, str], flags: Sequence[str]) -> bytes:
-    """The shared library, as bytes; without -march=native where the compiler does not know it."""
+    """The shared library, as bytes; without -march=native if the compiler does not know the flag."""
     message = ""
     with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
         source, library = Path(folder, SOURCE), Path(folder, "loops.so")
@@ -106,7 +106,7 @@ def _compile(words: list[str], sources: Mapping[str, str], flags: Sequence[str])
 
 
 def _processor() -> str:
-    """What -march=native depends on: a home folder may be shared by machines."""
+    """The processor, on which -march=native depends: machines may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

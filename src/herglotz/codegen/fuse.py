@@ -1,7 +1,7 @@
-"""Loops over rows of the same length as one loop, whose numbers stay in registers.
+"""Loop fusion: loops over rows of the same length become a single loop, whose numbers stay in registers.
 
-A program has a loop for every operation on a row, and each stores what the next one loads. Loops that read one another
-entry by entry run as one here; rows that nothing else reads are not stored.
+A program has a loop for every operation on a row, and each loop stores a row that the next loop loads. Loops that read
+each other's rows entry by entry are fused here; a row that only its own fused loop reads is not stored.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class Loop(NamedTuple):
 
     @property
     def whole_rows(self) -> set[int]:
-        """The statements that it reads otherwise than entry by entry."""
+        """Numbers of the statements whose rows the loop does not read entry by entry."""
         return {int(x) for x in NAME.findall(ENTRY.sub("", self.right))}
 
 
 def fused(program: Program, numbers: Iterable[int], kept: Collection[int]) -> tuple[list[str], set[int]]:
-    """The texts of these statements in an order in which they can run, and those whose results are no variables.
+    """The texts of these statements in an order in which they can run, and the statements whose rows are not stored.
 
-    Rows of `kept` statements are stored.
+    Rows of `kept` statements are always stored.
     """
     texts, inner = [], set()
     parts = _parts(program, sorted(numbers))
@@ -47,9 +47,9 @@ def fused(program: Program, numbers: Iterable[int], kept: Collection[int]) -> tu
 
 
 def _parts(program: Program, order: list[int]) -> list[list[int]]:
-    """Statements that are alone, and loops that are one: each goes on until a row of it is needed."""
+    """Groups of statements: single statements, and loops to be fused. A group ends where one of its rows is needed."""
     parts: list[list[int]] = []
-    waiting: dict[int, set[int]] = {}  # loops, and those of them that each needs, its own number among them
+    waiting: dict[int, set[int]] = {}  # loop → the waiting loops that must run with this loop, itself included
     length = 0
     for i in order:
         reads, loop = program.statements[i].reads, _loop(program, i)
@@ -63,7 +63,7 @@ def _parts(program: Program, order: list[int]) -> list[list[int]]:
 
 
 def _run(waiting: dict[int, set[int]], needed: set[int]) -> list[list[int]]:
-    """The waiting loops whose rows are needed, with those that they need, as one part; they wait no more."""
+    """The waiting loops whose rows are needed, with the loops that these need, as a group; the group waits no more."""
     done = set().union(*(needs for i, needs in waiting.items() if i in needed))
     for i in done:
         del waiting[i]
@@ -78,7 +78,7 @@ def _loop(program: Program, number: int) -> Loop | None:
 
 
 def _one_loop(loops: list[Loop], inside: set[int]) -> str:
-    """Loops as one; numbers that no other statement reads, those `inside`, are not stored."""
+    """The fused loop; the rows `inside`, which no other statement reads, are not stored."""
     own, lines = {x.number for x in loops}, []
     for x in loops:
         right = ENTRY.sub(lambda m: f"v{m[1]}" if int(m[1]) in own else m[0], x.right)

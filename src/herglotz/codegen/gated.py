@@ -1,9 +1,10 @@
-"""A C function that leaves out what only absent parameters need.
+"""A C function that skips the statements which only absent parameters need.
 
-A parameter θ_k that is 0 and that no derivative is asked by is *off*. A product with such a parameter is 0, and what
-nothing but such products read is not needed. Every statement is put behind a gate, a set of parameters of which one at
-least must be on; the numbers of a statement that is left out are 0. One compiled dictionary then costs what the terms
-of the model cost that is evaluated. What follows from parameters alone is computed once for many calls.
+A parameter θ_k is *off* if θ_k is 0 and no derivative by θ_k is asked for. A product with a parameter that is off is 0,
+and a number that only such products read is not needed. Every statement stands behind a gate: a set of parameters of
+which at least a single parameter must be on. The numbers of a skipped statement are 0. A compiled dictionary of terms
+then costs no more than the terms of the evaluated model. Numbers that depend on parameters alone are computed once for
+many calls.
 """
 
 from __future__ import annotations
@@ -18,27 +19,29 @@ from herglotz.codegen.c_function import Outputs, needed_by, row_of
 from herglotz.codegen.program import NAME, Program, Ref
 
 SUMS = ("{0} + {1}", "{0} - {1}", "{0} + {1} * {2}", "{0} - {1} * {2}")
-PLAIN = (*SUMS, "{0} * {1}", "-{0}")  # of finite numbers these are finite, and cost next to nothing
+# Operations whose results on finite numbers are finite, and which cost next to nothing.
+PLAIN = (*SUMS, "{0} * {1}", "-{0}")
 CONSTANT = ("theta", "sharpest")  # arguments that do not change from step to step
-WORTH_A_BRANCH = 3  # plain operations: fewer are done without asking
+# Number of plain operations from which a branch is cheaper than the operations.
+WORTH_A_BRANCH = 3
 
 Gate = frozenset[int] | None  # None: always open
 
 
 @dataclass
 class Prepared:
-    """What all functions of a library are handed: gates, and numbers that follow from parameters alone."""
+    """Arguments that all functions of a library share: gates, and numbers that depend on parameters alone."""
 
-    gates: dict[frozenset[int], int] = field(default_factory=dict)  # with their places in an array of flags
-    fixed: int = 0  # numbers
-    parts: list[str] = field(default_factory=list)  # of the C that computes them
+    gates: dict[frozenset[int], int] = field(default_factory=dict)  # gate → index in the array of flags
+    fixed: int = 0  # how many numbers depend on parameters alone
+    parts: list[str] = field(default_factory=list)  # blocks of C that compute the fixed numbers
 
     def flag(self, gate: frozenset[int]) -> str:
-        """The flag of a gate, as C reads it."""
+        """The C expression of a gate's flag."""
         return f"gate[{self.gates.setdefault(gate, len(self.gates))}]"
 
     def fix(self, program: Program, statements: list[int], read: list[int]) -> dict[int, str]:
-        """How the numbers of those of these `statements` are called that others `read`."""
+        """Names in C of the fixed numbers that other statements `read`, by statement."""
         names = {i: f"fixed[{self.fixed + at}]" for at, i in enumerate(read)}
         lines = [program.statements[i].text for i in statements] + [f"{name} = @{i};" for i, name in names.items()]
         self.parts.append(f"  {{\n{_named(program, [f'    {line}' for line in lines])}\n  }}\n")
@@ -46,7 +49,7 @@ class Prepared:
         return names
 
     def function(self) -> str:
-        """The C function that sets all of it; `on` says which parameters are on."""
+        """The C function that sets all flags and fixed numbers; `on` says which parameters are on."""
         flags = [f"  gate[{i}] = {' || '.join(f'on[{k}]' for k in sorted(x))};\n" for x, i in self.gates.items()]
         sizes = f"\n#define hz_GATES {max(1, len(self.gates))}\n#define hz_FIXED {max(1, self.fixed)}\n"
         taken = "const double *theta, const double *sharpest, const char *on, char *gate, double *fixed"
@@ -61,7 +64,7 @@ def gated(
     prepared: Prepared,
     columns: Mapping[str, int] = {},
 ) -> str:
-    """The C function of these outputs; a column of a parameter that is off is not written."""
+    """The C function of these outputs; the column of a parameter that is off is not written."""
     numbers = sorted(i for i in needed_by(program, outputs) if not program.statements[i].name)
     wanted = _wanted(outputs, columns)
     gate = _gates(program, numbers, wanted)
@@ -84,7 +87,7 @@ def _named(program: Program, lines: list[str], names: Mapping[int, str] = {}) ->
 
 
 def _fixed(program: Program, numbers: list[int]) -> set[int]:
-    """The scalars that follow from parameters alone."""
+    """The scalars that depend on parameters alone."""
     found = {i for i, x in enumerate(program.statements) if x.name in CONSTANT}
     for i in numbers:
         if not program.statements[i].size and program.statements[i].reads <= found:
@@ -93,7 +96,7 @@ def _fixed(program: Program, numbers: list[int]) -> set[int]:
 
 
 def _wanted(outputs: Outputs, columns: Mapping[str, int]) -> dict[int, Gate]:
-    """The statements that are written as outputs, with the gates behind which they are."""
+    """The statements whose results are outputs, and the gate of each output."""
     found: dict[int, Gate] = {}
     for name, row in outputs.items():
         for i, atom in enumerate(row_of(row)):
@@ -114,7 +117,7 @@ def _narrower(a: Gate, b: Gate) -> Gate:
 
 
 def _gates(program: Program, numbers: list[int], wanted: Mapping[int, Gate]) -> dict[int, Gate]:
-    """The gate of every statement: without it the statement is 0, or nothing needs it."""
+    """The gate of every statement: if the gate is closed, the result is 0, or nothing needs the result."""
     operations = {ref.statement: key for ref, key in program.operations.items()}
     vanishing = _vanishing(program, numbers, operations)
     read: dict[int, Gate] = dict(wanted)
@@ -131,7 +134,7 @@ def _gates(program: Program, numbers: list[int], wanted: Mapping[int, Gate]) -> 
 
 
 def _vanishing(program: Program, numbers: list[int], operations: Mapping[int, tuple]) -> dict[int, Gate]:
-    """The parameters without which a number is 0, of every operation on single numbers."""
+    """For every operation on scalars, the parameters without which the result is 0."""
     found: dict[int, Gate] = {}
 
     def zero(atom: object) -> Gate:
@@ -147,7 +150,8 @@ def _vanishing(program: Program, numbers: list[int], operations: Mapping[int, tu
             found[i] = _narrower(*parts)
         elif form in ("-{0}", "{0} / {1}"):
             found[i] = parts[0]
-        elif form in SUMS:  # makes no gate of its own
+        elif form in SUMS:
+            # A sum has the gate of an operand, never a new gate.
             second = _narrower(*parts[1:]) if len(parts) > 2 else parts[1]
             both = _either(parts[0], second)
             found[i] = both if both in (parts[0], second) else None
@@ -157,7 +161,7 @@ def _vanishing(program: Program, numbers: list[int], operations: Mapping[int, tu
 def _statements(
     program: Program, numbers: list[int], gate: Mapping[int, Gate], wanted: Mapping[int, Gate], prepared: Prepared
 ) -> Iterator[str]:
-    """Declarations of what is read outside of its block, and the blocks, each behind its gate."""
+    """Declarations of the numbers that are read outside of their block, and the blocks, each behind its gate."""
     blocks = list(_blocks(program, numbers, gate))
     outside = [(i, x) for i, x in _read_outside(program, blocks, gate, wanted) if gate[i] is not None]
     shared = {i for i, _ in outside}
@@ -179,7 +183,7 @@ def _behind(flag: str, lines: list[str]) -> list[str]:
 def _read_outside(
     program: Program, blocks: list[tuple[Gate, list[int]]], gate: Mapping[int, Gate], wanted: Mapping[int, Gate]
 ) -> Iterator[tuple[int, Gate]]:
-    """The numbers that outputs or other blocks read, each with the gate of its reader."""
+    """The numbers that outputs or other blocks read, each with the gate of the reader."""
     block = {i: at for at, (_, own) in enumerate(blocks) for i in own}
     for i, at in block.items():
         if i in wanted:
@@ -188,12 +192,12 @@ def _read_outside(
 
 
 def _covers(outer: Gate, inner: Gate) -> bool:
-    """Whether a gate is open wherever another one is."""
+    """Whether the outer gate is open whenever the inner gate is open."""
     return outer is None or (inner is not None and inner <= outer)
 
 
 def _blocks(program: Program, numbers: list[int], gate: Mapping[int, Gate]) -> Iterator[tuple[Gate, list[int]]]:
-    """Statements in an order in which they can run, those behind one gate together as far as that goes."""
+    """Statements in an order in which they can run; statements of the same gate stand together where possible."""
     own_numbers = set(numbers)
     waits = {i: len(program.statements[i].reads & own_numbers) for i in numbers}
     readers: dict[int, list[int]] = {}

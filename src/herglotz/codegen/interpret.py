@@ -1,4 +1,4 @@
-"""What the operations of a traced graph do to arrays of numbers of a `Program`."""
+"""The operations of a traced graph on arrays of numbers of a `Program`."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -
 
 
 def _squeezed(node: fx.Node) -> tuple[fx.Node, tuple[int, ...]]:
-    """The arguments of a squeeze with the axes that had size 1 when it was traced: here the batch has size 1, too."""
+    """The arguments of a squeeze with the axes that had size 1 in the trace: here the batch has size 1, too."""
     x, axes = node.args
     assert isinstance(x, fx.Node)
     shape = x.meta["example"].shape
@@ -73,7 +73,7 @@ def _full(shape: Any, value: float) -> np.ndarray:
 
 
 def operations(program: Program) -> dict[Any, Callable[..., Any]]:
-    """The table: what each operation gives."""
+    """The table of operations: the function on arrays of atoms for each operation of torch."""
     c = _Numbers(program)
     same = lambda x, *_, **__: x  # noqa: E731
     transposed = lambda x: x.T if x.ndim == 2 else np.swapaxes(x, -1, -2)  # noqa: E731
@@ -166,7 +166,7 @@ class _Numbers:
         return self.program.elementwise("{0} - {1}", fold, x, y)
 
     def add_product(self, a: Any, x: Any, y: Any, value: float = 1) -> np.ndarray:
-        """The sum a + value x y, in one operation where none of its numbers can be left out."""
+        """The sum a + value x y, as a single operation unless a number can be left out."""
         a, x, y = np.broadcast_arrays(_atoms(a), _atoms(x), _atoms(y))
         simple = lambda v: not isinstance(v, Ref) and v in (0.0, 1.0, -1.0)  # noqa: E731
         whole = all(isinstance(v, Ref) for v in x.flat) and not any(simple(v) for v in y.flat)
@@ -273,7 +273,7 @@ class _Numbers:
         return (x[..., 0] if vector else x), None, None, None
 
     def put(self, x: np.ndarray, places: Sequence[Any], value: np.ndarray, accumulate: bool = False) -> np.ndarray:
-        """A copy of x with these values at these places, or added to what is there."""
+        """A copy of x with these values at these places, or with the values added."""
         index = tuple(slice(None) if place is None else place for place in places)
         at = np.arange(x.size).reshape(x.shape)[index]
         out, values = _atoms(x).ravel().copy(), np.broadcast_to(_atoms(value), at.shape)
@@ -289,7 +289,7 @@ class _Numbers:
 
 
 def _put_slice(g: np.ndarray, shape: Sequence[int], dim: int, where: int | slice) -> np.ndarray:
-    """Zeros of this shape with g at `where` of one axis."""
+    """Zeros of this shape with g at `where` of an axis."""
     out = _full(shape, 0)
     out[(*(slice(None),) * (dim % len(shape)), where)] = g if g.ndim else g[()]  # an array would be kept as one
     return out
@@ -299,7 +299,7 @@ def _atoms(x: Any) -> np.ndarray:
     """Numbers as an array of atoms."""
     if isinstance(x, np.ndarray):
         return x if x.dtype == object else x.astype(float).astype(object)
-    # A `Ref` is what remains of an array without axes; numpy would take it for a row.
+    # An array without axes is reduced to a `Ref`, which numpy would take for a row.
     return _array([x if isinstance(x, Ref) else float(x)]).reshape(())
 
 

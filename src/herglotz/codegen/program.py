@@ -1,8 +1,8 @@
 """Straight-line C in static single assignment: scalars, loops over rows and calls of kernels, each expression once.
 
-A number of the traced function is an `Atom`: a Python float where it is constant, else a `Ref` to what a statement
-computes. Constants are folded, zeros and ones dropped. A loop is written where eight or more neighbouring results have
-operands that lie in a row of memory each; everything else is one scalar a line.
+A number of the traced function is an `Atom`: a Python float if the number is constant, else a `Ref` to the result of a
+statement. Constants are folded, zeros and ones dropped. A loop is written for eight or more neighbouring results whose
+operands lie in rows of memory; every other result is a scalar on a line of its own.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ import numpy as np
 
 from herglotz.errors import InputError
 
-LOOP = 8  # results from which on a loop is written; shorter rows are faster and no longer as scalars
-# Computed in one loop, of which compilers make one call: networks read both, side by side.
+# Number of results from which a loop is written: shorter rows are faster as scalars, and take no more lines.
+LOOP = 8
+# Both are computed in the same loop, which compilers turn into a single call: networks read both side by side.
 SINE_AND_COSINE = ("FN_sin({0})", "FN_cos({0})")
-DENSE = 64  # nonzero weights from which on a matrix product is a call
+# Number of nonzero weights from which a matrix product is a call of a kernel.
+DENSE = 64
 
 
 class Ref(NamedTuple):
@@ -43,7 +45,7 @@ NAME = re.compile(r"@(\d+)")
 
 @dataclass
 class Statement:
-    """One line or loop; `@7` in the text stands for the result of statement 7, which it reads unless 7 is its own."""
+    """A line or a loop; `@7` in the text is the result of statement 7, which may be this statement itself."""
 
     text: str
     size: int  # 0: a scalar
@@ -53,17 +55,17 @@ class Statement:
 
 @dataclass
 class Program:
-    """Statements in order, with what is known of their results."""
+    """Statements in order, and tables of their results for reuse."""
 
     statements: list[Statement] = field(default_factory=list)
     tables: dict[tuple[float, ...], str] = field(default_factory=dict)
     known: dict[Any, Atom] = field(default_factory=dict)
-    operations: dict[Ref, tuple[Any, ...]] = field(default_factory=dict)  # the form and the operands of scalars
-    loop: float = LOOP  # results from which on a loop is written; infinite: none is
-    angles: Any = None  # `herglotz.codegen.angles.Angles`, where sines and cosines follow from one another
+    operations: dict[Ref, tuple[Any, ...]] = field(default_factory=dict)  # scalar → its form and operands
+    loop: float = LOOP  # number of results from which a loop is written; infinite: no loops
+    angles: Any = None  # `herglotz.codegen.angles.Angles`, if sines and cosines of sums are expanded
 
     def given(self, name: str, size: int) -> list[Ref]:
-        """An input of the function: a row of `size`, or a scalar where that is 0."""
+        """An input of the function: a row of `size` numbers, or a scalar for size 0."""
         self.statements.append(Statement("", size, set(), name))
         return [Ref(len(self.statements) - 1, i) for i in range(max(size, 1))]
 
@@ -73,7 +75,7 @@ class Program:
         return self.tables.setdefault(key, f"hz_w{len(self.tables)}")
 
     def scalar(self, form: str, atoms: Sequence[Atom]) -> Ref:
-        """The result of a formula such as `{0} + {1}`; the same formula of the same numbers is computed once."""
+        """The result of a formula such as `{0} + {1}`; a repeated formula of the same numbers is computed once."""
         key = (form, *atoms)
         if key not in self.known:
             ref = self._append(f"const REAL @@ = {form.format(*map(self.read, atoms))};", 0)
@@ -85,8 +87,8 @@ class Program:
     ) -> np.ndarray:
         """A formula as in `scalar`, entry by entry of arrays of atoms that broadcast.
 
-        `fold` gives the result where no operation is needed, else None; `kernel` names a function of (count, x, y) that
-        does a whole row.
+        `fold` gives the result if no operation is needed, else None; `kernel` names a C function of (count, x, y) for a
+        whole row.
         """
         arrays = np.broadcast_arrays(*(np.asarray(x, object) for x in operands))
         out = np.empty(arrays[0].size, object)
@@ -112,7 +114,7 @@ class Program:
         return out.reshape(arrays[0].shape)
 
     def _row(self, form: str, entries: list[tuple[Atom, ...]], kernel: str | None) -> list[Ref]:
-        """The results of one run of entries: a loop if it is long, else scalars."""
+        """The results of a run of entries: a loop if the run is long, else scalars."""
         count = len(entries)
         if count < self.loop:
             return [self.scalar(form, atoms) for atoms in entries]
@@ -133,7 +135,7 @@ class Program:
         return [self.known[(form, *atoms)] for atoms in entries]
 
     def _in_loop(self, column: Sequence[Atom]) -> str:
-        """How a loop over k reads a column whose entries `_run` has found regular."""
+        """The operand of a loop over k for a column whose entries are evenly spaced (`_run`)."""
         first = column[0]
         if not isinstance(first, Ref):
             return self.read(first) if len(set(column)) == 1 else f"{self.table(column)}[k]"
@@ -144,13 +146,13 @@ class Program:
         return f"@{first.statement}[{index}{f' + {first.index}' if first.index else ''}]"
 
     def read(self, atom: Atom) -> str:
-        """One number, as an operand."""
+        """A number as an operand in C."""
         if not isinstance(atom, Ref):
             return literal(atom)
         return f"@{atom.statement}[{atom.index}]" if self.statements[atom.statement].size else f"@{atom.statement}"
 
     def pointer(self, atoms: Sequence[Atom]) -> str:
-        """The address of these numbers in a row, which are copied together where they do not lie so."""
+        """The address of a row with these numbers; numbers that are no row in memory are copied into a new row."""
         first = atoms[0]
         if isinstance(first, Ref) and self.statements[first.statement].size:
             wanted = [Ref(first.statement, first.index + i) for i in range(len(atoms))]
@@ -210,7 +212,7 @@ class Program:
         return [Ref(self.known[key].statement, i) for i in range(len(start))]
 
     def sum(self, atoms: Iterable[Atom]) -> Atom:
-        """The sum, by a call where the numbers lie in a long row."""
+        """The sum; of numbers in a long row by a call of a kernel."""
         terms = [x for x in atoms if x != 0.0]
         if len(terms) >= self.loop and _run([(x,) for x in terms], 0) == len(terms) and isinstance(terms[0], Ref):
             where = self.pointer(terms)
@@ -230,7 +232,7 @@ class Program:
         return [Ref(number, i) for i in range(n * n)]
 
     def _append(self, text: str, size: int) -> Ref:
-        """The result of another statement, which stands as `@@` in its own text."""
+        """The result of a new statement; `@@` in the text is the result of this statement."""
         number = len(self.statements)
         reads = {int(x) for x in NAME.findall(text)}
         self.statements.append(Statement(text.replace("@@", f"@{number}"), size, reads))
@@ -252,7 +254,7 @@ def multiply(program: Program, a: Atom, b: Atom) -> Atom:
 
 
 def fold_add(a: Atom, b: Atom) -> Atom | None:
-    """The sum where it needs no operation, else None."""
+    """The sum if no operation is needed, else None."""
     if isinstance(a, Ref):
         return a if not isinstance(b, Ref) and b == 0.0 else None
     if isinstance(b, Ref):
@@ -261,7 +263,7 @@ def fold_add(a: Atom, b: Atom) -> Atom | None:
 
 
 def fold_multiply(a: Atom, b: Atom) -> Atom | None:
-    """The product where it needs no operation, else None."""
+    """The product if no operation is needed, else None."""
     if not isinstance(a, Ref) and not isinstance(b, Ref):
         return a * b
     for number, other in ((a, b), (b, a)):
@@ -271,9 +273,9 @@ def fold_multiply(a: Atom, b: Atom) -> Atom | None:
 
 
 def literal(value: float) -> str:
-    """A constant, which `herglotz.export.c_header` rounds and marks by the number type.
+    """A constant in C, which `herglotz.export.c_header` rounds and marks by the number type.
 
-    Raise InputError if the number is not finite, as the inverse of a singular mass is (erratum E4: no step is defined).
+    Raise InputError if the constant is not finite, such as the inverse of a singular mass (erratum E4: no step exists).
     """
     if not math.isfinite(value):
         raise InputError(
@@ -285,12 +287,12 @@ def literal(value: float) -> str:
 
 
 def _varies(atoms: Iterable[Atom]) -> bool:
-    """Whether any of these numbers is a result of a statement."""
+    """Whether any of these numbers is the result of a statement, not a constant."""
     return any(isinstance(x, Ref) for x in atoms)
 
 
 def _run(entries: Sequence[tuple[Atom, ...]], start: int) -> int:
-    """How many entries from `start` on one loop can read: operands are constants, one number, or evenly spaced."""
+    """How many entries from `start` a loop can read: each operand is constant, the same number, or evenly spaced."""
     first, count = entries[start], 1
     strides: list[int | None] | None = None
     while start + count < len(entries):
@@ -304,7 +306,7 @@ def _run(entries: Sequence[tuple[Atom, ...]], start: int) -> int:
 
 
 def _step(a: Atom, b: Atom, distance: int) -> int | None:
-    """The stride between two entries of a row; None where there is none."""
+    """The stride between two entries of a row, None if their distance is no multiple of a stride."""
     if isinstance(a, Ref) and isinstance(b, Ref) and a.statement == b.statement:
         gap = b.index - a.index
         return gap // distance if gap % distance == 0 else None

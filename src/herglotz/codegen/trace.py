@@ -16,14 +16,15 @@ from herglotz.errors import InputError
 aten = torch.ops.aten
 PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)  # larger than any layer: a multiple of one in a shape is the batch
 LARGEST = 4096  # multiples of the batch looked for in shapes: (rows · B, …)
-SAME = (  # what leaves its first argument as it is, wherever shape and dtype stay
+# Operations that return their first argument unchanged if shape and dtype stay.
+SAME = (
     aten.alias.default, aten.to.device, aten.to.dtype, aten.to.dtype_layout, aten.expand.default, aten.reshape.default,
     aten.view.default, aten.slice.Tensor, aten.clone.default, aten.detach.default, aten.contiguous.default,
     aten.broadcast_to.default, aten._unsafe_view.default,
 )  # fmt: skip
-# A view holds for the strides of the example only, as a copy may have gone since; the sign of a complex number, which
-# derivatives of |x| ask for, is that of a real one. An operation that writes in place is the one that returns its
-# result; most have the same name without the last underscore.
+# A view is valid for the strides of the example only, because a copy before the view may have been left out. `sgn`,
+# which derivatives of |x| use, is `sign` of a real number. An operation in place becomes the operation that returns a
+# new tensor, most often of the same name without the last underscore.
 INSTEAD: dict[Any, Any] = {
     aten.view.default: aten.reshape.default,
     aten._unsafe_view.default: aten.reshape.default,
@@ -31,27 +32,29 @@ INSTEAD: dict[Any, Any] = {
     aten.zero_.default: aten.zeros_like.default,
     aten.sgn.default: aten.sign.default,
 }
-READS = (aten._local_scalar_dense.default, aten.equal.default)  # a number of Python, of which no graph knows
-SHAPE_ONLY = ("squeeze_", "unsqueeze_", "transpose_", "t_", "as_strided_")  # these write no number
+# Operations that return a Python number, which a graph cannot hold.
+READS = (aten._local_scalar_dense.default, aten.equal.default)
+# Operations in place that write no number.
+SHAPE_ONLY = ("squeeze_", "unsqueeze_", "transpose_", "t_", "as_strided_")
 
 
 class Graph(nn.Module):
     """A traced function f(*inputs) of `code`(*inputs, *constants); loops take the constants as operands.
 
-    Every node has meta "example": what it gave when it was traced, with `batch` samples, tensors as `Example`.
+    Every node has meta "example": the node's result in the trace, with `batch` samples, tensors as `Example`.
     """
 
     def __init__(self, code: fx.Graph, constants: Sequence[Tensor], batch: int):
         super().__init__()
         self.code = code
         self.batch = batch
-        self.operator: Callable[..., Any] | None = None  # what `herglotz.export.inline` puts in its place
+        self.operator: Callable[..., Any] | None = None  # the replacement by `herglotz.export.inline`
         for i, value in enumerate(constants):
             self.register_buffer(f"constant_{i}", value)
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
-        """What the graph reads besides its inputs."""
+        """The constants that the graph reads besides its inputs."""
         return tuple(self.buffers())
 
     def call(self, *arguments: Tensor) -> Any:
@@ -64,7 +67,7 @@ class Graph(nn.Module):
 
 
 def example_batch(sizes: set[int]) -> int:
-    """A prime that divides none of the sizes in the graph: wherever it shows in a shape, it is the batch."""
+    """A prime that divides none of the sizes in the graph: a shape that has this prime as a factor has the batch."""
     return next(prime for prime in PRIMES if all(size % prime for size in sizes if size))
 
 
@@ -96,7 +99,7 @@ def _described(value: Any) -> Any:
 
 
 class _Examples(fx.Interpreter):
-    """Evaluates a graph and notes what every node gives."""
+    """Evaluates a graph and notes the result of every node."""
 
     def run_node(self, n: fx.Node) -> Any:
         value = super().run_node(n)
@@ -105,26 +108,27 @@ class _Examples(fx.Interpreter):
 
 
 class Recorder(TorchDispatchMode):
-    """Writes down what torch computes from the inputs, operation by operation, as a graph.
+    """Records the operations by which torch computes the outputs from the inputs, as a graph.
 
-    It listens below autograd and `torch.func`, where derivatives are operations like any other. `make_fx` of torch
-    records the same at four times the cost: it describes every value a second time.
+    The recorder stands below autograd and `torch.func`, where derivatives are operations like any other. `make_fx` of
+    torch records the same graph at four times the cost, because `make_fx` describes every value a second time.
 
-    An operation on numbers that no input and no batch size decides is not written down; its result becomes a constant
-    where an operation that is written down reads it. What changes nothing is left out, and what repeats is one node.
+    An operation whose arguments depend on no input and no batch size is not recorded; its result becomes a constant if
+    a recorded operation reads the result. An operation that changes nothing is left out, and a repeated operation is a
+    single node.
     """
 
     def __init__(self, inputs: Sequence[Tensor]):
         super().__init__()
         self.graph = fx.Graph()
-        self.calls: dict[tuple[Any, str], fx.Node] = {}  # by operation and arguments
-        self.nodes: dict[int, fx.Node] = {}  # by the identity of the tensor, which `alive` keeps
+        self.calls: dict[tuple[Any, str], fx.Node] = {}  # nodes by operation and arguments
+        self.nodes: dict[int, fx.Node] = {}  # nodes by the id of their tensor, which `alive` keeps
         self.alive: list[Any] = []
-        self.unchanged: dict[int, tuple[Any, Any, Any]] = {}  # the operations left out, by their result
+        self.unchanged: dict[int, tuple[Any, Any, Any]] = {}  # operations left out, by the id of their result
         self.constants: dict[Any, tuple[fx.Node, Tensor]] = {}
-        self.current: dict[int, set[int]] = {}  # by written storage: the tensors whose nodes hold what was written
+        self.current: dict[int, set[int]] = {}  # written storage → tensors whose nodes have the written numbers
         self.size: fx.Node | None = None
-        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]  # and those of constants after them
+        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]  # inputs, then constants
         for x, place in zip(inputs, self.places, strict=True):
             place.meta["example"] = _described(x)
             self._name(x, place)
@@ -133,11 +137,11 @@ class Recorder(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """Nothing here is compiled by torch: to exclude it, torch would import its compiler, which takes 2 s."""
+        """False: torch would import its compiler, which takes 2 s, to exclude a mode that is never compiled."""
         return False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run one operation, and write it down."""
+        """Run an operation, and record the operation."""
         kwargs = kwargs or {}
         fixed = self._is_fixed((*args, *kwargs.values()))
         if not fixed and func in READS:
@@ -149,7 +153,7 @@ class Recorder(TorchDispatchMode):
             result = func(*args, **kwargs)
             self.alive += [args, result]
             return result
-        # What is written is read before: `result` is the tensor that is written to.
+        # An operation in place is recorded before it runs: afterwards its argument has the new numbers.
         node = self._written(func, args, kwargs) if func._schema.is_mutable else None
         result = func(*args, **kwargs)
         self.alive += [args, result]
@@ -164,7 +168,7 @@ class Recorder(TorchDispatchMode):
         return result
 
     def graph_of(self, outputs: Sequence[Tensor]) -> Graph:
-        """The graph that ends in these tensors; each is a tensor of its own."""
+        """The graph that ends in these tensors; each output is a tensor of its own."""
         left_out = [self.unchanged.get(id(x)) for x in outputs]
         ends = zip(outputs, left_out, strict=True)
         self.graph.output(tuple(self._moved(x) if how is None else self._written(*how) for x, how in ends))
@@ -183,14 +187,14 @@ class Recorder(TorchDispatchMode):
         return new or self._called(INSTEAD.get(func) or _without_writing(func), arguments, options)
 
     def _called(self, operation: Any, arguments: Any, options: Any = {}) -> fx.Node:  # noqa: B006  not changed
-        """The node of an operation; one of the same arguments is the same node, unless it draws random numbers."""
+        """The node of an operation; equal calls share a node, unless the operation draws random numbers."""
         key = (operation, repr((arguments, options)))
         if key not in self.calls or torch.Tag.nondeterministic_seeded in getattr(operation, "tags", ()):
             self.calls[key] = self.graph.call_function(operation, arguments, options)
         return self.calls[key]
 
     def _finite(self, func: Any, arguments: Any) -> fx.Node | None:
-        """(x = x) · (|x| ≠ ∞), which is what torch makes of isfinite, as one operation again."""
+        """`isfinite` as a single operation; torch decomposes `isfinite` into (x = x) · (|x| ≠ ∞)."""
         if func != aten.mul.Tensor or not all(isinstance(x, fx.Node) for x in arguments):
             return None
         same, below = arguments
@@ -221,7 +225,7 @@ class Recorder(TorchDispatchMode):
         return next((x for x in others if (x.shape, x.dtype) == (result.shape, result.dtype)), None)
 
     def _is_number(self, x: Any, number: int) -> bool:
-        """Whether no input decides this, and every entry is that number."""
+        """Whether x depends on no input, and every entry of x is the number."""
         if not isinstance(x, Tensor):
             return x == number
         if id(x) in self.nodes or x.is_meta:
@@ -229,13 +233,13 @@ class Recorder(TorchDispatchMode):
         return number == 0 if x._is_zerotensor() else bool((x == number).all())
 
     def _is_fixed(self, arguments: Any) -> bool:
-        """Whether neither an input nor the batch size decides the arguments."""
+        """Whether the arguments depend neither on an input nor on the batch size."""
         if isinstance(arguments, (list, tuple)):
             return all(map(self._is_fixed, arguments))
         return id(arguments) not in self.nodes and not self._is_size(arguments)
 
     def _name(self, result: Any, node: Any) -> None:
-        """The node of a result; results in a tuple are its items."""
+        """Note the node of a result; the results in a tuple are items of the tuple's node."""
         if isinstance(result, Tensor):
             self.nodes[id(result)] = node
             self.alive.append(result)
@@ -246,10 +250,10 @@ class Recorder(TorchDispatchMode):
                 self._name(x, self._called(operator.getitem, (node, i)))
 
     def _moved(self, value: Tensor) -> fx.Node:
-        """The node of a tensor; that of a constant on its first use.
+        """The node of a tensor; a constant gets its node on first use.
 
-        Raise InputError for a tensor whose numbers were written through another view of its memory: its node, or its
-        own numbers, are those of before.
+        Raise InputError for a tensor whose numbers were written through another view of the same memory: the tensor's
+        node still has the old numbers.
         """
         if id(value) not in self.current.get(_storage(value), {id(value)}):
             raise InputError(
@@ -269,7 +273,7 @@ class Recorder(TorchDispatchMode):
         return self.constants[key][0]
 
     def _argument(self, x: Any) -> Any:
-        """An argument as the graph has it: the node of a tensor, and of every multiple of the example's batch."""
+        """An argument of a node: tensors, and multiples of the example's batch, are replaced by their nodes."""
         if isinstance(x, Tensor):
             return self._moved(x)
         if not self._is_size(x):
@@ -279,17 +283,17 @@ class Recorder(TorchDispatchMode):
         return self.size if x == self.batch else self._called(operator.mul, (self.size, x // self.batch))
 
     def _is_size(self, x: Any) -> bool:
-        """Whether this is a multiple of the example's batch."""
+        """Whether x is a multiple of the example's batch."""
         return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * self.batch and x % self.batch == 0
 
 
 def _storage(x: Tensor) -> int:
-    """Identifies the memory of a tensor; that of one without memory is its own."""
+    """An identifier of a tensor's memory; a tensor without memory has an identifier of its own."""
     return id(x) if x.is_meta or x._is_zerotensor() else x.untyped_storage()._cdata
 
 
 def _without_writing(func: Any) -> Any:
-    """The operation that returns what this one writes in place; itself where it writes nothing."""
+    """The operation that returns the result of an operation in place; any other operation unchanged."""
     if not func._schema.is_mutable:
         return func
     name = func._schema.name.removeprefix("aten::")

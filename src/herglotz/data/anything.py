@@ -1,4 +1,4 @@
-"""Recordings in the form in which the user has them: files, DataFrames, dicts, Series, arrays, lists of these."""
+"""Recordings in the form that the user has: files, DataFrames, dicts, Series, arrays, lists of these."""
 
 from __future__ import annotations
 
@@ -26,8 +26,11 @@ from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse
 from herglotz.telling import tell
 
-TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
+TRANSPOSED = 4  # times as many coordinates as samples: so short a recording of a chain determines no model
 AS_THEY_ARE = Wanted(coordinates=())  # coordinates of arrays, which no header names
+OF_TRAJECTORIES = (
+    "trajectories have their columns already; angles, degrees, polar, input_terms and sensors alone change them"
+)
 OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "polar", "input_terms",
            "sensor_zeros", "sensor_scales")  # fmt: skip
 
@@ -49,37 +52,37 @@ def as_trajectories(
     sensor_scales: Sequence[float] | None = (),
     like: Trajectories | None = None,
 ) -> Trajectories:
-    """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
+    """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of these.
 
-    A dict of columns or a structured array is read like a DataFrame, and what each column was taken for is printed on
-    stderr, as by `load`. A list holds one recording an entry, unless its entries are numbers: that is one recording of
-    one coordinate. Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time`
-    gives them; the index of a DataFrame is a column, unless it merely counts the rows.
+    A dict of columns or a structured array is read like a DataFrame, and the role of each column is printed on stderr,
+    as by `load`. Every entry of a list is a recording; a list of numbers is a single recording of a single coordinate.
+    Angles come unwrapped, as from `load`. The index of a Series is the time, unless `h` or `time` is given; the index
+    of a DataFrame is a column, unless the index merely counts the rows.
 
     Parameters
     ----------
     data
-        One of these, or `Trajectories`.
+        Any of the forms above, or `Trajectories`.
     h
         Time between the samples of arrays, in s or the unit of your choice: the model has the same.
     time
-        Of a table the name of its column; of an array the times (N,): numbers, dates or durations.
+        Of a table the name of the column; of an array the times (N,): numbers, dates or durations.
     coordinates
-        Of a table the columns; of an array what to call its columns, `name` or `name[unit]`.
+        Of a table the columns; of an array the names of the columns, `name` or `name[unit]`.
     inputs
         Of a table the columns, () for none; of an array the inputs (N,) or (N, m).
     drop, group
-        Columns of a table that are left aside; the column that numbers its trajectories.
+        Columns of a table that are left aside; the column that numbers the trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
     degrees, polar, input_terms
-        Coordinates in degrees whose header does not say so; pairs of positions that become one angle each; terms of
-        inputs that act beside them: as in `load`.
+        Coordinates in degrees whose header does not say so; pairs of positions that become an angle each; terms of
+        inputs that act beside the inputs: as in `load`.
     sensor_zeros, sensor_scales
         q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
         for none.
     like
-        Another recording: columns of a table that have its names mean the same.
+        Another recording: columns with the same names have the same roles.
 
     Returns
     -------
@@ -92,35 +95,28 @@ def as_trajectories(
         If arrays come without times, or as `load` and `read_csv` do.
     """
     names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
-    coordinates, data = names["coordinates"], _by_field(data)
-    meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms}
+    meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms, "like": like}
+    sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
+    data = _by_field(data)
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
-    if isinstance(data, Trajectories):
-        wrong = (
-            "trajectories have their columns already; angles, degrees, polar, input_terms and sensors alone change them"
-        )
-        refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
-        found = data
-    elif isinstance(data, (str, Path)):
+    if isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
-        sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
-        return _shown(load(data, like=like, show=False, **meant, **sensors, **columns))
-    elif hasattr(data, "columns") and h is not None:
-        found = _array(np.asarray(data), h, time, {**names, "coordinates": coordinates or [*map(str, data.columns)]})
-    elif hasattr(data, "columns") or isinstance(data, Mapping):
+        return _shown(load(data, show=False, **meant, **sensors, **columns))
+    if isinstance(data, Trajectories):
+        refuse({OF_TRAJECTORIES: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
+        changed = any(x is not None for x in (degrees, polar, input_terms))
+        found = as_told(data, AS_THEY_ARE, **meant) if changed else data
+    elif _is_table(data, h):
         wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
-        found = as_told(_table(data, wanted), wanted, **meant, like=like)
+        found = as_told(_table(data, wanted), wanted, **meant)
         found = found if like is None else angles_like(found, like)
         return _shown(_marked(measured(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
-        options = {"h": h, "time": time, **names, **meant, "like": like}
-        return measured(_of_each(data, options), sensor_zeros)
+        return measured(_of_each(data, {"h": h, "time": time, **names, **meant}), sensor_zeros)
     else:
-        found = _array(data, h, time, names)
-    if not isinstance(data, Trajectories) or any(x is not None for x in (degrees, polar, input_terms)):
-        found = as_told(found, AS_THEY_ARE, **meant, like=like)
+        found = as_told(_array(data, h, time, names), AS_THEY_ARE, **meant)
     return _noted(_marked(measured(found, sensor_zeros, sensor_scales), angles), data)
 
 
@@ -130,7 +126,7 @@ def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 
 
 def _lists(told: dict[str, Any]) -> dict[str, Any]:
-    """What is said of columns, with a list for each array or index of names, as a DataFrame's columns are."""
+    """The settings of the columns, with a list for each array or index of names, as a DataFrame's columns are."""
     hold = {role: hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU" for role, x in told.items()}
     return {role: x.tolist() if hold[role] else x for role, x in told.items()}
 
@@ -141,16 +137,26 @@ def _by_field(data: Any) -> Any:
     return {name: data[name] for name in fields} if fields else data
 
 
+def _is_table(data: Any, h: float | None) -> bool:
+    """Whether data are named columns with their own time: a dict, or a DataFrame for which no step h is given."""
+    return h is None if hasattr(data, "columns") else isinstance(data, Mapping)
+
+
 def _is_list_of_recordings(data: Any) -> bool:
     if isinstance(data, (np.ndarray, Tensor)):
         return data.ndim == 3
-    if _is_series(data):
+    if _is_series(data) or hasattr(data, "columns"):
         return False
     return isinstance(data, Sequence) and len(data) > 0 and not isinstance(data[0], Number)
 
 
 def _is_series(data: Any) -> bool:
     return hasattr(data, "index") and not callable(data.index)
+
+
+def _name_of(series: Any) -> str | None:
+    name = getattr(series, "name", None)
+    return None if name is None else str(name)
 
 
 def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
@@ -172,10 +178,12 @@ def _table(data: Any, wanted: Wanted) -> Trajectories:
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:
     called = names["coordinates"]
-    if _is_series(data) and getattr(data, "name", None) is not None:
-        called = called or str(data.name)
-    if h is None and time is None and _is_series(data) and type(data.index).__name__ != "RangeIndex":
-        time = data.index
+    if hasattr(data, "columns"):
+        data, called = np.asarray(data), called or [*map(str, data.columns)]
+    elif _is_series(data):
+        called = called or _name_of(data)
+        if h is None and time is None and type(data.index).__name__ != "RangeIndex":
+            time = data.index
     q = torch.from_numpy(_floats("positions", data))
     _check_array(
         q, called, timeless=(h is None) == (time is None), of_tables=names["group"] is not None or names["drop"]
@@ -204,7 +212,7 @@ def _check_array(q: Tensor, called: Names | None, *, timeless: bool, of_tables: 
 
 
 def _labels(called: Names | None) -> dict[str, Any]:
-    """What names of coordinates say, as cells of a header do: `x[m]` is x, in m. Nothing where there are none."""
+    """Names and units from names of coordinates, as from cells of a header: `x[m]` is x, in m. Empty without names."""
     if called is None:
         return {}
     heads = [name_and_unit(name) for name in as_names(called)]
@@ -227,14 +235,14 @@ def _marked(data: Trajectories, angles: Any) -> Trajectories:
 
 
 def _noted(found: Trajectories, data: Any) -> Trajectories:
-    """The same; notes that were not of the data already are printed."""
+    """Print the notes that the data did not have; return `found`."""
     for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
         tell(f"{found.source or 'trajectories'}: {note}")
     return found
 
 
 def _shown(data: Trajectories) -> Trajectories:
-    """The same; what each column of its table was taken for is printed, after all that was said of the columns."""
+    """Print the role of each column of the table, after all notes on the columns; return `data`."""
     if data.columns:
         tell(data.table())
     return data

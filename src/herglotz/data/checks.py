@@ -23,7 +23,7 @@ DTYPES = (torch.float32, torch.float64)
 
 
 def unnamed(n: int) -> tuple[str, ...]:
-    """Names of n coordinates that have none: q, or q1, q2, … as a model's features number them."""
+    """Default names of n coordinates: q, or q1, q2, … as a model's features number coordinates."""
     return ("q",) if n == 1 else tuple(f"q{i + 1}" for i in range(n))
 
 
@@ -116,7 +116,7 @@ def _check_labels(where: str, labels: Any, n: int) -> None:
     if not all(labels.units) or not labels.time_unit:
         raise InputError(f"{where}: a unit is empty ({labels.units}, {labels.time_unit!r}); write '1' for none")
     for text in (*labels.names, *labels.units, labels.time_unit):
-        if any(unicodedata.category(x) in ("Cc", "Cs") for x in text):  # they can be neither drawn nor written
+        if any(unicodedata.category(x) in ("Cc", "Cs") for x in text):  # can be neither drawn nor written
             raise InputError(f"{where}: {text!r} has control characters or half a character; rename it")
     for name, unit, angle in zip(labels.names, labels.units, labels.angles, strict=True):
         if angle and unit != "rad":
@@ -148,7 +148,7 @@ def _check_observed(where: str, offsets: tuple[int, ...], observed: Tensor) -> N
 
 
 def check_sizes(where: str, q: Tensor, names: Sequence[str]) -> None:
-    """Raise where positions (N, n) are so large or small that their squares are no numbers: a fit needs those."""
+    """Raise if positions (N, n) are so large or small that their squares, which a fit needs, overflow or vanish."""
     for name, size in zip(names, q.detach().abs().amax(0).tolist(), strict=True):
         if size > LARGEST:
             raise InputError(f"{where}: {name} has a number of {size:.1e}, above {LARGEST:.0e}; use a larger unit")
@@ -194,7 +194,7 @@ def check_alike(sets: Sequence[Any]) -> None:
 
 
 def as_tensor(name: str, x: Tensor | np.ndarray | Sequence) -> Tensor:
-    """A tensor as it is, and what else holds numbers in float64; raise InputError if it is not an array of numbers."""
+    """A tensor unchanged, any other array of numbers in float64; raise InputError for other objects."""
     if isinstance(x, Tensor):
         return torch.atleast_1d(x)
     try:
@@ -204,6 +204,6 @@ def as_tensor(name: str, x: Tensor | np.ndarray | Sequence) -> Tensor:
 
 
 def as_columns(name: str, x: Tensor | np.ndarray | Sequence | None) -> Any:
-    """(N, n) of what may be (N,); None stays None."""
+    """An array (N,) or (N, n) as (N, n); None stays None."""
     x = None if x is None else as_tensor(name, x)
     return x[:, None] if x is not None and x.ndim == 1 else x

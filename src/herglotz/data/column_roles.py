@@ -1,4 +1,4 @@
-"""What the name and the unit of a column say of its role: an explicit unit first, then the words of the name."""
+"""The role of a column by its name and unit: an explicit unit decides first, then the words of the name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 from unicodedata import combining, normalize
 
 ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|gon|rev|turns?")
-# Kinds of units, in the order in which they are tried. Others, such as counts or 1, leave the role to the name.
+# Kinds of units, in the order of trial. With other units, such as counts or 1, the name decides the role.
 KINDS = {
     "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
     "time": re.compile(r"s|ms|us|µs|μs|ns|min|h|secs?|seconds?|msec|usec"),
@@ -41,7 +41,7 @@ RATE = re.compile(
 LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")  # of a velocity or an acceleration, unless the unit is that of a position
 DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")  # a desired value, or a derivative: q_d
 KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")  # usual names of coordinates
-# A German compound is what its last part is: Motorstrom, Winkelgeschwindigkeit.
+# The last part of a German compound decides: Motorstrom, Winkelgeschwindigkeit.
 COMPOUND = re.compile(
     ".+(winkel|kraft|moment|strom|spannung|drehzahl|geschwindigkeit|beschleunigung|fehler|temperatur|zeit)"
 )
@@ -75,7 +75,7 @@ READING = "it may be the reading of a position"
 
 
 class Guess(NamedTuple):
-    """The role of a column, and why it may be another one; "" where name and unit leave no doubt."""
+    """The role of a column, and a doubt about the role; "" if name and unit leave no doubt."""
 
     role: str  # a key of `ROLES`, "rate", "dropped" or "q"
     doubt: str = ""
@@ -101,12 +101,12 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
 
 
 def kind_of(unit: str) -> str:
-    """The kind of a unit, a key of `KINDS`; "" where there is no unit, or one that many quantities have."""
+    """The kind of a unit, a key of `KINDS`; "" for no unit, or a unit that many quantities have."""
     return next((kind for kind, pattern in KINDS.items() if pattern.fullmatch(unit)), "")
 
 
 def is_angular(name: str) -> bool:
-    """Whether a name is one that is given to angles."""
+    """Whether a name is usual for angles."""
     return bool(words_of(name) & WORDS["angle"])
 
 
@@ -121,7 +121,7 @@ def is_timed(words: frozenset[str]) -> bool:
 
 
 def is_usual(name: str, unit: str) -> bool:
-    """Whether the unit or the name is one that coordinates usually have."""
+    """Whether the unit or the name is usual for coordinates."""
     usual = KNOWN.fullmatch(name.casefold()) or words_of(name) & WORDS["position"]
     return kind_of(unit) == "position" or bool(usual)
 
@@ -148,12 +148,12 @@ def _whole(key: str, kind: str) -> str:
 
 
 def _letter(key: str) -> str:
-    """What is in doubt of an input by its letter alone, whose unit is that of a position."""
+    """The doubt about an input that only its letter names, and that has the unit of a position."""
     return "it has the unit of a position" if re.fullmatch(r"u_?([xyz]|\d*)", key) else ""
 
 
 def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
-    """The role of a column in the unit of a position: a coordinate, unless the name says what moves from outside."""
+    """The role of a column in the unit of a position: a coordinate, unless the name is usual for an excitation."""
     if words and words <= GIVEN:
         return Guess("input", "it has the unit of a position")
     if _is_rate(key, words, others, "position"):
@@ -179,7 +179,7 @@ def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
 
 
 def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess:
-    """The role of a column without a unit that tells it."""
+    """The role of a column whose unit does not decide."""
     shaken = words & {"acceleration", "acc", "accel"} and words & WORDS["support"]
     if shaken or words & WORDS["excitation"]:
         return Guess("input", BY_NAME)
@@ -197,7 +197,7 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
 
 
 def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:
-    """Whether a name is that of a rate; letters such as vx are none in the unit of a position, nor dx without x."""
+    """Whether a name is usual for a rate; vx in the unit of a position, or dx without a column x, is no rate."""
     if kind == "position":
         of = re.fullmatch(r"dd?_?(.+)", key)
         if LETTERS.fullmatch(key) or (of and of[1] not in {name.casefold() for name in others}):

@@ -1,4 +1,4 @@
-"""What was read, in words: of a recording a line; of a table a line a column, then notes, then warnings."""
+"""A recording in words: a line for people; a table with a line for each column, then notes, then warnings."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 
 from herglotz.data.column_roles import is_angular
 
-INPUT_TERM = "input term"  # role of a column of u that follows from a recorded one
+INPUT_TERM = "input term"  # role of a column of u that was computed from a recorded input
 WARNING = "warning: "  # begins a note that a user should see outside of the table, too
 LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
 
 
 def column_table(data: Any) -> str:
-    """Return of `Trajectories` a line a column: its role, its unit with the conversion that was made.
+    """Return a line for each column of `Trajectories`: role, unit, and the conversion of the unit.
 
-    Notes and warnings follow. Of more than `LISTED` columns the first and the last ones are shown, and the number of
-    the others.
+    Notes and warnings follow. Of more than `LISTED` columns the table shows the first, the last, and the number of the
+    others.
     """
     rows = [("column", "is taken for", "unit"), *column_rows(data)]
     left = len(rows) - 1 - LISTED
@@ -31,7 +31,7 @@ def column_table(data: Any) -> str:
 
 
 def summary_of(data: Any) -> str:
-    """Return of `Trajectories` one line: what was recorded, how much of it, and in which steps."""
+    """Return a line on `Trajectories`: coordinates and inputs, the number of samples, and the steps."""
     coordinates = ", ".join(f"{name} [{unit}]" for name, unit in zip(data.names, data.units, strict=True))
     known = "".join(f", {name}" for name in "sp" if getattr(data, name) is not None)
     known += "".join(f", input {name}" + (f" [{unit}]" if unit else "") for name, unit in data.input_labels)
@@ -47,12 +47,12 @@ def summary_of(data: Any) -> str:
 
 
 def of_file(name: str, note: str) -> str:
-    """A note that holds for one file of several."""
+    """A note on a single file of several."""
     return f"{WARNING}{name}: {note[len(WARNING) :]}" if note.startswith(WARNING) else f"{name}: {note}"
 
 
 def column_rows(data: Any) -> list[tuple[str, str, str]]:
-    """Name, role and unit of each column of `Trajectories`, in words, after all that was said of it and made of it."""
+    """Name, final role and final unit of each column of `Trajectories`, in words."""
     now = dict(zip(data.names, zip(data.units, data.angles, strict=True), strict=True))
     rows = []
     for name, role, unit in data.columns:
@@ -71,6 +71,6 @@ def column_rows(data: Any) -> list[tuple[str, str, str]]:
 
 
 def _converted(unit: str, now: str) -> str:
-    """The unit of a column, and what it became; of a column without a unit the one that it was given since."""
+    """The unit of a column, and the unit after conversion; for a column without a unit the assigned unit."""
     given = "" if now == "1" else now
     return unit if unit == now else f"{unit}, converted to {now}" if unit else given

@@ -13,7 +13,7 @@ from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
 HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
-# A unit without a space before it, where it is a unit: x(1) is a name.
+# A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
 TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
 # A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
 SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
@@ -26,7 +26,7 @@ Names = str | Sequence[str]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user says of the columns, each by name; None where the header decides."""
+    """The roles that the user gives to columns, by name; None if the header decides."""
 
     time: str | None = None
     coordinates: Names | None = None  # exactly these
@@ -35,8 +35,8 @@ class Wanted:
     group: str | None = None  # numbers the trajectories
     known: tuple[tuple[str, str, str], ...] = ()  # name, role, unit in another table: names keep their roles
     positions: tuple[str, ...] = ()  # coordinates as well, unless `coordinates` says exactly which
-    hold: str = ""  # what the inputs do between samples, whatever the file says of it; "": as the file says
-    motion: bool = True  # False: times and inputs suffice; without coordinates the first input stands in for one
+    hold: str = ""  # hold of the inputs between samples, which overrules the file's; "": the file decides
+    motion: bool = True  # False: times and inputs suffice; an input replaces a missing coordinate
 
     def role(self, name: str) -> str | None:
         """The role that the user gives to this column; None where the user says nothing."""
@@ -68,7 +68,7 @@ class Wanted:
         return replace(self, **{field: named(getattr(self, field)) for field in who})
 
     def before(self, name: str) -> str | None:
-        """The role that a column of this name had in the other table; None where it had none."""
+        """The role of the column of this name in the other table; None if the other table has no such column."""
         return next((AS_SHOWN.get(role) for other, role, _ in self.known if other == name), None)
 
     def in_order(self, found: Sequence[int], names: Sequence[str]) -> tuple[int, ...]:
@@ -82,7 +82,7 @@ HEADER_DECIDES = Wanted()
 
 @dataclass(frozen=True)
 class Columns:
-    """Column numbers (from 0) by what they mean."""
+    """Column numbers (from 0) by the role of the column."""
 
     names: tuple[str, ...]  # of all columns, as the header spells them
     units: tuple[str, ...]  # of all columns, "" where the header gives none
@@ -92,7 +92,7 @@ class Columns:
     s: int | None = None
     p: tuple[int, ...] = ()
     u: tuple[int, ...] = ()
-    hold: str = ""  # what the user says of the inputs between samples
+    hold: str = ""  # hold of the inputs between samples, as the user gives it
     notes: tuple[str, ...] = ()  # warnings of roles that are guesses
 
     @property
@@ -125,17 +125,11 @@ def assign(
     wanted = _dated(wanted.by_name(cells, names), names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
-    guesses = [_guess(name, unit, wanted, place) for name, unit in zip(names, units, strict=True)]
-    if wanted.motion and wanted.coordinates is None and not any(guess.role == "q" for guess in guesses):
-        # Volts of a sensor are the motion where no other column is.
-        guesses = [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
-    roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "rate", "q", "dropped")}
-    for i, guess in enumerate(guesses):
-        roles[guess.role].append(i)
+    guesses = _guesses(names, units, wanted)
+    roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
     clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))
     u = wanted.in_order(roles["input"], names)
-    q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
-    q = q if wanted.coordinates is None else tuple(place[x] for x in as_names(wanted.coordinates))
+    q = _coordinates(wanted, names, roles["q"]) or (() if wanted.motion else u[:1])
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
@@ -148,8 +142,15 @@ def assign(
     return replace(found, notes=_warnings(found, guesses, wanted))
 
 
+def _coordinates(wanted: Wanted, names: Sequence[str], found: Sequence[int]) -> tuple[int, ...]:
+    """The columns of coordinates: the columns that the user names, in the user's order, or else the found columns."""
+    if wanted.coordinates is None:
+        return wanted.in_order(found, names)
+    return tuple(names.index(x) for x in as_names(wanted.coordinates))
+
+
 def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
-    """What to do about a table without a coordinate; what its columns are taken for is not printed."""
+    """The remedy for a table without a coordinate, whose table of roles is never printed."""
     looks = {"rate": "look like rates", "input": "look like inputs", "dropped": "look like no positions"}
     alike = [f"{', '.join(names[i] for i in roles[role])} {look}" for role, look in looks.items() if roles[role]]
     choose = f"{', '.join(alike)}: choose with --coordinates NAMES (coordinates= in Python)"
@@ -157,14 +158,22 @@ def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
 
 
 def as_names(names: Names) -> Sequence[str]:
-    """Names, of which one may be given by itself."""
+    """A sequence of names; a single name may be given as a string."""
     return (names,) if isinstance(names, str) else names
 
 
-def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Guess:
-    """The role of a column by the user's word, by another table, or by its name and unit; with what is in doubt.
+def _guesses(names: Sequence[str], units: Sequence[str], wanted: Wanted) -> list[Guess]:
+    """The role of every column; volts of a sensor are the motion if no other column is."""
+    guesses = [_guess(name, unit, wanted, names) for name, unit in zip(names, units, strict=True)]
+    if wanted.motion and wanted.coordinates is None and all(guess.role != "q" for guess in guesses):
+        return [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
+    return guesses
 
-    It is `dropped` where the user gives that role to others.
+
+def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Guess:
+    """The role of a column by the user's word, by another table, or by its name and unit; and the doubt about the role.
+
+    The role is `dropped` if the user gives the found role to other columns.
     """
     if said := wanted.role(name):
         return Guess(said)
@@ -185,20 +194,20 @@ def _other_clocks(names: Sequence[str], units: Sequence[str], roles: dict[str, l
 
 
 def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple[str, ...]:
-    """What is said of columns whose role is a guess, and of coordinates that nothing shows to be one beside others."""
+    """Warnings of columns whose role is a guess, and of coordinates that neither a unit nor a usual name supports."""
     doubts: dict[str, list[int]] = {}
     for i, guess in enumerate(guesses):
         if guess.doubt:
             doubts.setdefault(guess.doubt, []).append(i)
     own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
     plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
-    if plain and len(own) > 1:  # one alone can be nothing else
+    if plain and len(own) > 1:  # a single column without a role can only be the coordinate
         doubts["no unit and no usual name says so"] = plain
     return tuple(_warning(found, columns, doubt) for doubt, columns in doubts.items())
 
 
 def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
-    """What these columns are taken for, why that may be wrong, and how to say otherwise."""
+    """The warning of these columns: their role, the doubt about the role, and the flags that change the role."""
     is_q, is_u = columns[0] in found.q, columns[0] in found.u
     names = [found.names[i] for i in columns]
     one, some = len(names) == 1, ",".join(names[:FEW])
@@ -215,7 +224,7 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
 
 
 def _dated(wanted: Wanted, names: Sequence[str]) -> Wanted:
-    """The same; a column `date` is the time where nothing else is: beside a time of day it is none."""
+    """The same, with a column `date` as the time if no other column is a time, such as a time of day."""
     dates = [name for name in names if name.casefold() == "date"]
     if wanted.time is not None or len(dates) != 1 or any(ROLES["time"].fullmatch(name.casefold()) for name in names):
         return wanted
@@ -250,12 +259,12 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
 
 
 def _whole(cell: str, unit: str) -> tuple[str, str]:
-    """Name and unit of one of several cells of one name: brackets of `x (raw)` hold no unit, and `x_deg` is a name."""
+    """Name and unit of a cell whose name repeats: the brackets of `x (raw)` hold no unit, and `x_deg` is a name."""
     return (cell.strip(), "" if cell.endswith(")") else unit) if not cell.endswith("]") else (cell.split("[")[0], unit)
 
 
 def name_and_unit(cell: str) -> tuple[str, str] | None:
-    """What a cell of a header says, `x[m]`, `x (m)` or `x_deg`; None where it is no such cell."""
+    """Name and unit of a header's cell, `x[m]`, `x (m)` or `x_deg`; None for any other text."""
     match = HEADER_CELL.fullmatch(cell)
     if not match or not cell.isprintable():
         return None

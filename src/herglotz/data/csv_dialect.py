@@ -14,7 +14,7 @@ from herglotz.data.csv_columns import is_number, name_and_unit
 from herglotz.data.rows import MISSING
 from herglotz.errors import InputError
 
-# Separators in the order in which they are tried; a comma last but one, as it may be the decimal sign of the others.
+# Separators in the order of trial; the comma stands last but one, because a comma may be a decimal sign.
 SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
 TITLES = 50  # lines above a header at most
 EXCEL = "sep=(.|tab)?"  # a line above the header by which Excel is told the separator
@@ -43,9 +43,9 @@ def in_commas(
 ) -> tuple[Rows, tuple[str, ...], str]:
     """Rows of a table, header first, with commas and decimal points; notes on what was changed, and the separator.
 
-    Lines without a value and comments are left out, unless a comment is the header: the last one before rows of numbers
-    alone, in as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points in
-    others, or commas that may be of thousands.
+    Lines without a value and comments are left out. A comment may be the header: the last comment before rows of
+    numbers alone, with as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points
+    in others, or commas that may be of thousands.
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
     rows, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
@@ -81,7 +81,7 @@ def _with_points(path: Path, table: Sequence[tuple[int, list[str]]]) -> tuple[Ro
 
 
 def _without_empty_ends(rows: Rows) -> Rows:
-    """The rows without columns at their end that hold nothing, as spreadsheets write them."""
+    """The rows without the empty columns that spreadsheets write at the end of rows."""
     if not any(line.rstrip().endswith(",") for _, line in rows):
         return rows
     filled = [line.rstrip(", \t").count(",") + 1 for _, line in rows]
@@ -90,7 +90,7 @@ def _without_empty_ends(rows: Rows) -> Rows:
 
 
 def _with_header(written: Rows) -> tuple[Rows, list[str]]:
-    """The rows without comments, but for one that is the header; and the note that says so."""
+    """The rows without comments, except for a comment that is the header; and the note on that header."""
     rows = [(i, line) for i, line in written if not line.lstrip().startswith("#")]
     before = [(i, line.lstrip("# ")) for i, line in written if rows and i < rows[0][0]]
     if before and (found := _separator(before[-1][1], rows[0][1])) and _all_numbers(rows[0][1], found):
@@ -99,7 +99,7 @@ def _with_header(written: Rows) -> tuple[Rows, list[str]]:
 
 
 def _without_titles(rows: Rows) -> tuple[Rows, list[str]]:
-    """The rows from the header on, where lines above the table say what was recorded; and the note that says so."""
+    """The rows from the header on, without title lines above the table; and the note on these lines."""
     at = next((k for k, (_, line) in enumerate(rows[:TITLES]) if any(_has_time(line, mark) for mark in SEPARATORS)), 0)
     if at == 0 or not _is_header(rows[at : at + 3]):
         return rows, []
@@ -129,7 +129,7 @@ def _is_header(rows: Rows) -> bool:
 
 
 def _told_apart(cells: Sequence[str], titles: Sequence[str]) -> list[str]:
-    """Names that come twice, as of several bodies, with the title above them; the first time is that of all."""
+    """Repeated names, as of several bodies, extended by the title above the name; the first time column serves all."""
     found: list[str] = []
     title, often = "", Counter(cells)
     for cell, above in zip(cells, titles, strict=True):
@@ -157,7 +157,7 @@ def _all_numbers(row: str, separator: str) -> bool:
 
 
 def _check_decimals(path: Path, rows: Sequence[tuple[int, list[str]]]) -> None:
-    """Raise where 1,5 and 2.5 stand in one table, or 1.000,5: one of the two signs separates thousands."""
+    """Raise if 1,5 and 2.5 stand in the same table, or 1.000,5: a sign may then separate thousands."""
     first: dict[str, tuple[int, str]] = {}
     for i, cells in rows:
         for cell in cells:

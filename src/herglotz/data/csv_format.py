@@ -1,4 +1,4 @@
-"""Trajectories as comma-separated text: `trajectory,t[s],q[rad],...`, one row a sample."""
+"""Trajectories as comma-separated text: `trajectory,t[s],q[rad],...`, a row for each sample."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.csv_dialect import Rows, cells_of, in_commas
@@ -24,35 +25,36 @@ from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.errors import InputError, refuse
 
 HEAD = 64  # lines that say how a table is written
-SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"  # what happens to inputs before they act, and what sensors read
+# Comments about inputs (hold, delay, lag) and about sensors (zero, scale).
+SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"
 
 
 def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     """Read trajectories from a csv file (UTF-8) whose columns have the wanted roles, and others by their names.
 
-    `herglotz.data.load` asks for roles by keywords (`time=`, `coordinates=`, …) and for angles; here they are a
+    `herglotz.data.load` takes roles as keywords (`time=`, `coordinates=`, …), and angles; here the roles are a
     `herglotz.data.csv_columns.Wanted`.
 
-    Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A coordinate
-    that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row without any, or without s or a
-    momentum, is left out; the step over it has the mean of its inputs. An input that is empty is held from the row
-    before, or goes in a straight line where its hold is "first" or "smooth".
-    Rows of stacked tables are sorted by time, and those of one time joined.
+    Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma. A coordinate that
+    is empty or NaN has no weight in a fit (`Trajectories.observed`). A row without any coordinate, or without s or a
+    momentum, is left out; the step over that row has the mean of the inputs. An empty input is held from the row
+    before, or interpolated linearly if the hold is "first" or "smooth". Rows of stacked tables are sorted by time, and
+    rows of equal time joined.
 
-    The header's cells are `name`, `name[unit]`, `name (unit)`, `name(unit)` of a known unit, or of angles and times
-    `name_deg`, `t_ms`; it may stand behind #, as `numpy.savetxt` writes it, and the units in a row of their own below
-    it. `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time;
-    `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta. Of other columns an
-    explicit unit decides before the name (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions, N, Nm, A,
-    V, % inputs, m/s, rad/s, rpm rates, which are left aside, and so are °C, Pa, W. What is wanted of a motion is an
-    input in any unit: goal, target, set point, desired, reference, command, soll. Without a unit `u`, `u1`, `u_*`, `F`,
-    force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors,
-    temperatures, batteries and counters (`index`, `frame`, a first column without a name) are left aside; every other
-    column is a coordinate. A role that is a guess is said in a warning. A column may be named with its unit. Times may
-    be dates in ISO 8601: they become seconds since the first row. Lines that start with # and blank lines are skipped,
-    but for `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do
-    between samples and how late they act, in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5`,
-    which make q = scale · (reading − zero) of the coordinates, one after the other (`herglotz.data.sensors`). A
+    The header's cells are `name`, `name[unit]`, `name (unit)`, `name(unit)` of a known unit, or for angles and times
+    `name_deg`, `t_ms`. The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
+    of their own below the header. `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of
+    time is the time; `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta.
+    Of other columns an explicit unit decides before the name (`herglotz.data.column_roles`): rad, deg, m, mm, px are
+    positions, N, Nm, A, V, % inputs, m/s, rad/s, rpm rates, which are left aside, and so are °C, Pa, W. A set value of
+    a motion is an input in any unit: goal, target, set point, desired, reference, command, soll. Without a unit `u`,
+    `u1`, `u_*`, `F`, force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates;
+    errors, temperatures, batteries and counters (`index`, `frame`, a first column without a name) are left aside; every
+    other column is a coordinate. A warning names every role that is a guess. A column may be named with its unit. Times
+    may be dates in ISO 8601, which become seconds since the first row. Lines that start with # and blank lines are
+    skipped, but for `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which give the hold of
+    the inputs between samples, and their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and
+    `# scale: 1 0.5`, which make q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`). A
     coordinate in rad is taken for an angle.
 
     Returns
@@ -97,7 +99,8 @@ def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[Columns, 
 def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
     """A table whose columns of time, trajectories and motion are plain numbers; None for any other file.
 
-    Its first lines say how it is written. Read row by row, a mistake has a place.
+    The first lines of the file decide separator and columns. None also for a table with a mistake: `_read_rows` names
+    the row.
     """
     if not path.is_file():
         return None
@@ -122,7 +125,7 @@ def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
 
 
 def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
-    """With what the first comments of each kind among the lines say of the inputs and of the sensors."""
+    """The set with hold, delay, lag, zeros and scales from the first comment of each kind among the lines."""
     said: dict[str, str | float] = {}
     sensors: dict[str, list[float]] = {}
     for match in filter(None, (re.fullmatch(SAID, line.strip()) for line in lines)):
@@ -132,7 +135,7 @@ def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
             sensors.setdefault(name, [number(x, where) for x in text.replace(",", " ").split()])
         else:
             said.setdefault(name, text if name == "hold" else number(text, where))
-    if found.hold:  # the user has said it
+    if found.hold:  # the user's hold overrules the file's
         said.pop("hold", None)
     return replace(measured(found, sensors.get("zero", ()), sensors.get("scale", ())), **said)  # type: ignore[arg-type]
 
@@ -142,26 +145,10 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
 
     `comments` become lines that start with #. Positions that were not read are NaN. A coordinate in rad that is not an
     angle is written too, although `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit
-    cannot stand in the header (it has a comma, or means another column).
+    cannot stand in the header, because of a comma or because the name means another column.
     """
-    q = trajectories.names
-    header = ["trajectory", f"t[{trajectories.time_unit}]"]
-    header += [f"{name}[{unit}]" for name, unit in zip(q, trajectories.units, strict=True)]
-    parts = [trajectories.t[:, None], trajectories.q]
-    if trajectories.v is not None:  # left aside by `read_csv`, as all rates are
-        rate = [f"{unit}/{trajectories.time_unit}".removesuffix("/1") for unit in trajectories.units]
-        header += [f"{name}_dot[{unit}]" for name, unit in zip(q, rate, strict=True)]
-        parts.append(trajectories.v)
-    if trajectories.s is not None:
-        header, parts = [*header, "s"], [*parts, trajectories.s[:, None]]
-    if trajectories.p is not None:
-        header, parts = header + [f"p_{name}" for name in q], [*parts, trajectories.p]
-    if trajectories.u is not None:
-        header, parts = header + [f"u_{i}" for i in range(trajectories.u.shape[1])], [*parts, trajectories.u]
+    header, table = _table(trajectories)
     _check_header(Path(path), header, trajectories)
-    table = np.concatenate([x.detach().cpu().numpy().astype(np.float64) for x in parts], axis=1)
-    if trajectories.observed is not None:
-        table[:, 1 : 1 + len(q)][trajectories.observed.cpu().numpy() == 0] = np.nan
     names = trajectories.trajectory.tolist()
     said = trajectories.arrival._asdict().items()
     comments = [*comments, *(f"{name}: {value}" for name, value in said if value not in ("", None))]
@@ -170,10 +157,28 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
+def _table(data: Trajectories) -> tuple[list[str], np.ndarray]:
+    """The header's cells, and the numbers below all cells but the first, which is the trajectory's."""
+    q = data.q if data.observed is None else data.q.where(data.observed > 0, torch.nan)
+    rates = [f"{unit}/{data.time_unit}".removesuffix("/1") for unit in data.units]
+    blocks = [
+        ([f"t[{data.time_unit}]"], data.t),
+        ([f"{name}[{unit}]" for name, unit in zip(data.names, data.units, strict=True)], q),
+        # `read_csv` leaves all rates aside.
+        ([f"{name}_dot[{unit}]" for name, unit in zip(data.names, rates, strict=True)], data.v),
+        (["s"], data.s),
+        ([f"p_{name}" for name in data.names], data.p),
+        ([f"u_{i}" for i in range(0 if data.u is None else data.u.shape[1])], data.u),
+    ]
+    header = ["trajectory", *(name for names, x in blocks if x is not None for name in names)]
+    parts = [x.detach().cpu().double().reshape(data.samples, -1) for _, x in blocks if x is not None]
+    return header, torch.cat(parts, 1).numpy()
+
+
 def _parse_rows(
     path: Path, columns: Columns, rows: Sequence[tuple[int, str]]
 ) -> tuple[list[int], list[str] | None, list[list[float]]]:
-    """Return line number, trajectory label and numbers of every row; None for the labels where all are of one."""
+    """Return line number, trajectory label and numbers of every row; None for the labels of a single trajectory."""
     width, labels, values = len(columns.names), [], []
     first = None  # date of the first row, where times are dates
     parse = {i: number if i == columns.time else number_or_none for i in columns.numeric}
@@ -189,14 +194,21 @@ def _parse_rows(
             cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
         values.append([parse[i](cells[i], f"{path}, row {at}, column '{columns.names[i]}'") for i in columns.numeric])
         labels.append("" if columns.trajectory is None else cells[columns.trajectory])
-    if any(labels) and not all(labels):
-        at = rows[labels.index("")][0]
-        raise InputError(f"{path}, row {at}, column 'trajectory': blank, but other rows name a trajectory; fill it in")
-    return [at for at, _ in rows], labels if any(labels) else None, values
+    return [at for at, _ in rows], _labels(path, rows, labels), values
+
+
+def _labels(path: Path, rows: Sequence[tuple[int, str]], labels: list[str]) -> list[str] | None:
+    """The trajectory of each row; None where no row names one."""
+    if not any(labels):
+        return None
+    if not all(labels):
+        where = f"{path}, row {rows[labels.index('')][0]}, column 'trajectory'"
+        raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
+    return labels
 
 
 def _check_kinds(path: Path, columns: Columns, rows: Sequence[tuple[int, str]]) -> None:
-    """Raise where a column of text would be read as numbers: neither of its first two cells is one."""
+    """Raise if a column of text would be read as numbers: neither of its first two cells is a number."""
     two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
     for i in columns.numeric if len(two) == 2 else ():
         if any(is_number(x) or x.casefold() in MISSING for x in (cells[i] for cells in two)):

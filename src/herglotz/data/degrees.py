@@ -1,9 +1,9 @@
-"""Angles in degrees whose header does not say so: by the user's word, or as their motion shows."""
+"""Conversion of angles in degrees whose header gives no unit: the user names them, or their motion shows the unit."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 
 import torch
@@ -13,8 +13,9 @@ from herglotz.data.column_roles import is_angular
 from herglotz.data.csv_columns import Names, as_names
 from herglotz.data.trajectories import DEGREES, TAKEN_FOR_DEGREES, Trajectories
 from herglotz.data.units import in_radians_and_seconds
-from herglotz.errors import InputError
+from herglotz.errors import check_coordinates
 
+# One full turn in each unit of angle.
 TURN = {"rad": 2 * math.pi, "deg": 360.0}
 
 
@@ -24,37 +25,45 @@ def in_told_degrees(
     angles: Names | bool | None,  # coordinates that the user calls angles in rad
     like: Trajectories | None = None,  # another recording: its columns mean the same here
 ) -> Trajectories:
-    """The set with these coordinates in rad; notes say what was guessed, and what to do where a guess is not certain.
+    """The set with these coordinates in rad; notes name each guess, and the remedy where the guess is not certain.
 
-    A coordinate without a unit whose name is that of an angle is in degrees where it reaches beyond 2π and, were it in
-    rad, its steps could not be told from steps of other turns (`is_in_degrees`). Raise InputError if a name is none of
-    a coordinate.
+    A coordinate without a unit that has the name of an angle is in degrees if it reaches beyond 2π and moves too far
+    between samples for an angle in rad (`is_in_degrees`). Raise InputError if a name is none of a coordinate.
     """
     if degrees is not None:
-        for name in as_names(degrees):
-            if name not in data.names:
-                where = data.source or "data"
-                raise InputError(f"{where}: degrees names {name!r}, but the coordinates are {data.names}")
+        check_coordinates(data.source, "degrees", as_names(degrees), data.names)
         return _converted(data, set(as_names(degrees)) - set(data.degrees), ())
-    found, notes, told = [], [], set(data.degrees)
     known = {} if like is None else dict.fromkeys(like.names, "") | {name: unit for name, _, unit in like.columns}
-    for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
-        said = unit == "rad" or angles is True or (not isinstance(angles, bool) and name in as_names(angles or ()))
-        if name in known:
-            found += [name] if unit == "1" and known[name] == TAKEN_FOR_DEGREES else []
-        elif name not in told and (said or (unit == "1" and angles is None and is_angular(name))):
-            note = _judged(data, name, q, said)
-            found += [name] if note and not said and is_in_degrees(data, q) else []
-            notes += [note] if note else []
+    units = zip(data.names, data.units, strict=True)
+    found = [name for name, unit in units if unit == "1" and known.get(name) == TAKEN_FOR_DEGREES]
+    notes = []
+    for name, q, in_radians in _angles_beyond_a_turn(data, angles, {*known, *data.degrees}):
+        in_degrees = is_in_degrees(data, q)
+        if in_degrees and not in_radians:
+            found.append(name)
+        if in_degrees or not in_radians:
+            notes.append(_note(name, float(q.abs().max()), in_radians, in_degrees))
     return _converted(data, found, notes)
+
+
+def _angles_beyond_a_turn(
+    data: Trajectories, angles: Names | bool | None, known: Collection[str]
+) -> Iterator[tuple[str, Tensor, bool]]:
+    """Names and values (N,) of coordinates that may be in degrees, and whether the user says that they are in rad."""
+    radians = data.names if angles is True else as_names(angles or ())
+    for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
+        in_radians = unit == "rad" or name in radians
+        angular = in_radians or (unit == "1" and angles is None and is_angular(name))
+        if angular and name not in known and float(q.abs().max()) > TURN["rad"]:
+            yield name, q, in_radians
 
 
 def is_in_degrees(data: Trajectories, q: Tensor) -> bool:
     """Whether a coordinate, (N,), is an angle in degrees, and not in rad.
 
-    Its motion is steadier where jumps lose turns of 360 than where they lose turns of
-    2π: an angle in rad that is recorded often enough loses jumps alone, one in degrees its motion. Whole numbers beyond
-    360 may be counts.
+    Removing turns of 360 from the steps of an angle in degrees leaves a steadier motion than removing turns of 2π. An
+    angle in rad that is sampled often enough loses only its jumps by turns of 2π. Whole numbers beyond 360 may be
+    counts of an encoder.
     """
     counts = float(q.abs().max()) > TURN["deg"] and bool((q == q.round()).all())
     return not counts and _unsteady(data, q, TURN["rad"]) > _unsteady(data, q, TURN["deg"])
@@ -68,19 +77,16 @@ def _unsteady(data: Trajectories, q: Tensor, turn: float) -> float:
     return float(d.diff().abs().mean() / d.abs().mean().clamp_min(torch.finfo(d.dtype).tiny))
 
 
-def _judged(data: Trajectories, name: str, q: Tensor, said: bool) -> str:
-    """What is said of a coordinate without a unit, or `said` to be in rad, that reaches far; "" for nothing."""
-    largest = float(q.abs().max())
-    if largest <= TURN["rad"]:
-        return ""
-    reaches, certain = f"reaches {largest:.4g}", is_in_degrees(data, q)
-    if said:
-        why = f"warning: {name} {reaches} rad, and moves between samples as an angle in degrees"
-        return f"{why}: --degrees {name} (degrees= in Python), if it is one" if certain else ""
-    if certain:
+def _note(name: str, largest: float, in_radians: bool, in_degrees: bool) -> str:
+    """The warning of a coordinate that reaches beyond a turn: what it is taken for, and the remedy."""
+    remedy, reaches = f"--degrees {name} (degrees= in Python)", f"reaches {largest:.4g}"
+    if in_radians:
+        why = f"{reaches} rad, and moves between samples as an angle in degrees"
+        return f"warning: {name} {why}: {remedy}, if it is one"
+    if in_degrees:
         why = f"it has no unit, {reaches}, and moves too far between samples for an angle in rad"
         return f"warning: {name} is taken for degrees: {why}; else give --degrees none (degrees=() in Python)"
-    ways = f"--degrees {name} (degrees= in Python), an angle in rad by --angles {name}"
+    ways = f"{remedy}, an angle in rad by --angles {name}"
     return f"warning: {name} {reaches} without a unit, and is taken for a length; an angle in degrees is said by {ways}"
 
 

@@ -38,10 +38,10 @@ def input_recording(
     unsaid: Arrival = NOT_SAID,
     known: Sequence[Sequence[str]] = (),  # columns of the fit: name, role, unit
 ) -> Trajectories:
-    """The recording whose inputs drive the model: the trajectory of that number, or the only one.
+    """The recording whose inputs drive the model: the trajectory of that number, or the only trajectory.
 
-    A file needs times and inputs alone. Its inputs are those that act: before they do what it says itself or, where it
-    says nothing, `unsaid`. Raise InputError if the file holds no inputs, has no such trajectory, or counts time in
+    A file needs times and inputs alone. The returned inputs are the acting inputs, by the file's own hold, delay and
+    lag, or else by `unsaid`. Raise InputError if the file holds no inputs, has no such trajectory, or counts time in
     another unit.
     """
     found = path if isinstance(path, Trajectories) else load(path, known=tuple(map(tuple, known)), motion=False)

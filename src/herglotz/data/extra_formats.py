@@ -18,7 +18,7 @@ from herglotz.errors import InputError, refuse
 
 INSTALL = "pip install 'herglotz[tables]'"
 COUNTER = re.compile(r"__index_level_\d+__")  # a column that pandas adds: an index without a name
-HDF5 = b"\x89HDF\r\n\x1a\n"  # the first bytes of such a file, also of MATLAB's version 7.3
+HDF5 = b"\x89HDF\r\n\x1a\n"  # first bytes of an HDF5 file, also of MATLAB's version 7.3
 
 
 class Table:
@@ -45,10 +45,10 @@ class Table:
 def read_packed(path: PathLike, wanted: Wanted) -> Trajectories:
     """Read a table of a suffix of `ARRAYS` like a csv file with the same header.
 
-    Raise InputError if the package that reads it is missing, the file is damaged, columns differ in length, or as
+    Raise InputError if the package for the format is missing, the file is damaged, columns differ in length, or as
     `read_csv`.
     """
-    every = ARRAYS[Path(path).suffix.lower()](path)  # of each recording
+    every = ARRAYS[Path(path).suffix.lower()](path)  # a mapping for each recording
     return Trajectories.cat(from_frame(Table(Path(path), one), wanted, Path(path)) for one in every)
 
 
@@ -62,7 +62,7 @@ def _parquet(path: PathLike) -> list[dict[str, np.ndarray]]:
 def _matlab(path: PathLike) -> list[dict[str, np.ndarray]]:
     """The arrays of a MATLAB file, vectors t, q, u, ... or matrices (N, n), in structs as well.
 
-    A struct array holds one recording an element. Text and single numbers are left aside.
+    Every element of a struct array is a recording. Text and single numbers are left aside.
     """
     with Path(path).open("rb") as file:
         if HDF5 in file.read(520):  # version 7.3: matrices are stored transposed
@@ -76,7 +76,7 @@ def _matlab(path: PathLike) -> list[dict[str, np.ndarray]]:
 
 
 def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-    """The elements of a struct array that is all that a file or its one struct holds; or else what it holds itself."""
+    """The elements of the only struct array in a file or in its only struct; without a struct array the file itself."""
     inside = [x for name, x in stored.items() if not name.startswith("__") and _is_kept(x)]
     if len(inside) != 1:
         return [stored]
@@ -100,7 +100,7 @@ def _is_structs(x: Any) -> bool:
 
 
 def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Arrays of numbers, by the last part of their names where structs hold them."""
+    """Arrays of numbers, by the last part of the name for arrays inside structs."""
     found: dict[str, np.ndarray] = {}
     for name, x in stored.items():
         inside = _vectors(path, x) if isinstance(x, Mapping) else {name: x}
@@ -113,7 +113,7 @@ def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]
 
 
 def _datasets(path: PathLike) -> list[dict[str, np.ndarray]]:
-    """Every dataset of numbers in an HDF5 file, its groups opened, by the last part of its name, with its unit."""
+    """Every dataset of numbers in an HDF5 file and its groups, by the last part of the name, with the unit."""
     h5py = _package("h5py", path)
     found: dict[str, np.ndarray] = {}
 

@@ -14,17 +14,17 @@ from pathlib import Path
 from herglotz.errors import InputError, no_such_file
 
 PathLike = str | os.PathLike[str]
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, or what this user may take of it
-# What spreadsheets and drives that do not write UTF-8 write in units and in words of Western Europe.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk or the user's quota is full
+# Bytes of units and of Western European words in files of spreadsheets and drives that do not write UTF-8.
 WINDOWS = "°µ²³·äöüÄÖÜßáàâçéèêëíìîïñóòôúùûÉÈÀÑ".encode("cp1252")
-TEMPORARY = ".{}.????????.tmp"  # names that `tempfile.mkstemp` gives to what becomes a file of this name
+TEMPORARY = ".{}.????????.tmp"  # pattern of the temporary names of a file (`tempfile.mkstemp`)
 
 
 def read_bytes(path: PathLike, most: int = -1) -> bytes:
     """Return the contents of a file, or its first `most` bytes.
 
-    Raise InputError if there is no such file, it is a directory, a pipe or a device (which may never end), empty or not
-    readable.
+    Raise InputError if the path is no file, is a directory, a pipe or a device (which may never end), or if the file is
+    empty or not readable.
     """
     path = Path(path)
     try:
@@ -49,8 +49,8 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
 def read_lines(path: PathLike) -> list[str]:
     r"""Return the lines of a text file, without their ends (\n, \r\n or \r).
 
-    It is UTF-8, UTF-16 with its mark, or else has units and words in Windows' letters. Raise InputError as
-    `read_bytes`, and if the file is none of them.
+    The encoding is UTF-8, UTF-16 with a byte-order mark, or cp1252 with letters of units and Western European words.
+    Raise InputError as `read_bytes`, and for any other encoding.
     """
     content = read_bytes(path)
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # "Unicode text" of spreadsheets
@@ -95,7 +95,7 @@ def write_atomically(path: PathLike, content: bytes) -> None:
 
 
 def folder_at(path: PathLike) -> Path:
-    """Return this folder, made with its parents if it is missing; raise InputError if it cannot be made."""
+    """Return this folder, made with its parents if missing; raise InputError if the folder cannot be made."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -105,7 +105,7 @@ def folder_at(path: PathLike) -> Path:
 
 
 def remove_leftovers(folder: PathLike, names: Iterable[str]) -> None:
-    """Remove what a killed writer of these files has left in a folder that nobody else writes them to now."""
+    """Remove the temporary files that a killed writer of these names left; no other writer may be at work."""
     for name in names:
         for path in Path(folder).glob(TEMPORARY.format(name)):
             with suppress(OSError):

@@ -1,11 +1,11 @@
-"""What an input does between its samples: how the recorded u_k become the input of a step, or of a part of it.
+"""The hold of an input between samples: how the recorded u_k become the input of a step, or of a part of it.
 
     zero     u_k from sample k to the next: a controller's output
     first    straight lines between the samples: the mean over a step is (u_k + u_{k+1})/2
     smooth   polynomials through eight samples: a signal without steps, sampled at the same times as the motion
 
-A model takes one input a step. Where u changes within the step the rule of order 2 wants its value in the middle: this
-is what a hold gives, for the whole recorded step or for each of the equal parts in which the step is crossed.
+A model takes one input a step. Where u changes within the step the rule of order 2 needs the value in the middle: a
+hold gives the value, for the whole recorded step or for each of the equal parts in which the step is crossed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ POINTS = {"zero": 1, "first": 2, "smooth": 8}  # samples that an input in betwee
 
 
 class Arrival(NamedTuple):
-    """What happens to recorded inputs before they act; "" or None: not said."""
+    """Hold, delay and lag of recorded inputs; "" or None: not said."""
 
     hold: str = ""
     delay: float | None = None  # in units of time

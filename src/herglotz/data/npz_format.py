@@ -32,7 +32,7 @@ DAMAGE = (
 
 
 class Metadata(TypedDict, total=False):
-    """What an archive says of its arrays: fields of `Trajectories`."""
+    """The metadata of an archive: fields of `Trajectories`."""
 
     names: list[str]
     units: list[str]

@@ -17,16 +17,17 @@ from herglotz.data.column_roles import kind_of
 from herglotz.data.csv_columns import is_number, name_and_unit
 from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
-from herglotz.errors import refuse
+from herglotz.errors import check_coordinates, refuse
 from herglotz.least_squares import least_squares
 
 POLAR = "polar"  # role of an angle that was made, in the table of columns
 MOST = 4000  # samples at most in which circles are looked for
-ON_A_CIRCLE = (
-    0.1  # a circle misses a tenth of what a straight line misses: bodies on arms are far below, ellipses above
-)
-ROUNDS, SMALLER = 50, 1 - 1e-12  # of Gauss and Newton, and by what the error has to fall in one
-EXACT = 1e-12  # of the radius: what rounding leaves of a circle
+# Largest misfit of a circle over the misfit of a straight line: bodies on arms are far below, ellipses above.
+ON_A_CIRCLE = 0.1
+# Gauss–Newton iterations at most, and the factor by which an iteration has to lower the error.
+ROUNDS, SMALLER = 50, 1 - 1e-12
+# Error of an exact circle by rounding, over the radius.
+EXACT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -37,15 +38,15 @@ class Pair:
     y: str
     signs: tuple[float, float] = (1.0, 1.0)  # −1 where an axis grows the other way
     centre: tuple[str, str] | tuple[float, float] | None = None  # columns, numbers in their unit, or to be found
-    again: bool = False  # whether the numbers are those of another recording
+    again: bool = False  # whether the centre comes from another recording
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """All columns that it names."""
+        """All columns of the pair and of its centre."""
         return (self.x, self.y, *(c for c in self.centre or () if isinstance(c, str)))
 
     def spec(self, centre: Sequence[str | float]) -> str:
-        """The pair as a user says it, with this centre."""
+        """The pair as text for `polar=`, with this centre."""
         (x, y), ends = self.axes(), map(str, centre)
         return ",".join([x.removeprefix("+"), y.removeprefix("+"), *ends])
 
@@ -55,9 +56,9 @@ class Pair:
 
 
 def pairs_of(polar: str | Sequence[str] | None, like: Trajectories | None = None) -> list[Pair]:
-    """What the user says, `x,y` or `x,y,CENTRE_X,CENTRE_Y` each, or what another recording was made with.
+    """The pairs of the user, `x,y` or `x,y,CENTRE_X,CENTRE_Y` each, or the pairs of another recording.
 
-    Raise InputError if a text names no two columns.
+    Raise InputError if a text does not name two columns.
     """
     if polar is None:
         told = [] if like is None else [unit for _, role, unit in like.columns if role == POLAR]
@@ -67,7 +68,7 @@ def pairs_of(polar: str | Sequence[str] | None, like: Trajectories | None = None
 
 
 def named_by(polar: str | Sequence[str] | None) -> tuple[str, ...]:
-    """All columns that the user names in pairs of positions: they are coordinates."""
+    """All columns that the user names in pairs of positions, which are coordinates."""
     return tuple(name for pair in pairs_of(polar) for name in pair.columns)
 
 
@@ -89,11 +90,11 @@ def _pair(text: str) -> Pair:
 
 
 def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
-    """The set with an angle in the place of each pair of positions; notes say about which centre, and at what distance.
+    """The set with an angle in the place of each pair of positions; notes give the centre and the distance.
 
-    A centre that is not given is fixed, and found by least squares, or it is the body of an earlier pair: whichever
-    leaves the distance more constant. The centre of another recording is kept unless a new one is better by the
-    Bayesian information criterion. Raise InputError if a pair is none of coordinates, or momenta are recorded.
+    A centre that is not given is a fixed point, found by least squares, or the body of an earlier pair, whichever
+    leaves the distance more constant. The centre of another recording is kept unless a new centre is better by the
+    Bayesian information criterion. Raise InputError if a pair does not name coordinates, or momenta are recorded.
     """
     pairs = [pair for pair in pairs if not pair.again or set(pair.columns) <= set(data.names)]
     if not pairs:
@@ -119,9 +120,7 @@ def _check(data: Trajectories, pairs: Sequence[Pair]) -> None:
     where = data.source or "data"
     named = [name for pair in pairs for name in (pair.x, pair.y)]
     for pair in pairs:
-        for name in pair.columns:
-            known = ", ".join(data.names)
-            refuse({f"{where}: polar names {name!r}, but the coordinates are {known}": name not in data.names})
+        check_coordinates(data.source, "polar", pair.columns, data.names)
         units = {data.units[data.names.index(name)] for name in pair.columns}
         refuse({f"{where}: polar: {', '.join(pair.columns)} are not in one unit, but in {', '.join(units)}":
                 len(units) > 1})  # fmt: skip
@@ -139,7 +138,7 @@ def _positions(data: Trajectories, pair: Pair, names: Iterable[str]) -> Tensor:
 def _centre(
     data: Trajectories, pair: Pair, body: Tensor, earlier: Sequence[tuple[Pair, Tensor]]
 ) -> tuple[Tensor, str, str]:
-    """The centre of a body's circle, (2,) or (N, 2), as the user would say it, and in words."""
+    """The centre of a body's circle, (2,) or (N, 2), the pair as text for `polar=`, and the centre in words."""
     if pair.centre is not None and isinstance(pair.centre[0], str):
         names = [str(name) for name in pair.centre]
         return _positions(data, pair, names), pair.spec(names), ", ".join(names)
@@ -158,14 +157,14 @@ def _centre(
 
 
 def _criterion(arm: Tensor, numbers: int) -> float:
-    """The Bayesian information criterion of a circle, by its radial errors, whose centre has so many fitted numbers."""
+    """The Bayesian information criterion of a circle by its radial errors, for a number of fitted coordinates."""
     r = _radii(arm)
     error = float(r.var(correction=0)) + (EXACT * float(r.mean())) ** 2
     return len(r) * math.log(max(error, 1e-300)) + numbers * math.log(len(r))
 
 
 def _words(data: Trajectories, pair: Pair, centre: Tensor) -> tuple[str, str]:
-    """A fixed centre as the user would say it, in the signs of the columns, and in words."""
+    """The pair with a fixed centre as text for `polar=`, in the signs of the columns, and the centre in words."""
     own = (centre * centre.new_tensor(pair.signs)).tolist()
     return pair.spec([repr(x) for x in own]), f"({own[0]:.4g}, {own[1]:.4g}){_unit(data, pair)}"
 
@@ -198,25 +197,19 @@ def _with_angles(
     notes: Sequence[str],
 ) -> Trajectories:
     """The set with these angles in the place of the first column of each pair, without its other columns."""
-    made = {pair.x: (name, angle) for pair, (name, *_), angle in zip(pairs, rows, angles, strict=True)}
-    every = [(pair, name) for pair, (name, *_) in zip(pairs, rows, strict=True)]
-    of = {column: name for pair, name in every for column in pair.columns}
-    of |= {column: name for pair, name in every for column in (pair.x, pair.y)}
+    made = {pair.x: (row[0], angle) for pair, row, angle in zip(pairs, rows, angles, strict=True)}
+    # A column that is both a position and a centre belongs to the pair of the position.
+    of = {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in pair.columns}
+    of |= {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in (pair.x, pair.y)}
     kept = [k for k, name in enumerate(data.names) if name in made or name not in of]
-    labels = [(made[data.names[k]][0], "rad", True) if data.names[k] in made
-              else (data.names[k], data.units[k], data.angles[k]) for k in kept]  # fmt: skip
-    observed = data.observed
-    if observed is not None:  # an angle is where all positions that it is made of are
-        parts = {name: [data.names.index(x) for x in _pair(spec).columns] for name, _, spec in rows}
-        places = [parts.get(label[0], [k]) for k, label in zip(kept, labels, strict=True)]
-        observed = torch.stack([observed[:, own].prod(1) for own in places], 1)
-    q = torch.stack([made[data.names[k]][1] if data.names[k] in made else data.q[:, k] for k in kept], 1)
+    old = {name: (name, data.q[:, k], data.units[k], data.angles[k]) for k, name in enumerate(data.names)}
+    new = {x: (name, angle, "rad", True) for x, (name, angle) in made.items()}
+    names, q, units, turning = zip(*((old | new)[data.names[k]] for k in kept), strict=True)
     columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
-    names, units, turning = zip(*labels, strict=True)
     return replace(
         data,
-        q=q,
-        observed=observed,
+        q=torch.stack(q, 1),
+        observed=_observed(data, kept, names, rows),
         v=None,
         names=names,
         units=units,
@@ -226,10 +219,21 @@ def _with_angles(
     )
 
 
+def _observed(
+    data: Trajectories, kept: Sequence[int], names: Sequence[str], rows: Sequence[tuple[str, str, str]]
+) -> Tensor | None:
+    """Where each coordinate was read, (N, n): an angle was read if all its positions were."""
+    if data.observed is None:
+        return None
+    parts = {name: [data.names.index(x) for x in _pair(spec).columns] for name, _, spec in rows}
+    places = [parts.get(name, [k]) for k, name in zip(kept, names, strict=True)]
+    return torch.stack([data.observed[:, own].prod(1) for own in places], 1)
+
+
 def circle(x: Tensor) -> Tensor:
     """The centre (2,) of the circle of least squares through points (N, 2).
 
-    It starts from Taubin's algebraic fit (IEEE PAMI 13:1115, 1991) and goes on by Gauss and Newton on the distances.
+    Start: Taubin's algebraic fit (IEEE PAMI 13:1115, 1991). Then Gauss–Newton iterations on the distances.
     """
     middle = x.mean(0)
     x = x - middle
@@ -264,7 +268,7 @@ def _variance(arm: Tensor) -> float:
 
 
 def with_hints(data: Trajectories) -> Trajectories:
-    """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
+    """The set with a warning of each pair of positions x, y that stays on a circle, as a body on an arm does."""
     notes, earlier, read = [], [], complete(data)
     for x, y in _pairs_by_name(data):
         pair = Pair(x, y)
@@ -282,7 +286,7 @@ def with_hints(data: Trajectories) -> Trajectories:
 
 
 def _pairs_by_name(data: Trajectories) -> list[tuple[str, str]]:
-    """Coordinates of one unit whose names differ by x and y alone: x1 and y1, mass_x and mass_y."""
+    """Pairs of coordinates with the same unit whose names differ by x and y alone: x1 and y1, mass_x and mass_y."""
     units = dict(zip(data.names, data.units, strict=True))
     found = []
     for x in data.names:

@@ -1,7 +1,7 @@
-"""Columns of one table that were sampled at different times: rows joined, inputs between their samples.
+"""Columns of a table that were sampled at different times: rows are joined, and inputs filled between samples.
 
-A sample of the motion is a row in which a coordinate is known. An input is needed between samples, too: it is held
-from its sample to its next one, or goes there in a straight line, and a step of the motion has its mean.
+A sample of the motion is a row in which a coordinate is known. An input is needed between its own samples, too: the
+input is held from sample to sample, or interpolated linearly, and a step of the motion takes the mean of the input.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from herglotz.data.csv_columns import Columns
 from herglotz.data.missing import NEAR, between
 from herglotz.data.trajectories import Trajectories
 
-MIN_STEPS = 20  # of an input that is told from one whose steps fell two numbers of rows apart by chance
-OFTEN = 0.1  # of these numbers of rows each: a row that is missing here and there is no clock
+# Number of changes below which chance can set all changes of an input k or k + 1 rows apart.
+MIN_STEPS = 20
+# Least share of each of the two distances: a row that is missing here and there is no second clock.
+OFTEN = 0.1
 
 
 class Recording(NamedTuple):
@@ -29,9 +31,9 @@ class Recording(NamedTuple):
 
 
 def in_order(one: Recording) -> Recording:
-    """The rows by time where each column is in order by itself, as in stacked tables; those of one time joined.
+    """The recording with its rows sorted by time, if each column by itself is in order, as in stacked tables.
 
-    Rows of one time are one row where they hold different columns. Other rows stay as they are.
+    Rows of equal time become a single row if they hold different columns. All other rows stay as they are.
     """
     t, known = one.values[:, 0], ~np.isnan(one.values)
     if (np.diff(t) < 0).any() and all((np.diff(t[known[:, k]]) > 0).all() for k in range(1, known.shape[1])):
@@ -51,9 +53,9 @@ def in_order(one: Recording) -> Recording:
 def completed(
     recordings: Sequence[Recording], columns: Columns, hold: str
 ) -> tuple[list[Recording], tuple[str, ...], str]:
-    """The recordings with all that can be known of their rows, notes on what was made, and the hold of the inputs.
+    """The recordings with interpolated coordinates and filled inputs, notes for the user, and the hold of the inputs.
 
-    A hold that nobody has said is "zero" where most samples of the motion have no input of their own.
+    A hold that neither user nor file gives is "zero" if most samples of the motion have no input of their own.
     """
     q, u = slice(1, 1 + len(columns.q)), slice(len(columns.numeric) - len(columns.u), len(columns.numeric))
     straight, unit, notes = hold in ("first", "smooth"), columns.units[columns.time] or "s", []
@@ -73,10 +75,10 @@ def completed(
 
 
 def _together(one: Recording, q: slice) -> Recording:
-    """The recording with the values of all coordinates in one row.
+    """The recording with the values of all coordinates in the same rows.
 
-    Where most samples of the coordinate with the fewest stand in rows without another one, the others are interpolated
-    at its times, by cubics through their samples beside. Rows of the others stay, and lack the rarest one.
+    If most samples of the rarest coordinate stand in rows without another coordinate, the others are interpolated at
+    the times of the rarest, by cubics through neighbouring samples. Rows without the rarest coordinate stay.
     """
     known = ~np.isnan(one.values[:, q])
     counts = known.sum(0)
@@ -99,10 +101,10 @@ def _between(t: np.ndarray, x: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]:
-    """The recording with its inputs in every row where they can be known, and the longest time that one was held.
+    """The recording with its inputs in every row where the inputs are known, and the longest time of holding.
 
-    Rows before the first sample of an input stay without it, and so do those farther behind its last one than its
-    samples are apart, or behind it at all where it goes in `straight` lines.
+    An input stays unknown before its first sample. Behind the last sample the input is known for the median distance
+    of its samples, or not at all if the input goes in `straight` lines.
     """
     t, values, longest = one.values[:, 0], one.values.copy(), 0.0
     for x in values[:, u].T:
@@ -118,7 +120,7 @@ def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]
 
 
 def _where_blank(names: Sequence[str], straight: bool, longest: float, unit: str) -> str:
-    """What was made of inputs that have no value in some rows."""
+    """The note on inputs that have no value in some rows."""
     some = f"{', '.join(names)} {'has' if len(names) == 1 else 'have'} no value in some rows"
     if straight:
         return f"{some}; straight lines go there from the row before to the row behind"
@@ -129,9 +131,10 @@ def _where_blank(names: Sequence[str], straight: bool, longest: float, unit: str
 
 
 def filled_inputs(data: Trajectories) -> list[str]:
-    """Names of inputs that were recorded at a slower rate and filled in: they change every k-th or (k + 1)-th row.
+    """Names of inputs that were recorded at a slower rate and filled in: they change in every k-th or (k + 1)-th row.
 
-    Clocks that run together make every k-th row alone; steps of a signal's own come after any number of rows.
+    Two clocks that run together give changes in every k-th row alone; a signal that steps by itself changes after any
+    number of rows.
     """
     labels = [name for name, _ in data.input_labels]
     return [name for name, u in zip(labels, [] if data.u is None else data.u.T, strict=True) if _filled_in(data, u)]

@@ -17,7 +17,6 @@ from herglotz.data.degrees import in_told_degrees
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
-from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
@@ -34,20 +33,17 @@ from herglotz.telling import tell
 
 @dataclass(frozen=True)
 class Format:
-    """One kind of file: how to recognise it, and what reads it."""
+    """A kind of file: how to recognise the file, and the function that reads the file."""
 
-    name: str  # as messages say it
+    name: str  # for messages
     suffix: str
     read: Callable[..., Trajectories]
     is_table: bool = False  # whether columns can be chosen
     first_line: Callable[[str], bool] = lambda _: True  # whether the first line can belong to this format
 
 
-# The first format that fits reads the file: a special case of a suffix stands before the general one.
+# The first format that fits reads the file: a special format of a suffix stands before the general format.
 FORMATS = (
-    Format(
-        "IBM double pendulum, six marker columns (.csv)", ".csv", read_ibm_double_pendulum, False, looks_like_markers,
-    ),
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
     Format(
         "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
@@ -74,12 +70,12 @@ def load(
     input_terms: Names | None = None,  # squares, sizes, rates … of inputs that act as well; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
-    sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
-    sensor_scales: Sequence[float] | None = (),  # what one unit of each reading is worth
+    sensor_zeros: Sequence[float] | None = (),  # readings of the sensors at 0; see `herglotz.data.sensors`
+    sensor_scales: Sequence[float] | None = (),  # position for a unit of each reading
     like: Trajectories | None = None,  # another recording: columns of the same names mean the same
     **columns: Any,  # of a table: time, coordinates, inputs, drop and group
 ) -> Trajectories:
-    """Read trajectories from any of `FORMATS`, and say what each column of a table was taken for.
+    """Read trajectories from any of `FORMATS`, and print the role of each column of a table.
 
     Parameters
     ----------
@@ -89,15 +85,15 @@ def load(
     angles
         Coordinates that are angles; True for all; left out: those in rad or deg; () for none.
     degrees
-        Coordinates in degrees whose header does not say so; left out: those without a unit whose name is that of an
-        angle and whose motion cannot be one in rad, with a warning; () for none.
+        Coordinates in degrees whose header gives no unit; () for none. Left out: columns without a unit that have the
+        name of an angle and move too far between samples for an angle in rad, with a warning.
     polar
         Pairs of positions that become one angle each (`herglotz.data.polar`): "x,y" of a body on a circle, or
         ["x1,y1", "x2,y2"] of a chain, the second body on the first; "x,y,X,Y" with the centre in numbers or columns;
         "x,-y" where y grows downwards. Left out: as in `like`; () for none.
     input_terms
-        Terms of inputs that act beside them (`herglotz.data.input_terms`): "V^2", "|V|", "V'", "sat(V/2)", "tanh(V/2)".
-        Left out: as in `like`.
+        Further inputs made of the recorded ones (`herglotz.data.input_terms`): "V^2", "|V|", "V'", "sat(V/2)",
+        "tanh(V/2)". Left out: as in `like`.
     unwrap
         Make angles continuous.
     show
@@ -106,12 +102,12 @@ def load(
         Positions are scale · (reading − zero), both in the file's units: n numbers each, or n for each recording of the
         file, one recording after the other; after what the file itself says.
     like
-        Another recording, such as `run.data`: columns of a table that have the names of its columns are taken for the
-        same, in the same order, and its angles are angles, where nothing else is said.
+        Another recording, such as `run.data`: columns of the same name have the same role, in the same order, and the
+        same coordinates are angles, unless another argument says otherwise.
     **columns
         Of a table: time, coordinates, inputs, drop and group, each by column names; left out, the header decides.
-        hold="zero", "first" or "smooth": what inputs do between samples, whatever the file says. motion=False where
-        inputs alone are needed.
+        hold="zero", "first" or "smooth": the hold of the inputs between samples, which overrules the file's.
+        motion=False if inputs alone are needed.
 
     Returns
     -------
@@ -121,8 +117,8 @@ def load(
     Raises
     ------
     InputError
-        If the format is not known (the message lists those that are), a coordinate of a table that nobody named moves
-        in jumps alone, or from the reader of that format.
+        If the format is not known (the message lists the known formats), or a coordinate that the user did not name
+        moves in jumps alone; and as the reader of the format does.
     """
     columns.setdefault("known", () if like is None else like.columns)
     wanted = Wanted(**columns, positions=named_by(polar))
@@ -184,9 +180,9 @@ def save(path: PathLike, trajectories: Trajectories) -> None:
     Parameters
     ----------
     path
-        The file; one that is there is overwritten.
+        The file; an existing file is overwritten.
     trajectories
-        What is written: times, positions, and s, p, u where there are any, with their units.
+        The set: times, positions, and s, p, u if the set has these, with their units.
 
     Raises
     ------
@@ -220,7 +216,7 @@ def _files(path: Path) -> list[Path]:
 def _usable(
     path: Path, files: Sequence[Path], wanted: Wanted
 ) -> tuple[list[Path], list[Trajectories], tuple[str, ...]]:
-    """The files that hold a recording, what they hold, and a warning of those whose recording is too short."""
+    """The files that hold a recording, their recordings, and a warning of files whose recording is too short."""
     kept: list[Path] = []
     sets: list[Trajectories] = []
     wrong: list[Unusable] = []
@@ -246,7 +242,7 @@ def _is_prose(file: Path) -> bool:
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
-    """One set of all; a note that not every file has begins with the name of its file, and so does what differs."""
+    """The joined set; notes that only some files have, and errors about differences, begin with the file's name."""
     for file, one in zip(files[1:], sets[1:], strict=True):
         try:
             check_alike([sets[0], one])

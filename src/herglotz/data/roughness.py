@@ -1,4 +1,4 @@
-"""What recordings tell without a model: an upper bound on their noise, and how few samples tell the motion."""
+"""Estimates without a model: an upper bound on the noise of recordings, and how few samples show the motion."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> T
 
 
 def precision(data: Trajectories) -> float:
-    """Standard deviation of the noise of q as the data show it without a model; an upper bound where they are coarse.
+    """Standard deviation of the noise of q, estimated without a model; an upper bound for coarse data.
 
-    inf where no trajectory has nine samples.
+    inf if no trajectory has nine samples.
     """
     return min(roughness(data, degree) for degree in DEGREES)
 
@@ -93,8 +93,8 @@ def precisions(data: Trajectories) -> Tensor:
 def part_of(data: Trajectories, most: int) -> Trajectories:
     """About `most` samples of more than twice as many: every second, fourth … one while these follow the motion.
 
-    What is left over is cut to the runs of samples that move most. The data themselves where they have no more. Samples
-    that lack positions are the first to go: every m-th row may be none of those that a slower sensor has read.
+    The result is cut to the runs of samples that move most. Data with no more than `most` samples stay unchanged.
+    Samples that lack positions are left out first: every m-th row may miss all rows of a slower sensor.
     """
     few = data if data.samples < 2 * most else complete(data)
     while few.samples >= 2 * most and min(few.lengths) >= 2 * most / len(few) and not coarse(half := few.thinned(2)):

@@ -11,7 +11,7 @@ from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.errors import InputError
 
 SHOWN = 40  # characters of a bad cell that a message quotes
-MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # what programs write where a value is missing
+MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # cells of programs for a missing value
 
 
 class Unusable(InputError):
@@ -52,7 +52,7 @@ def group_rows(
     rows: Sequence[int],  # line of the file, from 1, of each sample
     labels: Sequence[str],  # trajectory of each sample; "" when the file has one
     t: Sequence[float],  # time of each sample
-    columns: tuple[str, str] = ("trajectory", "t"),  # what the file calls label and time
+    columns: tuple[str, str] = ("trajectory", "t"),  # names of label and time in the file
 ) -> list[list[int]]:
     """Return the sample numbers of each trajectory, in order of first appearance.
 

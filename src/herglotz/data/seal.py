@@ -1,7 +1,7 @@
-"""The seal of a file: it ends with the sha256 of all bytes before it, in a place that its format leaves free.
+"""The seal of a file: the file ends with the sha256 of all bytes before, in a place that the format leaves free.
 
-A seal finds damage and careless changes, not malice: who changes a file on purpose can seal it again. `SECURITY.md`
-says what that means for files from strangers.
+A seal finds damage and careless changes, not malice: whoever changes a file on purpose can seal the file again.
+`SECURITY.md` says what that means for files from strangers.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TEXT = (b"/* sha256 of all above: ", b" */\n")
 def sealed_zip(content: bytes) -> bytes:
     """A zip archive (`.pt2`, `.pt`, `.npz`) whose comment is the hash.
 
-    Raise ValueError if the archive has a comment already: its writer is not one of ours.
+    Raise ValueError if the archive has a comment already: another program wrote the archive.
     """
     if content[-22:-18] != b"PK\5\6" or content[-2:] != EMPTY_ZIP_COMMENT:
         raise ValueError("not a zip archive without a comment")
@@ -36,19 +36,19 @@ def sealed_onnx(content: bytes) -> bytes:
 
 
 def sealed_text(content: str) -> str:
-    """A C header whose last line is the hash, whatever its line ends become."""
+    """A C header whose last line is the hash, independent of line ends."""
     return sealed_bytes(content.encode() + TEXT[0], TEXT[1]).decode()
 
 
 def sealed_bytes(content: bytes, tail: bytes = b"") -> bytes:
-    """A file whose format ignores what follows it, such as a shared library: the content, its hash, and the tail."""
+    """A file whose format ignores trailing bytes, such as a shared library: the content, its hash, and the tail."""
     return content + hashlib.sha256(content).hexdigest().encode() + tail
 
 
 def check_seal(content: bytes, path: PathLike, remedy: str = "export the model again", text: bool = False) -> None:
-    """Refuse a file that is not what was written.
+    """Raise InputError for a changed file.
 
-    Raise InputError if the hash is missing (the file is cut, or older than seals), or is not that of the file.
+    The hash is missing (the file is cut, or older than seals), or differs from the hash of the file.
     """
     if text:
         content = content.replace(b"\r\n", b"\n").removesuffix(TEXT[1])

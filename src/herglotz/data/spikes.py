@@ -8,28 +8,28 @@ from torch import Tensor
 from herglotz.data.trajectories import Trajectories
 from herglotz.least_squares import least_squares
 
-# A sample is compared with the polynomial of degree 3 through its four neighbours on either side.
+# A sample is compared with the polynomial of degree 3 through four neighbours on either side.
 BESIDE, DEGREE = 4, 3
 # A spike departs from that polynomial by more than all of these; tests/unit/data/test_spikes.py measures that nothing
 # is left out of smooth motion, with noise or without.
-LOCAL = 6.0  # times the RMS residual of its neighbours
+LOCAL = 6.0  # times the RMS residual of the neighbours
 NOISE = 8.0  # times the noise of the whole trajectory
 SIZE = 0.01  # times the standard deviation of the motion: quantisation is no gross error
 RESOLVED = 0.1  # times the standard deviation of the motion: above, sampling is too coarse to judge
 PASSES = 10  # the worst spikes are removed and the rest is judged anew, at most this often
 STUCK = 4  # equal readings behind the first, beyond the runs below
-LEAP = 2.0  # times the fastest step: two of them in one
+LEAP = 2.0  # times the fastest step: two steps in one
 RUNS = (1, 2, 3)  # numbers of wrong samples in a row that are looked for
 
 
 def spikes(data: Trajectories) -> Tensor:
-    """Return which samples are spikes, (N,) bool; none of the first or last four of a trajectory is one.
+    """Return which samples are spikes, (N,) bool; never the first or last four of a trajectory.
 
-    A sample (or a run of two or three) is compared with the cubic in time through its eight neighbours (deleted
-    residuals, Cook & Weisberg 1982). A spike exceeds the misfit of its neighbours, so that fast smooth motion is kept,
-    and the noise. The worst spikes are removed and the rest is judged anew, until none is left. Spikes within four
-    samples of one another may hide each other; a robust loss serves those. Angles should be `unwrapped()`. Readings
-    that stand still while the motion goes on (`_stuck`) are left out, too.
+    A sample (or a run of two or three) is compared with the cubic in time through eight neighbours (deleted residuals,
+    Cook & Weisberg 1982). A spike exceeds the misfit of the neighbours, so that fast smooth motion is kept, and the
+    noise. The worst spikes are removed and the rest is judged anew, until none is left. Spikes within four samples of
+    each other may be overlooked; for these use a robust loss. Angles should be `unwrapped()`. Readings that stand still
+    while the motion goes on (`_stuck`) are left out, too.
     """
     found = _stuck(data)
     for first, length in zip(data.offsets, data.lengths, strict=True):
@@ -47,11 +47,11 @@ def spikes(data: Trajectories) -> Tensor:
 
 
 def _stuck(data: Trajectories) -> Tensor:
-    """Repeated readings of a sensor that stuck, (N,) bool: equal ones, and behind them a leap to where the motion is.
+    """Repeated readings of a sensor that stuck, (N,) bool: equal readings, then a leap to where the motion is.
 
-    They are `STUCK` at least, and the leap is `LEAP` times as fast as the fastest step between other readings: what
-    friction holds leaves slowly, and a slow motion goes from count to count. A sensor that stands still in half of its
-    steps is not judged.
+    At least `STUCK` readings are equal, and the leap is `LEAP` times as fast as the fastest step between other
+    readings: a body that friction holds leaves slowly, and a slow motion goes from count to count. A sensor that stands
+    still in half of its steps is not judged.
     """
     found = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
     for first, length in zip(data.offsets, data.lengths, strict=True):

@@ -1,4 +1,4 @@
-"""`Trajectories` from the columns of a table, whether a csv file or a DataFrame holds it."""
+"""`Trajectories` from the columns of a table: a csv file or a DataFrame."""
 
 from __future__ import annotations
 
@@ -36,11 +36,10 @@ def from_table(
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
-    A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). One without any is left out,
-    and a note says how many are: the step over them is longer, with the mean of its inputs, which go on between the
-    rows that have them (`herglotz.data.rates`). A trajectory that is too
-    short or whose time does not increase is left out with a warning, as long as most can be used. Raise InputError if
-    they cannot.
+    A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). Rows without any coordinate are
+    left out, and a note gives their number: the step over these rows is longer, with the mean of the inputs
+    (`herglotz.data.rates`). A trajectory that is too short, or whose time does not increase, is left out with a
+    warning. Raise InputError if most trajectories are unusable.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     recordings = _recordings(path, labels, np.asarray(at), values)
@@ -65,7 +64,7 @@ def from_table(
 
 
 def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:
-    """The recordings by time, without stamps that repeat; and what was made of those, once for several recordings."""
+    """The recordings sorted by time without repeated stamps, and notes on these, a single note for equal repairs."""
     made = [without_repeats(in_order(one) if blank else one, unit) for one in recordings]
     notes = [note for _, note in made if note]
     more = f", and so of {len(notes) - 1} more recordings" if len(notes) > 1 else ""
@@ -75,7 +74,7 @@ def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[l
 def _usable(
     path: Path, recordings: list[Recording], check: Callable[[Recording], None]
 ) -> tuple[list[Recording], tuple[str, ...]]:
-    """The recordings that pass a check, and a warning of the others; raise what it says where most do not pass."""
+    """The recordings that pass a check, and a warning of the others; raise the check's error if most do not pass."""
     kept: list[Recording] = []
     wrong: list[Unusable] = []
     for one in recordings:
@@ -134,7 +133,7 @@ def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
 
 
 def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
-    """Where all labels are whole numbers, those of equal value are one trajectory, as in a table of numbers: 1, 01."""
+    """Labels as numbers, if all are whole numbers: 1 and 01 are then the same trajectory, as in a table of numbers."""
     if any("_" in label for label in set(labels)):  # Python reads 1_000 as a number, and numpy does not
         return labels
     try:
@@ -148,7 +147,7 @@ def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
 
 
 def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
-    """The set whose samples are the rows of these recordings; 0 where a value is missing."""
+    """The set of these recordings, a sample a row, with 0 for a missing value."""
     table = np.nan_to_num(np.concatenate([one.values for one in recordings]))
     lengths = tuple(len(one.values) for one in recordings)
     widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
@@ -180,8 +179,8 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording])
 def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("DataFrame")) -> Trajectories:
     """Read a pandas DataFrame (or anything with `columns` and `frame[name]`) like a csv file with that header.
 
-    `where` begins messages. The index of a DataFrame joins the columns, unless it merely counts the rows. InputError
-    names column, row (counted from 0), value and remedy.
+    `where` begins messages. The index of a DataFrame joins the columns, unless the index merely counts the rows.
+    InputError names column, row (counted from 0), value and remedy.
     """
     frame = _with_index(frame)
     raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
@@ -199,7 +198,7 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
 
 
 def _heads(frame: Any, raw: Sequence[np.ndarray], where: Path, wanted: Wanted) -> tuple[list[str], int]:
-    """The header of a frame, and its first row of numbers: 1 behind one of units, as csv files have them."""
+    """The header of a frame, and its first row of numbers: row 1 if row 0 holds units, as in csv files."""
     if (rows := _two_rows(list(frame.columns))) and (named := with_units(*rows, str(where), wanted)):
         return named, 0
     heads = [str(name) for name in frame.columns]
@@ -217,7 +216,7 @@ def _two_rows(names: Sequence[Any]) -> tuple[list[str], list[str]] | None:
 
 
 def _text(x: Any) -> str:
-    """A cell of a table as a csv file has it: a number, whatever its digits, is 0 here, and a missing one is blank."""
+    """The kind of a cell as text: "0" for any number, blank for a missing value, and other text unchanged."""
     return x if isinstance(x, str) else "" if x is None or x != x else "0"
 
 
@@ -228,9 +227,9 @@ def in_dates(found: Trajectories, told: str = "date") -> Trajectories:
 
 
 def plain(x: Any, what: str = "numbers") -> np.ndarray:
-    """Values as an array, those that are masked or pandas' NA as NaN; messages call them `what`.
+    """Values as an array, with NaN for masked values and pandas' NA; messages call the values `what`.
 
-    Raise InputError if they are complex.
+    Raise InputError if the values are complex.
     """
     array = np.ma.filled(x.astype(np.float64), np.nan) if isinstance(x, np.ma.MaskedArray) else np.asarray(x)
     refuse({f"{what} are complex; give their real parts, x.real": np.iscomplexobj(array)})
@@ -241,7 +240,7 @@ def plain(x: Any, what: str = "numbers") -> np.ndarray:
 
 
 def seconds(column: np.ndarray) -> np.ndarray:
-    """Times in seconds, since the first one where they are dates; the column itself where it holds neither.
+    """Times in seconds: of dates since the first date, of durations their length; any other column unchanged.
 
     Raise InputError if some dates have a time zone and others have none.
     """
@@ -259,7 +258,7 @@ def seconds(column: np.ndarray) -> np.ndarray:
 
 
 def _with_index(frame: Any) -> Any:
-    """A DataFrame with its index as columns: a named one by its name, an unnamed one of dates or floats as the time."""
+    """A DataFrame with its index as columns: a named index by its name, unnamed dates or floats as the time."""
     index = getattr(frame, "index", None)
     if index is None or not hasattr(frame, "reset_index"):
         return frame
@@ -270,7 +269,7 @@ def _with_index(frame: Any) -> Any:
 
 
 def moment(text: str) -> datetime | None:
-    """A date with time in ISO 8601, such as 2026-03-01 12:00:00.25, or 12:00:00.25 of one day; None for other text."""
+    """A date with time in ISO 8601, such as 2026-03-01 12:00:00.25, or a time of day, 12:00:00.25; else None."""
     for read in (datetime.fromisoformat, lambda x: datetime.combine(datetime.min, time.fromisoformat(x))):
         with suppress(ValueError):
             return read(text.strip())
@@ -283,7 +282,7 @@ def _called(columns: Columns) -> tuple[str, str]:
 
 
 def _numbers(where: Path, name: str, column: np.ndarray, known: bool, first: int) -> np.ndarray:
-    """A column, whose rows count from `first`, as float64: finite or, unless it must be known, NaN."""
+    """A column, whose rows count from `first`, as float64: finite numbers, and NaN if missing values are allowed."""
     try:
         found = column.astype(np.float64)
     except (TypeError, ValueError):
@@ -300,7 +299,7 @@ def _numbers(where: Path, name: str, column: np.ndarray, known: bool, first: int
 
 
 def _is_float(cell: np.ndarray) -> bool:
-    """Whether numpy makes a float of a column of one cell, as of None."""
+    """Whether numpy converts a column of this single cell, such as None, to a float."""
     try:
         return cell.astype(np.float64).size == 1
     except (TypeError, ValueError):

@@ -18,7 +18,7 @@ from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.missing import interpolated, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
-from herglotz.errors import InputError, refuse
+from herglotz.errors import InputError, check_coordinates, refuse
 
 TAKEN_FOR_DEGREES = "taken for deg"  # in the place of a unit that the header had not, or had wrong
 DEGREES = ("deg", "°", "degree", "degrees", TAKEN_FOR_DEGREES)
@@ -28,7 +28,7 @@ IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectories:
-    """B trajectories of n coordinates, stored one after the other; N samples in all. `of` fills in what is left out.
+    """B trajectories of n coordinates, stored one after the other; N samples in all. `of` fills in defaults.
 
     Construction checks: finite values, increasing time, three samples each, shapes, one floating dtype.
 
@@ -42,10 +42,9 @@ class Trajectories:
     observed
         (N, n) dimensionless weight of each position in a fit: 0 where none was read and q interpolates; None: 1.
     time_unit, source, columns, notes
-        Of t; origin, for messages; name, role and unit of each column that was read, and what else was made of them.
+        Of t; origin, for messages; name, role and unit of each column that was read; notes on the reading.
     hold, delay, lag
-        What u does between samples, and the delay and the time constant with which it acts, in the
-        unit of t; 0: u is what acts.
+        The input between samples; the delay and the time constant of the actuator, in the unit of t; 0: u itself acts.
 
     Raises
     ------
@@ -58,17 +57,17 @@ class Trajectories:
     lengths: tuple[int, ...]  # samples of each trajectory, adding up to N
     names: tuple[str, ...]  # of the coordinates
     units: tuple[str, ...]  # "rad", "m", "pixel", "1", ...
-    angles: tuple[bool, ...]  # a coordinate that is 2π-periodic; its unit is "rad"
+    angles: tuple[bool, ...]  # a coordinate that is 2π-periodic, in "rad"
     s: Tensor | None = None  # (N,) action variable, where known
     p: Tensor | None = None  # (N, n) momentum, where known
     u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
     time_unit: str = "s"
     source: str = ""  # file or scene of origin, for messages
-    hold: str = ""  # what u does between samples (`herglotz.data.holds`); "": not said
+    hold: str = ""  # the input between samples (`herglotz.data.holds`); "": not said
     delay: float | None = None  # with which u acts (`herglotz.data.actuator`); None: not said
     lag: float | None = None  # time constant of the actuator; None: not said
-    columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
-    notes: tuple[str, ...] = ()  # on reading the table: its separators, rows left out
+    columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as read
+    notes: tuple[str, ...] = ()  # on reading the table: separators, rows left out
     v: Tensor | None = None  # (N, n) velocity, of a model: recorded ones are not read
     observed: Tensor | None = None  # (N, n) 0 where a position is missing, else 1; None: none is
 
@@ -98,10 +97,10 @@ class Trajectories:
         lag: float | None = None,
         columns: tuple[tuple[str, str, str], ...] = (),
     ) -> Trajectories:
-        """Build a set from tensors, arrays or lists, filling in what is left out.
+        """Build a set from tensors, arrays or lists, with defaults for the rest.
 
         Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v`, `u` and `observed` (N,) become (N, 1).
-        Left out: one trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
+        Defaults: a single trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
         columns_of = (("p", p), ("u", u), ("v", v), ("observed", observed))
         own_p, own_u, own_v, own = (as_columns(name, x) for name, x in columns_of)
@@ -160,22 +159,22 @@ class Trajectories:
 
     @property
     def degrees(self) -> tuple[str, ...]:
-        """Coordinates that the table had in degrees: they are rad here, and reported in degrees too."""
+        """Coordinates that the table had in degrees: in rad here, and reported in degrees too."""
         return tuple(name for name, _, unit in self.columns if unit in DEGREES and name in self.names)
 
     @property
     def input_labels(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of each column of u, as the table had them; u, or u1, u2, ..., where no table was read."""
+        """Name and unit of each column of u, as in the table; u, or u1, u2, ..., if no table was read."""
         m = 0 if self.u is None else self.u.shape[1]
         found = tuple((name, unit) for name, role, unit in self.columns if role in ("input", INPUT_TERM))
         return found if len(found) == m else tuple(("u" if m == 1 else f"u{j + 1}", "") for j in range(m))
 
     @cached_property
     def balance(self) -> Tensor:
-        """(n,) size of the motion of each kind of coordinate over the largest: 1 where all have one unit.
+        """(n,) size of the motion of each kind of coordinate over the largest: 1 if all have the same unit.
 
-        Errors over it can be added up and compared: metres and radians cannot. Coordinates of one unit are measured
-        alike, and keep their differences.
+        Errors over the balance can be added up and compared: metres and radians cannot. Coordinates of the same unit
+        share a balance, and keep their differences.
         """
         kinds = list(zip(self.units, self.angles, strict=True))
         moved = (self.q - self.q[0]).std(0, correction=0)
@@ -184,18 +183,18 @@ class Trajectories:
         return torch.where(torch.isfinite(size) & (size > 0), size, 1.0)
 
     def steps(self) -> Steps:
-        """Return all N - B steps, with their trajectory and the row they start from."""
+        """Return all N - B steps, each with the trajectory and the row of its start."""
         index = (self.trajectory[1:] == self.trajectory[:-1]).nonzero()[:, 0]
         return Steps(self.t[index + 1] - self.t[index], self.trajectory[index], index)
 
     def inputs_of_steps(self, row: Tensor | None = None, part: Tensor | None = None) -> Tensor | None:
-        """Return the input of each step as `hold` has it between samples; None without inputs.
+        """Return the input of each step, between samples by `hold`; None without inputs.
 
         Parameters
         ----------
         row, part
             (...) sample at which a recorded step starts and where in the step, from 0 to 1; default the middle of the
-            step at every sample, (N, m). At the last sample of a trajectory it is u itself, which acts on no step.
+            step at every sample, (N, m). The last sample of a trajectory, where no step starts, has u itself.
         """
         if self.u is None:
             return None
@@ -205,7 +204,7 @@ class Trajectories:
 
     @property
     def arrival(self) -> Arrival:
-        """What the recording says of its inputs."""
+        """Hold, delay and lag of the inputs, as recorded."""
         return Arrival(self.hold, self.delay, self.lag)
 
     def triples(self, max_step: float | None = None) -> Triples:
@@ -232,7 +231,7 @@ class Trajectories:
         return int((self.steps().h > GAP * self.typical_step).sum())
 
     def split_time(self, fraction: float) -> tuple[Trajectories, Trajectories]:
-        """Cut every trajectory in time: its first `round(fraction * length)` samples train, the others test."""
+        """Cut every trajectory in time: the first `round(fraction * length)` samples train, the others test."""
         (train, train_lengths), (test, test_lengths) = time_split(self.lengths, fraction, self.source)
         device = self.t.device
         return self.rows(train.to(device), train_lengths), self.rows(test.to(device), test_lengths)
@@ -243,9 +242,9 @@ class Trajectories:
         return self if len(rows) == self.samples else self.rows(rows.to(self.t.device), lengths)
 
     def thinned(self, every: int) -> Trajectories:
-        """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the steps they then span.
+        """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the longer steps.
 
-        Where positions are missing, samples that have all of them are counted, and the first of each trajectory.
+        If positions are missing, only complete samples and the first of each trajectory are counted.
 
         Raises
         ------
@@ -258,10 +257,10 @@ class Trajectories:
         return self.keep(kept.masked_scatter(kept, every_mth(counts, every).to(kept.device)))
 
     def keep(self, kept: Tensor) -> Trajectories:
-        """Return these samples alone, (N,) bool; steps become longer where samples between them are left out.
+        """Return these samples alone, (N,) bool; steps become longer where samples between are left out.
 
-        A longer step takes the mean of the inputs in it, weighted by their time. The first sample of every trajectory
-        must be kept. Inputs are those of steps from then on: their hold, if one is known, is "zero".
+        A longer step takes the mean of its inputs, weighted by duration. The first sample of every trajectory
+        must be kept. Inputs then belong to steps: the hold, if known, is "zero".
         """
         if bool(kept.all()):
             return self
@@ -316,9 +315,7 @@ class Trajectories:
     def with_angles(self, angles: str | Iterable[str]) -> Trajectories:
         """Return the set with exactly these coordinates marked as angles; a unit "1" among them becomes "rad"."""
         wanted = (angles,) if isinstance(angles, str) else tuple(angles)
-        where = self.source or "trajectories"
-        wrong = [name for name in wanted if name not in self.names]
-        refuse({f"{where}: angles names {name!r}, but the coordinates are {self.names}": name for name in wrong})
+        check_coordinates(self.source, "angles", wanted, self.names)
         flags = tuple(name in wanted for name in self.names)
         units = tuple("rad" if a and unit == "1" else unit for a, unit in zip(flags, self.units, strict=True))
         return replace(self, angles=flags, units=units)
@@ -335,11 +332,11 @@ class Trajectories:
         return sha.hexdigest()
 
     def summary(self) -> str:
-        """Return one line for people."""
+        """Return a line for people."""
         return summary_of(self)
 
     def table(self) -> str:
-        """Return what every column of the table that was read was taken for, a line each, for people."""
+        """Return the role of every column of the table that was read, a line each, for people."""
         return column_table(self)
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:

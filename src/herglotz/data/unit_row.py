@@ -18,8 +18,8 @@ def with_units(
 ) -> list[str] | None:
     """Header cells `name[unit]` with the units of the row below; None where that row holds none.
 
-    It holds units where no cell is a number, and the time is in a unit of time: no sample has that. Raise InputError if
-    a name has one unit in the header and another below, or as `herglotz.data.csv_columns.assign`.
+    The row holds units if no cell is a number, and the cell of the time is a unit of time. Raise InputError if a name
+    has different units in the header and below, or as `herglotz.data.csv_columns.assign`.
     """
     units = [_bare(cell) for cell in below]
     if len(units) != len(cells) or not {"s", *PER_SECOND}.intersection(units) or any(map(_is_sample, units)):
@@ -34,7 +34,7 @@ def with_units(
 
 
 def refuse_unknown(columns: Columns, below: Sequence[str], where: str) -> None:
-    """Raise where the first row would be one of units, if its unit of time were known: no cell is a number."""
+    """Raise if the first row looks like a row of units with an unknown unit of time: no cell is a number."""
     cell, name = below[columns.time], columns.names[columns.time]
     text = _bare(cell).isalpha() and cell.casefold() not in MISSING and not any(map(_is_sample, below))
     known = ", ".join(["s", *filter(str.isascii, PER_SECOND)])
@@ -48,5 +48,5 @@ def _bare(cell: str) -> str:
 
 
 def _is_sample(unit: str) -> bool:
-    """Whether a cell is a number, which 1 need not be: it is the unit of plain numbers."""
+    """Whether a cell is a number; 1 may be the unit of plain numbers instead."""
     return is_number(unit) and unit != "1"

@@ -44,9 +44,9 @@ def in_seconds(data: Trajectories) -> Trajectories:
 
 
 def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
-    """Return the set with these coordinates in deg, for a table to be read by people (`load` converts them back).
+    """Return the set with these coordinates in deg, for a table for people (`load` converts degrees to radians).
 
-    Momenta stay those of radians.
+    Momenta stay conjugate to radians.
     """
     turned = [name in names and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
     factor = data.q.new_tensor([180 / math.pi if x else 1.0 for x in turned])
@@ -60,7 +60,7 @@ def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
 
 
 def as_recorded(data: Trajectories) -> tuple[Trajectories, Tensor]:
-    """The set in deg where the table had degrees, for figures, and how many such units one of the fit's is, (n,)."""
+    """The set in deg where the table had degrees, for figures, and the factor from rad to that unit, (n,)."""
     turned = [180 / math.pi if name in data.degrees and unit == "rad" else 1.0
               for name, unit in zip(data.names, data.units, strict=True)]  # fmt: skip
     return in_degrees(data, data.degrees), data.q.new_tensor(turned)
@@ -72,7 +72,7 @@ def common_unit(units: Sequence[str]) -> str:
 
 
 def size(value: float, unit: str, degrees: bool = False, digits: int = 3) -> str:
-    """A length or an angle in words: `0.0021 rad = 0.12 deg` where it was recorded in degrees."""
+    """A length or an angle in words: `0.0021 rad = 0.12 deg` for a coordinate that was recorded in degrees."""
     also = f" = {math.degrees(value):.3g} deg" if degrees and unit == "rad" else ""
     return f"{value:.{digits}g} {unit}".removesuffix(" 1").rstrip() + also
 

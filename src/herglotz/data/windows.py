@@ -1,6 +1,6 @@
 """Windows on a concatenation of trajectories: steps, three-sample windows and continuous angles.
 
-`trajectory` (N,) says which trajectory each row belongs to; no window joins two of them.
+`trajectory` (N,) says which trajectory each row belongs to; no window joins two trajectories.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Triples:
-    """All windows of three consecutive samples of one trajectory; one discrete Herglotz residual joins three."""
+    """All windows of three consecutive samples of a trajectory, which a discrete Herglotz residual joins."""
 
     q0: Tensor  # (T, n) positions q_{k−1}, q_k, q_{k+1}
     q1: Tensor  # (T, n)
@@ -71,11 +71,11 @@ def unwrap(
     trajectory: Tensor,  # (N,) long
     angles: Tensor,  # (n,) bool, the columns to make continuous
 ) -> Tensor:
-    """Remove the multiple of 2π from every jump longer than π; each trajectory keeps its first value.
+    """Remove the multiple of 2π from every jump longer than π; each trajectory keeps the first value.
 
-    A sample between both ends of a jump, as a resampled or filtered angle has it, leaves two steps of less than π. Such
-    a turn is removed where the motion on either side of the sample says so. A sensor that wraps leaps by its range, or
-    by half of it twice: where no step is longer than a quarter of the range, all turns were counted.
+    A sample between both ends of a jump, as in a resampled or filtered angle, leaves two steps of less than π. The turn
+    is removed if the motion on either side of the sample goes on after removal. A sensor that wraps leaps by the range,
+    or twice by half the range: if no step is longer than a quarter of the range, all turns were counted.
     """
     inside = (trajectory[1:] == trajectory[:-1])[:, None] & angles
     inside &= _wraps(q, trajectory)[trajectory[1:]]
@@ -88,7 +88,7 @@ def unwrap(
 
 
 def _wraps(q: Tensor, trajectory: Tensor) -> Tensor:
-    """Whether each trajectory has a step of a quarter of its range, (B, n)."""
+    """Whether each trajectory has a step of a quarter of the range, (B, n)."""
     rows = trajectory[:, None].expand_as(q)
     empty = q.new_zeros(int(trajectory[-1]) + 1, q.shape[1])
     high, low = (empty.scatter_reduce(0, rows, q, how, include_self=False) for how in ("amax", "amin"))
@@ -97,15 +97,15 @@ def _wraps(q: Tensor, trajectory: Tensor) -> Tensor:
 
 
 def _divided_turns(q: Tensor, trajectory: Tensor) -> Tensor:
-    """Turns that a step and the next one make together, (N, n), at the end of the second step.
+    """Turns that a step and the next make together, (N, n), at the end of the second step.
 
-    Across one sample the motion goes as far as in the step before and the step behind; what it departs from that by is
-    whole turns. The steps on either side of these two agree, so that a wrong sample there is no turn.
+    Across a sample the motion goes as far as in the step before and the step behind; the difference is whole turns. The
+    steps on either side of these two agree, so that a wrong sample there is no turn.
     """
     turns, step = torch.zeros_like(q), q.diff(dim=0)
     if len(q) < 7:
         return turns
-    before, behind = step[:-5], step[5:]  # with the steps next to them: the motion on either side of five samples
+    before, behind = step[:-5], step[5:]  # with the neighbouring steps: the motion on either side of five samples
     near, far = step[1:-4], step[4:-1]
     across = q[4:-2] - q[2:-4]
     found = torch.round((across - near - far) / (2 * torch.pi))

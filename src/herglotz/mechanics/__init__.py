@@ -1,4 +1,4 @@
-"""What learning and stepping need of every discrete contact Lagrangian: derivatives, momenta, regularity."""
+"""Derivatives, momenta and regularity of every discrete contact Lagrangian, for learning and stepping."""
 
 from herglotz.mechanics.contact import (
     contact_defect as contact_defect,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.func import vjp
 
+from herglotz.mechanics.contact import split
 from herglotz.mechanics.partials import DiscreteLagrangian, Forced, Forces, Partials, called, checked
 
 
@@ -37,16 +38,12 @@ def functional_partials(
     n = q0.shape[-1]
     if order == 1:
         D, L = first(*xs)
-        return Partials(L, *_split(D, n), force=force)
+        return Partials(L, *split(D), force=force)
     D, by, L = _rows(first, xs)
     return Partials(
-        L, *_split(D, n), by[0][..., :n, :], by[1][..., :n, :], by[1][..., n : 2 * n, :], by[2][..., :n],
+        L, *split(D), by[0][..., :n, :], by[1][..., :n, :], by[1][..., n : 2 * n, :], by[2][..., :n],
         by[2][..., n : 2 * n], by[2][..., 2 * n], force,
     )  # fmt: skip
-
-
-def _split(D: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    return D[..., :n], D[..., n : 2 * n], D[..., 2 * n]
 
 
 def _rows(function: Callable[..., tuple[Tensor, Any]], xs: tuple[Tensor, ...]) -> tuple[Tensor, list[Tensor], Any]:

@@ -1,7 +1,7 @@
-"""Newton's iteration with backtracking, batched: the one loop for every equation of this package.
+"""Newton's iteration with backtracking, batched: the only such loop, for every equation of this package.
 
-Samples do not influence one another: each has its own Jacobian, its own fraction of a step and its own end. One sample
-alone may take the same loop with Python's floats in the place of tensors (...), for small tensors cost the most there.
+Samples do not influence each other: every sample has its own Jacobian, its own fraction of a step and its own end. A
+single sample may take the same loop with Python's floats in place of tensors (...): small tensors cost the most there.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-Jacobian = Any  # a matrix (..., m, m), or what the solver of the rules understands: a tuple of tensors (..., *)
+Jacobian = Any  # a matrix (..., m, m), or a tuple of tensors (..., *) for the solver of the rules
 Solver = Callable[[Jacobian, Tensor], Tensor]  # (J, F) → J⁻¹F, not finite where J is singular
 
 
 class Point(NamedTuple):
-    """An equation at one trial."""
+    """An equation at a trial."""
 
     F: Tensor  # (..., m)
-    J: Jacobian  # ∂F/∂x; None where it was not asked for
-    rest: Any = None  # what the equation wants back at the solution
+    J: Jacobian  # ∂F/∂x; None if the iteration did not ask for ∂F/∂x
+    rest: Any = None  # further results of the equation, returned at the solution
 
 
 class Equation(Protocol):
@@ -37,7 +37,7 @@ class Equation(Protocol):
 # Batches of larger matrices are solved one by one: torch 2.13 hands each to a thread of its own, where the LU
 # decomposition of oneMKL, from 190 rows on, never ends or says that a parameter of its own was wrong.
 AT_ONCE = 128
-Number = Any  # (...) a number a sample; a float of one sample that is `alone`
+Number = Any  # (...) a number for each sample; a float for a sample that is `alone`
 # The size of the unknown and the size below which a move is rounding, from x, the first point and |J⁻¹F|.
 Sizes = Callable[[Tensor, Point, Number], tuple[Number, Number]]
 
@@ -85,16 +85,16 @@ def _eliminate(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def attached(x: Tensor, J: Tensor, F: Tensor) -> Tensor:
-    """A solved x with its derivative: one Newton step, zero in value and dx = −J⁻¹ dF in slope; F has the graph."""
+    """A solved x with its derivative: a Newton step of value 0 and slope dx = −J⁻¹ dF; F has the graph."""
     return x - solve(J, F - F.detach())
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How an equation is iterated.
+    """The rules of an iteration.
 
-    A move is accepted where it makes |F| smaller or, with `natural`, where the simplified Newton step J(x)⁻¹F(x + λδ)
-    is shorter than δ; that test does not depend on the units of F. Else it is halved.
+    A move is accepted if |F| falls or, with `natural`, if the simplified Newton step J(x)⁻¹F(x + λδ) is shorter than δ,
+    a test that does not depend on the units of F. Any other move is halved.
     """
 
     tol: float  # a sample has converged when its next move is below this times its size
@@ -106,7 +106,8 @@ class Rules:
     length: Callable[[Tensor], Tensor] = largest  # of a move
 
 
-NEAR = 1e-3  # of the size of x: nearer than this a Jacobian that is one iteration old converges fast enough
+# Share of the size of x: a move below this converges fast enough with the Jacobian of the last iteration.
+NEAR = 1e-3
 CONTRACTION = 0.05  # an old Jacobian that gains less than this per iteration is replaced
 ARMIJO = 1e-4  # |F| must fall by this share of what a linear equation would lose
 NATURAL = 0.25  # the simplified Newton step by this share
@@ -121,11 +122,11 @@ class Found(NamedTuple):
     residual: Tensor  # (...) |J⁻¹F|
     done: Tensor  # (...) converged, stalled at rounding or given up; without, the iterations ran out
     iterations: int
-    healthy: bool  # one sample that is done, all numbers finite; False where that is not known
+    healthy: bool  # True for a single sample that is done with finite numbers; False if that is not known
     floor: Tensor | float = 0.0  # (...) see `Sizes`
-    J: Jacobian = None  # at x, or the old one that still serves
+    J: Jacobian = None  # at x, or an older Jacobian that still serves
     move: Tensor | None = None  # (..., m) −J⁻¹F, which was not taken any more
-    mixed: bool = False  # the samples' last trials are different ones, and `point` is that of none
+    mixed: bool = False  # the samples' last trials differ, so that `point` belongs to no trial
 
 
 class _Here(NamedTuple):
@@ -140,7 +141,7 @@ class _Here(NamedTuple):
 
 
 def _moved(here: _Here, trial: _Here, accept: Number, refused: bool, alone: bool) -> tuple[_Here, bool]:
-    """The trial of each sample that accepts it, and whether the point is that of no one trial."""
+    """The accepted trial of each sample, and whether samples accepted different trials."""
     if not refused:  # a done sample's trial is its own x: nothing to select
         return trial, False
     if alone:
@@ -152,17 +153,17 @@ def _moved(here: _Here, trial: _Here, accept: Number, refused: bool, alone: bool
 def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: bool = False) -> Found:
     """Iterate from x (..., m), all samples at once.
 
-    One sample may be iterated `alone`, with floats for numbers, by rules that are not `natural` and have no solver.
+    A single sample may be iterated `alone`, with floats for numbers, by rules without `natural` and without a solver.
     """
     here = _evaluate(equation, x, rules, alone)
     scale, floor = sizes(x, here.point, here.residual)
     tiny, near = rules.tol * scale, NEAR * scale
-    # A direction that is not finite can never be followed: such a sample is over, and costs its neighbours nothing.
+    # A direction that is not finite can never be followed: the sample ends, and costs its neighbours nothing.
     going = (here.residual > tiny) & (here.residual < inf)
     fraction: Number = None  # every sample takes full steps
-    slow: Number = False  # samples whose old Jacobian has served its time
-    stale: Number = False  # samples whose move is by an old Jacobian
-    back: Number = False  # samples that such a move misled: they take no step, to get the Jacobian where they are
+    slow: Number = False  # samples whose old Jacobian no longer serves
+    stale: Number = False  # samples whose last move used an old Jacobian
+    back: Number = False  # samples that a stale move misled: these take no step, but a new Jacobian at x
     mixed, iterations = False, 0
     while iterations < rules.max_iterations and _any(going):
         if not rules.natural or _any(here.residual > floor):  # the last digits are not counted
@@ -203,7 +204,7 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
 def _evaluate(
     equation: Equation, x: Tensor, rules: Rules, alone: bool, J: Jacobian = None, fresh: Number = True
 ) -> _Here:
-    """The equation at x, with the Jacobian J in the samples that are not `fresh` where the rules keep it."""
+    """The equation at x; if the rules keep Jacobians, samples that are not `fresh` have J."""
     second = not rules.keep or _any(fresh)
     point = equation(x, second)
     if second:
@@ -215,7 +216,7 @@ def _evaluate(
 
 
 def _next(fraction: Number, accept: Number, natural: bool, like: Number) -> Number:
-    """The fractions of the next move: halves after a refused trial; after an accepted one all, or twice as much."""
+    """The fractions of the next move: half after a refused trial, 1 or twice the fraction after an accepted trial."""
     if isinstance(accept, bool):
         return 1.0 if accept else (fraction or 1.0) / 2
     fraction = torch.ones_like(like) if fraction is None else fraction
@@ -239,7 +240,7 @@ def _not(mask: Number) -> Number:
 
 
 def _found_alone(here: _Here, done: bool, iterations: int) -> Found:
-    """Where one sample ended, its floats as tensors."""
+    """The end of a sample that was iterated alone, its floats as tensors."""
     shape, healthy = here.x.shape[:-1], done and isfinite(here.merit + here.residual)
     merit, residual = here.x.new_full(shape, here.merit), here.x.new_full(shape, here.residual)
     flag = torch.full(shape, done, device=here.x.device)
@@ -247,7 +248,7 @@ def _found_alone(here: _Here, done: bool, iterations: int) -> Found:
 
 
 def newton_step(J: Tensor, F: Tensor) -> tuple[Tensor | float, float, float]:
-    """−J⁻¹F of one sample, not finite where J is singular, |F| and |J⁻¹F|."""
+    """−J⁻¹F of a single sample, not finite if J is singular; |F|; and |J⁻¹F|."""
     n = F.shape[-1]
     if n == 1:
         f, j = F.item(), J.item()
@@ -276,7 +277,7 @@ def _eliminate_numbers(a: float, b: float, c: float, d: float, x: float, y: floa
 
 
 def norm(values: list[float]) -> float:
-    """The largest absolute value, NaN if one is."""
+    """The largest absolute value, NaN if any entry is NaN."""
     return nan if any(v != v for v in values) else max(map(abs, values), default=0.0)
 
 
@@ -287,7 +288,8 @@ def select(mask: Tensor, a: Any, b: Any) -> Any:
     return torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
 
 
-MAX_ITERATIONS = 50  # ends what makes no progress and no mistake
+# Ends an iteration that neither converges nor fails.
+MAX_ITERATIONS = 50
 SHORTEST = 1e-6  # twenty halvings: no direction of descent
 
 
@@ -322,8 +324,8 @@ def find_root(
 ) -> Root:
     """Solve F(x) = 0 from `guess`, without a graph, to rounding; the test of a move is the natural one.
 
-    A sample has converged when it got to rounding, or no nearer from a move below eps^(2/3) of `scale`; one that is
-    singular, not finite or makes no progress is given up.
+    A sample has converged when its residual is rounding, or when a move below eps^(2/3) of `scale` lowers the residual
+    no further. A sample that is singular, not finite or makes no progress is given up.
     """
     eps = torch.finfo(guess.dtype).eps
     tol = 4 * eps if tol is None else tol

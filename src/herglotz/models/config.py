@@ -1,4 +1,4 @@
-"""What a learnable model is made of: its level of the ladder, its terms and their sizes, as plain numbers."""
+"""The settings of a learnable model: level of the ladder, terms and sizes, as plain numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POWERS = {"s^2": 2, "s^3": 3}  # that L may have beside −γ s, by name
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything that is needed to build a model; plain numbers, so that it can be stored as JSON.
+    """Everything that is needed to build a model; plain numbers, which JSON stores.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class ModelConfig:
     correction_width, correction_depth
         Units and layers of the correction N of a step.
     baseline
-        Without it the correction is all of L_d: it is there to show why a baseline is needed (trap 2).
+        Without a baseline the correction is all of L_d, to show why a baseline is needed (trap 2).
     seed, activation
         Of the networks' first weights; one of `herglotz.models.network.ACTIVATIONS`.
     mass_width, mass_depth
@@ -55,7 +55,7 @@ class ModelConfig:
         Number m of inputs; the map to forces, n · m numbers row by row, in units of force (mass 1) over input, left
         out: learned; whether each input has a learned zero.
     features, known
-        What a user guesses of L, with learned coefficients, and what is known of it, as text
+        Guessed terms of L, with learned coefficients, and known terms, as text
         (`herglotz.models.features`).
     alike, diagonal
         One mass for all, and a potential of features alone; or a mass for each, and none between two.
@@ -63,13 +63,13 @@ class ModelConfig:
         Friction of differences of speeds; further friction forces such as "|v1| v1" (`herglotz.models.drag`); both of
         the forced level.
     order
-        Of the rule, 2 or 4; 4 adds what the rule lacks of the exact L_d, from the features (`herglotz.models.order4`).
+        Of the rule, 2 or 4; 4 adds the error term of the rule, from the features (`herglotz.models.order4`).
         Forces stay of order 2.
     terms
         Further parts of V and of the forces, by their names in `herglotz.models.TERMS`.
     translations
-        Symmetries of L_d, named by what moves together ("q1 + q2"): no part of it depends on where these coordinates
-        are, and what is left of the baseline is not learned (`herglotz.models.translations`).
+        Symmetries of L_d, named by the coordinates that move together ("q1 + q2"): no part of L_d depends on where
+        these coordinates are, and the rest of the baseline is not learned (`herglotz.models.translations`).
     absent
         Numbers of the model that are 0 and not learned, as `numbers_of` names them: "potential.tilt[0]".
 

@@ -1,15 +1,15 @@
 """Named friction forces of one joint or between two: |v| v, v³, q² v, and so on, with a learned coefficient each.
 
-The text of one is a product: a power or a wave of a position if any, |v|, and a power of the same speed v. That speed
-is a joint's own, or the one of two joints from one another, which a damper between them brakes:
+The text of a force is a product: a power or a wave of a position (optional), |v|, and a power of the same speed v. The
+speed v is that of a joint, or the relative speed of two joints with a damper between:
 
     |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
     cos(q1) v1     sin(2.5 q2) v1     sin(2.5 v1)     cos(0.8 (v1 - v2))
 
-Dampers that saturate or act on one side are sums of waves of a speed. `load 2` is a constant force on coordinate 2: on
-an angle no potential has it. `|v1|` is what viscous friction has more in one direction than in the other. `|v| v`
-brakes a body that moves in a plane or in space as air does: |v| is the length of the whole velocity. Dry friction
-changes with the position, or with the load that a position puts on a bearing, by
+Dampers that saturate or act on one side are sums of waves of a speed. `load 2` is a constant force on coordinate 2; no
+periodic potential of an angle gives a constant force. `|v1|` is the difference of viscous friction between the two
+directions. `|v| v` is air drag on a body that moves in a plane or in space: |v| is the length of the whole velocity.
+Dry friction changes with the position, or with the load that a position puts on a bearing, by
 
     q1^2 sgn(v1)        cos(q1) sgn(v1)        sin(q2) sgn(v1)
 """
@@ -44,8 +44,8 @@ AIR = "|v| v"
 class DragFeature:
     """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of, which brakes the coordinate `on`, and drives `of`.
 
-    If `dry` q_at^a sgn(v); a `wave`, cos or sin, of rate · q_at stands in the place of its power, or
-    `of_speed` one of rate · v alone.
+    If `dry` q_at^a sgn(v). A `wave`, cos or sin, of rate · q_at replaces the power of q_at; if `of_speed`, the wave of
+    rate · v is the whole feature.
     """
 
     on: int
@@ -62,15 +62,15 @@ class DragFeature:
 
     @property
     def even(self) -> bool:
-        """Whether it is |v|."""
+        """Whether the feature is |v|."""
         return (self.b, self.c) == (1, 0)
 
     def position(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the factor that depends on q_at, and its slope."""
+        """Return the factor that depends on q_at, and the slope."""
         return self._wave(q) if self.wave and not self.of_speed else (_power(q, self.a), _power(q, self.a - 1) * self.a)
 
     def speed(self, v: Tensor, width: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the factor that depends on v, and its slope; dry friction has this width, or is 0."""
+        """Return the factor that depends on v, and the slope; dry friction has this width, or is 0."""
         if self.of_speed:
             return self._wave(v)
         if self.dry:
@@ -82,7 +82,7 @@ class DragFeature:
         return own * _power(v, self.c), slope
 
     def _wave(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the wave of rate · x, and its slope."""
+        """Return the wave of rate · x, and the slope."""
         x = x * self.rate
         value, slope = (x.cos(), -x.sin()) if self.wave == "cos" else (x.sin(), x.cos())
         return value, slope * self.rate
@@ -91,7 +91,7 @@ class DragFeature:
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     """Read the text of a friction force.
 
-    Raise InputError if it is none, or names a coordinate that the model has not.
+    Raise InputError if the text is no friction force, or names a coordinate that the model has not.
     """
     plain = " ".join(text.split())
     if plain == AIR:
@@ -152,7 +152,7 @@ def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) 
 
 
 def _position(text: str, found: dict[str, str | None], on: int, angles: Sequence[bool]) -> tuple[int, int, str, float]:
-    """The number of the coordinate whose position a force depends on, `on` without one, its power, wave and rate."""
+    """The number of the coordinate whose position a force depends on (`on` by default), the power, wave and rate."""
     at, wave, rate = int(found["angle"] or found["q"] or on), found["wave"] or "", float(found["rate"] or 1)
     a = int(found["a"] or 1) if found["q"] else 0
     angle = any(angles[at - 1 : at])
@@ -166,17 +166,17 @@ def _position(text: str, found: dict[str, str | None], on: int, angles: Sequence
 class Drag(nn.Module):
     """f = −Σ_g θ_g e q̄_j^a |v|^b v^c of the speeds v = e·Δ/h, with F⁻ = c (h/2) f and F⁺ = (h/2) f.
 
-    e has a 1 at a joint, and a −1 at another where v is the speed of the two from one another; drag through air is
+    e has a 1 at a joint, and a −1 at a second joint where v is the relative speed of the two; drag through air is
     f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters that start at 0; van der Pol's
-    oscillator has viscous friction of negative sign and one of q² v. What dry friction has beside its constant force is
-    −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; of set-valued friction it is `held`, at q0.
+    oscillator has viscous friction of negative sign and the term q² v. The part of dry friction that depends on the
+    position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; for set-valued friction `held`, at q0.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):
         super().__init__()
         self.features = tuple(features)
         self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
-        eye = torch.eye(dof + 1, dof, dtype=torch.float64)  # its last row is 0: no other joint
+        eye = torch.eye(dof + 1, dof, dtype=torch.float64)  # last row 0: no second joint
         on, of = [f.on for f in features], [f.on if f.air else dof if f.of is None else f.of for f in features]
         self.air, self.dry = ([g for g, f in enumerate(features) if getattr(f, kind)] for kind in ("air", "dry"))
         self.register_buffer("on", eye[on] - eye[of], persistent=False)
@@ -185,7 +185,7 @@ class Drag(nn.Module):
         self.at: Tensor
 
     def held(self, q0: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Return what these terms add to the force of set-valued friction, (..., n), and ∂/∂q0, (..., n, n)."""
+        """Return the part of set-valued friction from these terms, (..., n), and ∂/∂q0, (..., n, n)."""
         if not self.dry:
             return None
         at, x = self.at[self.dry], q0 @ self.at[self.dry].T
@@ -194,7 +194,7 @@ class Drag(nn.Module):
         return value @ self.on[self.dry], self.on[self.dry].T @ (slope[..., None] * at)
 
     def terms(self, q: Tensor, v: Tensor, widths: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return φ_g and its slopes by q̄_j and v, each (..., G); dry terms have these `widths` (n,), or are 0."""
+        """Return φ_g, ∂φ_g/∂q̄_j and ∂φ_g/∂v, each (..., G); dry terms have these `widths` (n,), or are 0."""
         x, y = q @ self.at.T, v @ self.on.T
         columns = []
         for g, f in enumerate(self.features):
@@ -205,7 +205,7 @@ class Drag(nn.Module):
         return value, by_q, by_v
 
     def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces, widths: Tensor | None = None) -> Forces:
-        """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if it has them.
+        """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if `own` has.
 
         `widths` are those of smooth dry friction, (n,).
         """
@@ -218,9 +218,9 @@ class Drag(nn.Module):
         return with_force(own, f, slope, c, h, by_position)
 
     def _through_air(self, v: Tensor) -> tuple[Tensor, Tensor]:
-        """−θ |v| v, (..., n), and its slope −θ (|v| I + v vᵀ/|v|), (..., n, n)."""
+        """−θ |v| v, (..., n), and the slope −θ (|v| I + v vᵀ/|v|), (..., n, n)."""
         theta, eye = self.coefficient[self.air].sum(), torch.eye(v.shape[-1], dtype=v.dtype, device=v.device)
-        # With a derivative at rest; onnxruntime leaves out what is added where its 32 bits are 0.
+        # `tiny` gives a derivative at rest; onnxruntime drops an addend that is 0 in float32.
         size = ((v * v).sum(-1, keepdim=True) + torch.finfo(torch.float32).tiny).sqrt()
         bend = size[..., None] * eye + v[..., None] * (v / size)[..., None, :]
         return -theta * size * v, -theta * bend

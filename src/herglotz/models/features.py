@@ -76,7 +76,7 @@ def revolute(angles: Sequence[bool]) -> list[str]:
 
 
 def lengths(angles: Sequence[bool]) -> list[str]:
-    """What coordinates that are no angles are often made of, by themselves and in pairs.
+    """Frequent features of coordinates that are no angles, singly and in pairs.
 
     Powers 2, 3 and 4 of each difference of two, 3 and 4 of each coordinate. Of two or three coordinates also those
     powers of sums, a potential of the distance r = |q|, and forces across the velocity (a magnetic field, a frame that

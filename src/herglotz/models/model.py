@@ -33,8 +33,8 @@ INSTANT = 2.0**-50
 def numbers_of(model: ContactLagrangian) -> dict[str, tuple[str, int]]:
     """Parameter and entry of every number that a model learns, by its name: `damping.rate`, `friction.viscous[1]`.
 
-    They stand in the order of the parameters. The baseline's springs and tilts have one name at both orders of the
-    rule: at order 4 they are the first features, −k and b of an angle and k/2 and b of a length.
+    The numbers stand in the order of the parameters. The baseline's springs and tilts have the same names at both
+    orders of the rule: at order 4 these are the first features, −k and b of an angle, k/2 and b of a length.
     """
     own, n = baseline_is_named(model.config), model.config.dof
     found = {}
@@ -52,14 +52,14 @@ def numbers_of(model: ContactLagrangian) -> dict[str, tuple[str, int]]:
 
 @dataclass(frozen=True)
 class Terms:
-    """The jets a model is made of at one set of points, for reports and tests; None for what it has not."""
+    """The jets of a model's terms at a set of points, for reports and tests; None for a term that the model lacks."""
 
     g: Tensor | Jet | None
     K: Jet | None
     V0: Jet | None
     V1: Jet | None
     N: Jet | None
-    b: Jet | None  # what the units of the full level read of q̄ and v
+    b: Jet | None  # inputs of the full level's units, made of q̄ and v
 
 
 class ContactLagrangian(nn.Module):
@@ -76,13 +76,13 @@ class ContactLagrangian(nn.Module):
     Every step h is allowed, and may differ from sample to sample.
 
     Positions do not determine L_d (gauge): s′ = f(q, s) gives the same motion. The mass's first entry is fixed at 1,
-    which leaves s′ = s + b(q) — within the span of the terms — and a constant shift of s. Only the priors hold those.
+    which leaves s′ = s + b(q) — within the span of the terms — and a constant shift of s. Only priors fix these two.
     Source: traps 2, 3 and 4 of `docs/mathematics.md`.
 
     Parameters
     ----------
     config
-        Which terms, their sizes and their starting values.
+        The terms, their sizes and their starting values.
     """
 
     def __init__(self, config: ModelConfig):
@@ -102,7 +102,7 @@ class ContactLagrangian(nn.Module):
         self._leave_out(c.absent)
 
     def _leave_out(self, absent: Sequence[str]) -> None:
-        """Set these numbers to 0, where they stay: `herglotz.training.parameter_vector` leaves them out of a fit."""
+        """Fix these numbers at 0: `herglotz.training.parameter_vector` leaves fixed numbers out of a fit."""
         known = numbers_of(self)
         for name in absent:
             if name not in known:
@@ -118,7 +118,7 @@ class ContactLagrangian(nn.Module):
 
     @property
     def forces_between(self) -> list[Term]:
-        """The terms whose force may depend on every velocity."""
+        """The terms with a force that may depend on every velocity."""
         known = [] if self.coupling is None else [self.coupling]
         return known + [term for term in self.named_terms if term.has_force()]
 
@@ -134,17 +134,17 @@ class ContactLagrangian(nn.Module):
 
     @property
     def s_enters_motion(self) -> bool:
-        """Whether the positions depend on s at all (they do at the affine and full levels)."""
+        """Whether the positions depend on s at all, as at the affine and full levels."""
         return self.capabilities.carries_s
 
     @property
     def linear_in_q1(self) -> bool:
-        """Whether the step equation is linear in q1, so that one Newton step solves it (forces may be part of it)."""
+        """Whether the step equation, forces included, is linear in q1, so that a single Newton step solves it."""
         return self.capabilities.linear_in_q1
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the model is made of, and what follows for its steps."""
+        """The terms of the model, and properties of its steps."""
         return Capabilities(
             order=self.config.order,
             baseline=self.config.baseline,
@@ -171,7 +171,7 @@ class ContactLagrangian(nn.Module):
         K = self.kinetic(phase)
         if instant:
             return Terms(g, K, K * 0.0, K * 0.0, N, b)
-        V = self.potential(torch.stack([phase.q0, phase.q1]), order)  # both ends in one network call
+        V = self.potential(torch.stack([phase.q0, phase.q1]), order)  # both ends in the same network call
         V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
         if self.config.order == 4:
             N = self._missing(phase, V0, V1)
@@ -205,7 +205,7 @@ class ContactLagrangian(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return p = L_v (..., n) and L_vv (..., n, n) of the model's L(q, v, s) = lim L_d(q, q + hv, s, h)/h, h → 0.
 
-        They are D2 L_d and h D22 L_d in an instant: jets divide by h and subtract nothing.
+        L_v and L_vv are the limits of D2 L_d and h D22 L_d: jets divide by h and subtract nothing.
         """
         h = torch.full_like(s, INSTANT * max(self.config.scale) / max(self.config.speed))
         phase = Phase(q, q, h, 2, self.config, v * h[..., None])
@@ -215,7 +215,7 @@ class ContactLagrangian(nn.Module):
     def forces(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, u: Tensor | None = None
     ) -> tuple[Tensor, Tensor] | None:
-        """F⁻ and F⁺, each (..., n), in units of momentum; None at every level but the forced one."""
+        """F⁻ and F⁺, each (..., n), in units of momentum; None at every level but `forced`."""
         if self.friction is None:
             return None
         force = self._evaluate(self._phase(q0, q1, s0, h, 1), s0, u).force
@@ -223,7 +223,7 @@ class ContactLagrangian(nn.Module):
         return force.minus, force.plus
 
     def at(self, u: Tensor) -> DrivenLagrangian:
-        """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
+        """The discrete Lagrangian of a step with the inputs u, (..., m)."""
         if not self.config.inputs:
             raise InputError(
                 "this model has no inputs: fit a recording that has input columns, or leave the inputs out"
@@ -231,9 +231,9 @@ class ContactLagrangian(nn.Module):
         return DrivenLagrangian(self, u)
 
     def typical_increment(self, h: Tensor) -> Tensor:
-        """The size of q1 − q0 at the data's top speed, shaped like h: what the rounding of the networks is relative to.
+        """The size of q1 − q0 at the data's top speed, shaped like h: the unit of the rounding of networks.
 
-        They are not zero near rest as the motion is: there J⁻¹F cannot be had better than some eps of this size.
+        Networks do not vanish near rest as the motion does: rounding there leaves J⁻¹F of some eps of this size.
         """
         return h * max(self.config.speed)
 
@@ -299,12 +299,12 @@ class ContactLagrangian(nn.Module):
         return gained if N is None else gained + N
 
     def _missing(self, phase: Phase, V0: Jet, V1: Jet) -> Jet:
-        """What the rule of order 2 lacks to order 4."""
+        """The correction that makes the rule of order 2 a rule of order 4."""
         features, kinetic, damping = self.potential.features, self.kinetic, self.damping
         assert features is not None  # the baseline at least
         assert not isinstance(kinetic, PositionKinetic)
         assert not isinstance(damping, AffineDamping)
-        # A constant, and no function of q0: ONNX has matrices of a sample apart from those of the model.
+        # A constant, not a function of q0: ONNX treats a matrix for each sample and a matrix of the model differently.
         rate = torch.zeros((), dtype=phase.q0.dtype, device=phase.q0.device) if damping is None else damping.rate
         return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 

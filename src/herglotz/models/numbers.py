@@ -1,4 +1,4 @@
-"""A model as a function of some of its numbers: for derivatives by them, and for what sets them between steps."""
+"""A model as a function of some of its numbers: for derivatives by numbers, and to set numbers between steps."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.models.model import ContactLagrangian, numbers_of
 
 
 class Line(NamedTuple):
-    """A number λ that stands for several: those of a model on the line between two others."""
+    """A number λ that stands for several numbers of a model, on the line between two models."""
 
     value: float  # of λ in the model
     ends: dict[str, tuple[Tensor, Tensor]]  # by parameter, its values at λ = 0 and at 1
@@ -40,30 +40,33 @@ def lines(model: ContactLagrangian) -> Mapping[str, Line]:
 
 
 def combined(model: ContactLagrangian, name: str, values: Mapping[str, float]) -> ContactLagrangian:
-    """A copy of the model with a number `name` that moves several: 0 is the model as it is, and 1 has these values.
+    """A copy of the model with a number `name` that moves several numbers: 0 is the model, and 1 has these values.
 
     x(λ) = x + λ (x₁ − x), and for a mass e^{2x} of `log_diagonal` e^{2x(λ)} = e^{2x} + λ (e^{2x₁} − e^{2x}). A load
-    that a body takes up adds to L in proportion to it; that the first mass is 1 (gauge) divides all of L by one number,
-    and lines stay lines. So the models of all loads lie on the line between those of two loads, where no constant mass
-    lies between coordinates (`off_diagonal`); λ grows with the load, but not in proportion to it. A number that is
-    named beside it stands as it is given.
+    that a body takes up adds to L in proportion to the load; the gauge, which fixes the first mass at 1, divides L by a
+    number, and lines stay lines. So the models of all loads lie on the line between the models of two loads, unless a
+    constant mass couples coordinates (`off_diagonal`); λ grows with the load, but not in proportion to the load. A
+    number that is named beside `name` keeps its own value.
 
-    Raise InputError if the name is none or taken, nothing moves, a value is no finite number, or the model has no such
-    number or moves it by another name already. Weights of a network have no line between them.
+    Raise InputError if the name is no name or taken, nothing moves, a value is no finite number, or the model lacks a
+    number or moves that number by another name already. Weights of a network have no line between two networks.
     """
     every = numbers_of(model)
     chosen(model, list(values))
-    if not re.fullmatch(r"[A-Za-z]\w*", name) or any(re.match(rf"{name}(\W|$)", x) for x in (*every, *lines(model))):
+    words = {re.split(r"\W", x)[0] for x in (*every, *lines(model))}
+    if not re.fullmatch(r"[A-Za-z]\w*", name) or name in words:
         raise InputError(f"'{name}' must be a word of letters, digits and _ that the model's numbers do not begin with")
     moved = {key: x for key, x in values.items() if values_of(model, [key]) != [x]}
-    parameters = {every[key][0] for key in moved}
-    taken = sorted(x for x in parameters if any(x in line.ends for line in lines(model).values()))
-    networks = [key for key in moved if ".network." in key]
-    if not moved or taken or networks:
-        why = f"nothing differs for {name}" if not moved else f"{(taken or networks)[0]} cannot be moved by {name}"
-        raise InputError(f"{why}; give other values of numbers that are no weights of a network, each by one name")
+    parameters = sorted({every[key][0] for key in moved})
+    moved_already = {parameter for line in lines(model).values() for parameter in line.ends}
+    fixed = [key for key in moved if every[key][0] in moved_already or ".network." in key]
+    remedy = "give other values of numbers that are no weights of a network, each by one name"
+    refuse({
+        f"nothing differs for {name}; {remedy}": not moved,
+        f"{fixed[0] if fixed else ''} cannot be moved by {name}; {remedy}": fixed,
+    })  # fmt: skip
     end = with_values(model, moved)
-    ends = {x: tuple(m.get_parameter(x).detach().clone() for m in (model, end)) for x in sorted(parameters)}
+    ends = {x: tuple(m.get_parameter(x).detach().clone() for m in (model, end)) for x in parameters}
     new: Any = copy.deepcopy(model)
     new.lines = {**lines(model), name: Line(0.0, ends)}  # pyright: ignore[reportArgumentType]
     return new
@@ -72,7 +75,7 @@ def combined(model: ContactLagrangian, name: str, values: Mapping[str, float]) -
 def chosen(model: ContactLagrangian, names: Sequence[str]) -> list[str]:
     """The numbers of a model that names stand for: `friction.viscous[1]`, or `friction.viscous` for all of them.
 
-    Raise InputError if a name is none, or one number is named twice.
+    Raise InputError if the model has no number of a name, or a number is named twice.
     """
     every, found = [*numbers_of(model), *lines(model)], []
     for name in names:
@@ -100,8 +103,8 @@ def values_of(model: ContactLagrangian, names: Sequence[str]) -> list[float]:
 class WithNumbers(nn.Module):
     """A function of a model as a function of some of the model's numbers too: f(*arguments, θ) with θ (K,).
 
-    θ has no batch: all samples share it. Numbers that the model has not are passed over; `function` reads the model
-    itself, whose parameters are replaced during the call.
+    θ has no batch: all samples share θ. Names that the model lacks are skipped; `function` reads the model itself,
+    whose parameters are replaced during the call.
     """
 
     def __init__(self, model: ContactLagrangian, function: Callable[..., Any], names: Sequence[str]):
@@ -141,7 +144,7 @@ def with_values(model: ContactLagrangian, values: Mapping[str, float]) -> Contac
     every, own = numbers_of(model), lines(model)
     new: Any = copy.deepcopy(model)
     chosen(model, list(values))
-    for name, value in sorted(values.items(), key=lambda x: x[0] not in own):  # what moves several moves first
+    for name, value in sorted(values.items(), key=lambda x: x[0] not in own):  # lines before single numbers
         if name not in every and name not in own:
             raise InputError(f"{name} stands for several numbers of the model; name each of them")
         if not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""What a rule of order 2 lacks of the exact L_d, to order 4, from V and K themselves: no parameter of its own.
+"""The error of a rule of order 2 against the exact L_d, to order 4, from V and K: no further parameters.
 
 Between q0 and q1 the motion leaves the straight line by δ(τ) = a (τ² − h²/4)/2, |τ| ≤ h/2. With
 e = L_q − L_vq v − γ L_v at (q̄, v) and M = L_vv, the action of L = K − V − γ s is, to O(h⁵),
@@ -87,7 +87,7 @@ class Slope:
 
 
 def missing(slope: Slope, V0: Jet, V1: Jet, root: Tensor) -> Jet:
-    """What the exact L_d has beyond √c K − h/2 (c V0 + V1), to O(h⁵), over (q0, q1); `root` is √c."""
+    """The exact L_d less √c K − h/2 (c V0 + V1), to O(h⁵), over (q0, q1); `root` is √c."""
     phase, rate = slope.phase, slope.rate
     h = phase.h
     v = phase.velocity

@@ -1,4 +1,4 @@
-"""An L_d of one's own in the place of a model: what fits, exports and files ask of one."""
+"""A user's own L_d in place of a model: the attributes that fits, exports and files read."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ UNKNOWN = Capabilities(
 
 @dataclass(frozen=True)
 class OwnConfig:
-    """What is known of an L_d of one's own; the names are those of `ModelConfig`."""
+    """The description of a user's L_d, by the names of `ModelConfig`."""
 
     name: str  # of its class or function
     angles: tuple[bool, ...]
     scale: tuple[float, ...]  # (n,) typical sizes of q
     speed: tuple[float, ...]  # (n,) and of its rate
     inputs: int = 0
-    level: str = "full"  # "forced" where it comes with forces: its map is no contact map
+    level: str = "full"  # "forced" for an L_d with forces, whose map is no contact map
     baseline: bool = False
     absent: tuple[str, ...] = ()
     order: int = 2
@@ -48,10 +48,10 @@ class OwnConfig:
 
 
 class OwnLagrangian(nn.Module):
-    """L_d(q0, q1, s0, h) of a module or function, with what steppers, fits and exports ask of `ContactLagrangian`.
+    """L_d(q0, q1, s0, h) of a module or function, with the attributes of `ContactLagrangian`.
 
-    Derivatives are the module's own `partials`, or those of `functional_partials`. A module with `at(u)` takes inputs,
-    one with `forces` has forces F⁻ and F⁺ (Lagrange–d'Alembert–Herglotz).
+    Derivatives come from the module's own `partials`, or from `functional_partials`. A module with `at(u)` takes
+    inputs, a module with `forces` has forces F⁻ and F⁺ (Lagrange–d'Alembert–Herglotz).
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class OwnLagrangian(nn.Module):
     inputs
         Number m of inputs; L_d then has `at(u)`.
     angles, scale, speed
-        (n,) which coordinates are angles in rad, and typical sizes of q and of its rate, in the data's units.
+        (n,) which coordinates are angles in rad, and typical sizes of q and q̇, in the data's units.
 
     Raises
     ------
@@ -110,7 +110,7 @@ class OwnLagrangian(nn.Module):
         return self.config.inputs
 
     def at(self, u: Tensor) -> DrivenLagrangian:
-        """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
+        """The discrete Lagrangian of a step with the inputs u, (..., m)."""
         check_own(self.L_d, 1)
         return DrivenLagrangian(self, u)
 
@@ -134,7 +134,7 @@ class OwnLagrangian(nn.Module):
     def partials_increment(
         self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1, u: Tensor | None = None
     ) -> Partials:
-        """`partials` at (q0, q0 + Δ, s0); L_d subtracts what is added here, and a short step in float32 rounds."""
+        """`partials` at (q0, q0 + Δ, s0); L_d subtracts q0 again, so that a short step in float32 rounds."""
         return self.partials(q0, q0 + delta, s0, h, order, u)
 
     def forces(
@@ -153,7 +153,7 @@ class OwnLagrangian(nn.Module):
 
 
 def check_own(L_d: Any, inputs: int) -> None:
-    """Refuse what is no discrete Lagrangian, or takes no inputs where there are some."""
+    """Raise InputError if L_d is no discrete Lagrangian, or has inputs and no `at(u)`."""
     if not isinstance(L_d, Callable):
         raise InputError(f"model must be a module or function L_d(q0, q1, s0, h), got a {type(L_d).__name__}")
     if inputs and not isinstance(L_d, Driven):
@@ -165,6 +165,6 @@ def check_own(L_d: Any, inputs: int) -> None:
 
 
 def refuse_own(model: Any, what: str, instead: str) -> None:
-    """Refuse what reads the package's own terms of a model that is an L_d of one's own."""
+    """Raise InputError for a function that reads the terms of a model, if the model is a user's L_d without terms."""
     if isinstance(model, OwnLagrangian):
         raise InputError(f"{what} reads the terms of the package's models, not an L_d of your own; {instead}")

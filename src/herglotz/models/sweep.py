@@ -2,7 +2,7 @@
 
 The step equation asks for the gradient of a network of (q̄, v) and for the derivative of that gradient along q1; a
 rollout asks for V and V′. A reverse sweep gives the gradient at the cost of the value, and tangents that go through
-both sweeps give its derivative: 1 + n rows where a jet over (q0, q1) carries 1 + 2n + n(2n + 1).
+both sweeps give the second derivative: 1 + n rows where a jet over (q0, q1) carries 1 + 2n + n(2n + 1).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from herglotz.models.network import Network
 
 
 class Trigonometry(NamedTuple):
-    """What features are made of, each (..., n): sin q and cos q of angles, q itself of other coordinates."""
+    """The entries of features, each (..., n): sin q and cos q of angles, q itself of other coordinates."""
 
     s: Tensor  # sin q, or q
     c: Tensor  # cos q
@@ -45,7 +45,7 @@ class Sweep:
     """One scalar network at its present parameters, reading (s, c) or (s, c, v): `Trigonometry` and the velocity.
 
     The network's features are those of `Phase`, or of `position_features` where `speed` is None; `scale` and `speed` of
-    the coordinates go into the weights of its first layer. `factor`, a number or a tensor (...) such as h, multiplies
+    the coordinates go into the weights of the first layer. `factor`, a number or a tensor (...) such as h, multiplies
     the network.
     """
 
@@ -98,7 +98,7 @@ def _columns(
     dtype: torch.dtype,
     device: torch.device,
 ) -> tuple[Tensor | None, Tensor]:
-    """Which columns of the first layer read s, c and v, and the factors on them; None: they do already."""
+    """Which columns of the first layer read s, c and v, and their factors; None: the columns are those already."""
     sines, cosines, factors, column = [], [], [], 0
     for angle in angles:
         sines.append(column)

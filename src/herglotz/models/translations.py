@@ -107,7 +107,7 @@ def _across(seen: Tensor) -> Tensor:
 
 
 def blind(config: Any, velocities: int) -> Tensor | None:
-    """What networks may see of their features (position, then so many velocities): a projection (m, m), or None."""
+    """The projection (m, m) onto features (position, then velocities) that networks may see; None: all."""
     moved = directions(config.translations, config.angles)
     if not moved:
         return None

@@ -30,7 +30,7 @@ Shape = tuple[np.ndarray, np.ndarray]  # x and y of the joints, (points,) each
 
 @dataclass(frozen=True)
 class Animation:
-    """A GIF that was written; a notebook shows it moving."""
+    """A written GIF, which a notebook plays."""
 
     path: Path
 
@@ -42,13 +42,13 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
     """Write a GIF of one trajectory: the recording in grey beside the model's free run, and both against time.
 
     Where all coordinates are angles, links of equal length hang from a point, each angle measured from the vertical;
-    where angles follow one length, they hang from a cart. Two lengths of one unit are a point in the plane; other
-    lengths are beads side by side, each displaced by its coordinate. Time is stretched to six seconds.
+    angles after a length hang from a cart. Two lengths of the same unit are a point in the plane; other lengths are
+    beads side by side, each displaced by a coordinate. Time is stretched to six seconds.
 
     Parameters
     ----------
     run
-        What `fit` returned.
+        The result of `fit`.
     path
         The file, which ends in .gif.
     trajectory
@@ -57,12 +57,12 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
     Returns
     -------
     Animation
-        Its `path`; as the last line of a notebook's cell it shows the GIF.
+        Has the `path`; as the last line of a notebook's cell, shows the GIF.
 
     Raises
     ------
     InputError
-        If the name does not end in .gif, or there is no such trajectory.
+        If the name does not end in .gif, or `trajectory` is no number of a trajectory.
     """
     data = run.data.unwrapped()
     if Path(path).suffix.lower() != ".gif":
@@ -127,7 +127,7 @@ def _series(ax: Axes, data: Trajectories, motion: tuple[np.ndarray, np.ndarray, 
 
 
 class _Scene:
-    """What positions look like, by the kinds of the coordinates."""
+    """The drawing of a position, by the kinds of the coordinates."""
 
     def __init__(self, run: Run, positions: np.ndarray):
         angles, n = run.data.angles, run.data.dof
@@ -141,7 +141,7 @@ class _Scene:
         self.x, self.y = (x.min() - room, x.max() + room), (y.min() - room, y.max() + 2.5 * room)
 
     def shape(self, q: np.ndarray) -> Shape:
-        """Joints of one position (n,)."""
+        """Joints of a position (n,)."""
         if self.links:
             own = q[len(q) - self.links :]
             base = 0.0 if self.links == len(q) else q[0]
@@ -152,7 +152,7 @@ class _Scene:
         return (q, np.zeros(1)) if len(q) == 1 else (np.arange(len(q)) * 1.0, q)
 
     def frame(self, ax: Axes) -> None:
-        """Limits and what stands still."""
+        """Limits, and the parts that stand still."""
         ax.set(xlim=self.x, ylim=self.y)
         if self.links or self.plane:
             ax.set_aspect("equal")

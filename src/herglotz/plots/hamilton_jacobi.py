@@ -23,7 +23,7 @@ NULL_STEPS = (1, 4, 8)  # first, middle and last of STEPS
 DISTANCES = torch.logspace(-5, -0.5, 10, dtype=torch.float64)  # of p̂0 from the fan's solution, in widths of the fan
 ANCHOR = 7  # index of the distance through which the reference line of slope 2 is drawn
 BELOW = 1 / 200  # rounding errors at which a difference of exactly 0 is drawn
-WITHOUT = "(caustic, or failed step)"  # what has no S^k
+WITHOUT = "(caustic, or failed step)"  # label of points without S^k
 
 
 def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None) -> Figure:

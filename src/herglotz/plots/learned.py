@@ -1,4 +1,4 @@
-"""What the model has learned: potential, force, friction, damping and mass by coordinate, with the data's support."""
+"""The learned functions of a model: potential, force, friction, damping and mass by coordinate, with the support."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
 
 
 def _labels(run: Run) -> dict[str, str]:
-    """What the axes of each kind are called, with their units."""
+    """Labels of the axes of each kind, with units."""
     speed, time = momentum_unit(run), run.data.time_unit
     force = speed + "²" if speed and time not in ("", "1") else ""  # rad/s, rad/s²
     length = "" if run.data.units[0] == "1" else run.data.units[0]

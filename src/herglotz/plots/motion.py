@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from herglotz.training.predict import Prediction
 
 MOST_PANELS, DATA = 4, "#B5B5B5"
-ROOM_FOR_RMS = 0.2  # of the axis: its caption takes 0.15 of a figure of one panel
+ROOM_FOR_RMS = 0.2  # of the axis: the caption takes 0.15 of the axis in a figure with a single panel
 # Shares that have a word.
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
@@ -50,14 +50,14 @@ def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
     Parameters
     ----------
     run
-        A fitted run; its prediction is one rollout a trajectory, never corrected by later data.
+        A fitted run; the prediction is a rollout of each trajectory, never corrected by later data.
     trajectory
-        Which one; left out, up to four spread over the set. A single one shows up to four coordinates.
+        Number of a trajectory, with up to four coordinates; left out, up to four trajectories spread over the set.
 
     Raises
     ------
     InputError
-        If there is no such trajectory.
+        If `trajectory` is no number of a trajectory.
     """
     if trajectory is not None and not 0 <= trajectory < len(run.data):
         raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(run.data) - 1}")
@@ -66,9 +66,10 @@ def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
 
 
 def plot_prediction(found: Prediction) -> Figure:
-    """Draw a recording, the free run of a model that has not seen it, and their difference; the warm-up is not shaded.
+    """Draw a recording, the free run of a model not fitted to it, and the residual; the warm-up is not shaded.
 
-    A single trajectory shows up to four coordinates; several show their first, four of them spread over the set.
+    A single trajectory shows up to four coordinates. Of several, up to four spread over the set show the first
+    coordinate.
     """
     counts = (found.warmup,) * len(found.data)
     return _drawn(
@@ -77,7 +78,7 @@ def plot_prediction(found: Prediction) -> Figure:
 
 
 class _Motion(NamedTuple):
-    """Data beside a model whose first samples of every trajectory have seen them."""
+    """Data beside the motion of a model that has seen the first samples of every trajectory."""
 
     data: Trajectories
     model: torch.Tensor  # (N, n) positions
@@ -151,7 +152,7 @@ def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, la
     if count < len(t):
         for ax in (top, bottom):
             ax.axvspan(boundary, t[-1], color=SHADE, lw=0, zorder=0)
-    top.plot(t, q, ".", color=DATA, ms=7, mew=0, zorder=2)  # wide and pale, so that the line does not hide them
+    top.plot(t, q, ".", color=DATA, ms=7, mew=0, zorder=2)  # wide and pale: the line does not hide the data
     seen, unseen = slice(0, max(count, 0)), slice(max(count - 1, 0), None)
     top.plot(t[seen], model[seen], color=MODEL, lw=1.2, zorder=3)
     if count < len(t):
@@ -175,7 +176,7 @@ def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, la
 
 
 def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, unit: str) -> None:
-    """Write the RMS of each part above its residuals."""
+    """Write the RMS of each part above the residuals."""
     split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
     reach = float(np.nanmax(np.abs(residual))) if np.isfinite(residual).any() else 0.0
     bottom.set_ylim(-1.25 * (reach or 1.0), 1.9 * (reach or 1.0))  # room for the RMS above the points
@@ -188,7 +189,7 @@ def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, un
 
 
 def _cells(data: Trajectories, trajectory: int | None) -> list[tuple[int, int]]:
-    """Return the (trajectory, coordinate) of each panel: one trajectory's coordinates, or coordinate 0 of several."""
+    """Return (trajectory, coordinate) of each panel: coordinates of a trajectory, or coordinate 0 of several."""
     if trajectory is not None or len(data) == 1:
         return [(trajectory or 0, i) for i in range(min(data.dof, MOST_PANELS))]
     chosen = np.linspace(0, len(data) - 1, min(len(data), MOST_PANELS)).round().astype(int)
@@ -214,12 +215,12 @@ def _series(data: Trajectories, values: torch.Tensor, b: int, i: int) -> tuple[n
 
 
 def _readings(data: Trajectories, b: int, i: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times of a trajectory, and what was read of one coordinate; NaN where nothing was."""
+    """Times of a trajectory, and the readings of a coordinate; NaN where a reading is missing."""
     t, q = _series(data, data.q, b, i)
     return t, q if data.observed is None else np.where(_series(data, data.observed, b, i)[1] > 0, q, np.nan)
 
 
 def _broken(t: np.ndarray, q: np.ndarray, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Put a NaN into every gap, so that the line is not drawn across it."""
+    """Put a NaN into every gap, so that no line crosses the gap."""
     at = np.nonzero(np.diff(t) > 1.5 * data.typical_step)[0] + 1
     return np.insert(t, at, np.nan), np.insert(q, at, np.nan)

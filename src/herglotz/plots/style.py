@@ -29,7 +29,7 @@ DPI = 150  # sharp on a screen at twice the size
 # Okabe & Ito (2008): distinguishable with every common form of colour blindness, and in grey.
 INK, MODEL, UNSEEN, ACCENT, MUTED = "#222222", "#0072B2", "#D55E00", "#009E73", "#8A8A8A"
 SERIES = (MODEL, UNSEEN, ACCENT, "#CC79A7", "#E69F00", "#56B4E9")
-SHADE = "#FBEDE3"  # behind what was not trained on
+SHADE = "#FBEDE3"  # behind samples outside training
 SUPPORT = "#EAF2F8"  # where the data are
 FORMATS = ("png", "svg", "pdf")
 
@@ -64,7 +64,7 @@ def styled() -> Iterator[None]:
 
 
 class Picture(Figure):
-    """A figure that a notebook shows, although pyplot, which would register it there, is not used."""
+    """A figure that a notebook shows without pyplot, which would register the figure there."""
 
     def _repr_png_(self) -> bytes:
         return image(self, "png")
@@ -89,7 +89,7 @@ def save_figure(figure: Figure, path: PathLike) -> None:
 
 
 def save_all(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path]:
-    """Write figures by their names into `folder`, which is made if it is missing; return the files."""
+    """Write figures by their names into `folder`, which is made if missing; return the files."""
     files = [folder_at(folder) / f"{name}.{form}" for name in drawn]
     for file, figure in zip(files, drawn.values(), strict=True):
         save_figure(figure, file)
@@ -97,7 +97,7 @@ def save_all(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path
 
 
 def image(figure: Figure, form: str) -> bytes:
-    """Return what a file of a figure holds, in the form png, svg or pdf."""
+    """Return the bytes of a figure's file, in the form png, svg or pdf."""
     buffer = io.BytesIO()
     with styled():
         if form != "png":
@@ -115,7 +115,7 @@ def _png(pixels: np.ndarray, dpi: float) -> bytes:
     the files of lines on white larger.
     """
     height, width = pixels.shape[:2]
-    rows = np.zeros((height, 1 + 4 * width), dtype=np.uint8)  # a row begins with its filter: 0, none
+    rows = np.zeros((height, 1 + 4 * width), dtype=np.uint8)  # a row begins with the filter type: 0, none
     rows[:, 1:] = pixels.reshape(height, -1)
     per_metre = round(dpi / 0.0254)
     parts = {
@@ -136,7 +136,7 @@ def label(ax: Axes, x: float, y: float, text: str, color: str = INK, **options: 
 
 
 def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left", row: int = 0) -> None:
-    """Write (text, colour) entries in one line inside the panel, each in the colour of what it names.
+    """Write (text, colour) entries in a line inside the panel, each in the colour of the thing named.
 
     `row` counts lines from the panel's top, for a second line under the first.
     """
@@ -157,10 +157,10 @@ def with_unit(name: str, unit: str) -> str:
 
 
 class Powers(LogFormatter):
-    """Numbers of a logarithmic axis as text, `20` and `2×10⁻⁵`; matplotlib's own ones take its parser of formulas."""
+    """Numbers of a logarithmic axis as text, `20` and `2×10⁻⁵`, without matplotlib's parser of formulas."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        """Return the text of a tick, empty where matplotlib leaves its number out."""
+        """Return the text of a tick, empty where matplotlib leaves the number out."""
         mantissa, _, exponent = f"{x:g}".partition("e")
         power = raised("10", int(exponent)) if exponent else ""
         text = power if mantissa == "1" and power else "×".join(filter(None, (mantissa, power)))
@@ -175,7 +175,7 @@ def logarithmic(ax: Axes) -> None:
 
 
 def position_axis(ax: Axes, data: Trajectories, i: int) -> None:
-    """Name the lower axis after coordinate i, in rad or a length; its ticks are in deg where the table was."""
+    """Name the lower axis after coordinate i, in rad or a length; ticks are in deg if the table was."""
     in_degrees = data.names[i] in data.degrees
     if in_degrees:
         low, high = ax.get_xlim()

@@ -1,4 +1,4 @@
-"""What a report says: sections of text, tables, code and pictures, before they become HTML or Markdown."""
+"""The contents of a report: sections of text, tables, code and pictures, before they become HTML or Markdown."""
 
 from __future__ import annotations
 
@@ -56,5 +56,5 @@ class Document:
 
     title: str
     verdict: str  # one of the sentences of `herglotz.training.verdict`
-    meaning: str  # what the verdict means for the reader
+    meaning: str  # of the verdict for the reader
     sections: tuple[Section, ...] = field(default_factory=tuple)

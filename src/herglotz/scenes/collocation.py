@@ -35,7 +35,7 @@ def lobatto(count: int) -> tuple[Tensor, Tensor, Tensor]:
     x[1:-1] = inner
     degrees = np.arange(count)
     P = np.polynomial.legendre.legvander(x, count)
-    norm = 2 / (2 * degrees + 1)  # of P_k; that of the last is of no account, as its integral is 0 at every node
+    norm = 2 / (2 * degrees + 1)  # of P_k; the norm of the last does not matter: the integral of P_k is 0 at every node
     weights = 2 / (count * (count - 1) * P[:, count - 1] ** 2)
     series = (P[:, :-1] * weights[:, None] / norm).T  # (degree, j) coefficients of l_j
     integral = np.empty((count, count))  # (i, degree) of P_k from −1 to x_i
@@ -57,12 +57,12 @@ def _values(nodes: Array, size: Array, x: Array) -> Array:
     return np.where(hit.any(1, keepdims=True), hit, terms / terms.sum(1, keepdims=True))
 
 
-SMALL = 1e-8  # of the unknowns: the move after one below is below rounding
-PIECE = 4  # nodes from one look for a conjugate point to the next
+SMALL = 1e-8  # of the unknowns: after a smaller move the next is below rounding
+PIECE = 4  # nodes between two checks for a conjugate point
 
 
 class End(NamedTuple):
-    """A motion at both ends of the step, and the derivatives of its end in (q0, p0, s0)."""
+    """A motion at both ends of the step, and the derivatives of the end in (q0, p0, s0)."""
 
     p0: Tensor  # (..., n)
     p1: Tensor  # (..., n)
@@ -89,7 +89,7 @@ class Collocation:
     h: Tensor  # (B,)
 
     def start(self) -> Tensor:
-        """Uniform motion, with the action that it gathers; (B, k, 2n+1)."""
+        """Uniform motion, with the action along the motion; (B, k, 2n+1)."""
         c, a, _ = (x.to(self.q0) for x in lobatto(self.count))
         q = self.q0[:, None] + c[:, None] * (self.q1 - self.q0)[:, None]
         s = self.s0[:, None].expand(-1, self.count)
@@ -115,7 +115,7 @@ class Collocation:
         return self.h * (rate @ lobatto(self.count)[1][-1].to(x))
 
     def _equations(self, x: Tensor) -> tuple[Tensor, ...]:
-        """The equations (B, k, 2n+1), z, the derivatives (B, k, 2n+1, k, 2n+1) and ∂z/∂x, L_s and its derivative."""
+        """The equations (B, k, 2n+1), z, the derivatives (B, k, 2n+1, k, 2n+1) and ∂z/∂x, L_s and ∂L_s/∂x."""
         n, k = self.q0.shape[-1], self.count
         a = lobatto(k)[1].to(x)
         difference = torch.eye(k, dtype=x.dtype, device=x.device)
@@ -140,7 +140,7 @@ class Collocation:
         return F, z, F_x, z_x, R[..., -1], J[..., -1, :]
 
     def end(self, x: Tensor) -> tuple[End, Tensor]:
-        """What is wanted of a motion, and what it leaves of its equations, (B,), relative to 1 + |z|."""
+        """The result of a motion, and the residual of the equations, (B,), relative to 1 + |z|."""
         n, k = self.q0.shape[-1], self.count
         weights = lobatto(k)[1][-1].to(x)
         F, z, F_x, z_x, rate, rate_x = self._equations(x)
@@ -166,8 +166,8 @@ def _regular(D: Tensor, n: int) -> Tensor:
     At the end of a piece alone, Y = ∂q/∂p has eigenvalues with positive real parts, as it has at t → 0. Where a piece
     `own` is joined to those before, the action has the second derivative W = c own⁻¹ now before⁻¹ in the position q
     between them, with `before` and `now` = ∂q/∂p0 at the ends of the piece, and is a minimum where W > 0, which is
-    where the symmetric beforeᵀ own⁻¹ now is. The eigenvalues of `now` would not do: gyroscopic terms turn it, and two
-    of them may change sign together.
+    where the symmetric beforeᵀ own⁻¹ now is. The eigenvalues of `now` would not do: gyroscopic terms rotate `now`, and
+    two eigenvalues may change sign together.
     """
     pieces = torch.linalg.solve_ex(D[:, :-1], D[:, 1:], left=False)[0]
     own, Y = pieces[..., :n, n : 2 * n], D[..., :n, n : 2 * n]

@@ -1,8 +1,8 @@
 """The exact discrete Lagrangian of any contact system, to near round-off.
 
 L_d(q0, q1, s0, h) = s(h) − s0 along the motion with q(0) = q0, q(h) = q1, s(0) = s0. The boundary-value problem is
-solved by collocation: polynomials through Gauss–Lobatto nodes satisfy q̇ = v, ṗ = L_q + L_s p and ṡ = L there. All nodes
-of all samples are one Newton iteration, and the sensitivities of the motion are one more linear equation.
+solved by collocation: polynomials through Gauss–Lobatto nodes satisfy q̇ = v, ṗ = L_q + L_s p and ṡ = L there. All
+nodes of all samples are one Newton iteration, and the sensitivities of the motion are one more linear equation.
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ class NumericallyExact:
         D22 = P_p Y_p⁻¹,  D23 = P_s − D22 Y_s,  D12 = −c Y_p⁻¹ − p0 ⊗ D23,
         D33 = ∂c/∂s0 − D23·Y_s,  D13 = c Y_p⁻¹ Y_s − p0 D33,  D11 = c Y_p⁻¹ Y_q − p0 ⊗ D13.
 
-    Always computed in float64. NaN where there is no such motion or more than one branch; `shoot` says which. There is
+    Always computed in float64. NaN without a motion or with several branches; `shoot` tells the two apart. There is
     no conjugate point inside the step where none of its pieces has one and the action is a minimum in the positions
-    between them. L_d can be differentiated twice and its first partials once; a further derivative raises, and so does
-    one with respect to h.
+    between them. L_d can be differentiated twice and the first partials once; a further derivative raises, and so does
+    a derivative with respect to h.
 
     Parameters
     ----------
     motion
         The equations.
     tolerance
-        What the polynomials may leave of the integrated equations between their nodes, relative to 1 + |component|.
+        Largest residual of the integrated equations between the nodes, relative to 1 + |component|.
     max_nodes
-        Of one step; a sample that needs more is `UNRESOLVED`.
+        Of a step; a sample that needs more is `UNRESOLVED`.
     max_iterations
         Of Newton's method.
 
@@ -91,7 +91,7 @@ class NumericallyExact:
         return P if order == 2 else Partials(P.L, P.D1, P.D2, P.D3)
 
     def shoot(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float) -> Shot:
-        """Solve the boundary-value problem of each sample, with more nodes where fewer do not resolve its motion."""
+        """Solve the boundary-value problem of each sample, with more nodes where fewer do not resolve the motion."""
         shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, as_step(h, q0).shape)
         n = q0.shape[-1]
         with torch.no_grad():
@@ -130,7 +130,7 @@ def exact_discrete_lagrangian(system: Motion | StateFunction, **options: Any) ->
     Parameters
     ----------
     system
-        L(q, v, s), any regular one, differentiated by autograd; or a `Motion` with its equations written out, which is
+        L(q, v, s), any regular one, differentiated by autograd; or a `Motion` with the equations written out, which is
         several times faster.
     **options
         `tolerance`, `max_nodes` and `max_iterations` of `NumericallyExact`.

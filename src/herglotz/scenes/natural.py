@@ -1,8 +1,8 @@
-"""Short forms of a scene: one without a closed form, and of these the one of a constant mass and one damping rate.
+"""Short forms of a scene: without a closed form, and, as a case, with a constant mass and a constant damping rate.
 
-A scene may have a force beside the Lagrangian's own, which no L(q, v, s) of one action s says, such as friction of one
-joint: ṗ = L_q + L_s p + f(q, v) (Lagrange–d'Alembert–Herglotz). The motion is then no contact flow and has no exact
-discrete Lagrangian; its rules are discrete Lagrangians with discrete forces.
+A scene may have an external force that no L(q, v, s) of a single action s describes, for example friction of one joint:
+ṗ = L_q + L_s p + f(q, v) (Lagrange–d'Alembert–Herglotz). The motion is then no contact flow and has no exact discrete
+Lagrangian; its rules are discrete Lagrangians with discrete forces.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def scene_without_closed_form(
     external: External | None = None,
     **fields: Any,
 ) -> Scene:
-    """The scene whose flow and exact L_d are computed, from L with its derivatives written out.
+    """The scene whose flow and exact L_d are computed, from L with derivatives written out.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 Gragg's modified midpoint rule, whose error is a series in the square of the step, extrapolated to order 12
 (Gragg–Bulirsch–Stoer), with the number of substeps doubled until a sample has converged. Always in float64. Herglotz's
-action of any smooth path, the continuous Cauchy problem that L_d discretises, is integrated by it.
+action of any smooth path, the continuous Cauchy problem that L_d discretises, is integrated by the same method.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from herglotz.theory.continuous import Lagrangian
 VectorField = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 Derivative = Callable[[Tensor], Tensor]
 
-# Midpoint steps per column: order 12, 37 evaluations a substep. Extrapolation multiplies round-off by the sum of its
-# |weights|: 26 with these six columns; two more would gain order and make it 119, above the tolerance at h ≥ 5.
+# Midpoint steps per column: order 12, 37 evaluations a substep. Extrapolation multiplies round-off by the sum of
+# |weights|: 26 with these six columns; two more would gain order and make the sum 119, above the tolerance at h ≥ 5.
 SEQUENCE = (2, 4, 6, 8, 10, 12)
 
 TOLERANCE = 1e-13  # of a sample, relative to 1 + |component|: a hundred times the rounding of a step
@@ -30,7 +30,7 @@ HOPELESS = 8  # a sample that is not finite with this many substeps is given up
 
 @dataclass(frozen=True)
 class ReferenceSolution:
-    """The end state of each sample and its estimated error."""
+    """The end state of each sample and the estimated error."""
 
     q1: Tensor  # (..., n)
     p1: Tensor  # (..., n)
@@ -48,10 +48,10 @@ def reference_solve(
 ) -> ReferenceSolution:
     """Integrate (q, p, s) over time h, and estimate the error.
 
-    A sample keeps the first result that agrees with the one of half its substeps to `TOLERANCE`, so it does not depend
-    on the rest of its batch; after `max_substeps` it keeps the last, with whatever `error` says. The result is in the
+    A sample keeps the first result that agrees with that of half the substeps to `TOLERANCE`, and so does not depend
+    on the rest of the batch; after `max_substeps` the last result is kept, with `error`. The result is in the
     dtype of q, and differentiable if the vector field is. `error` belongs to the coarser of the last two results: the
-    one returned is better.
+    finer is returned.
     """
     n, dtype = q.shape[-1], q.dtype
     h = torch.as_tensor(h, dtype=torch.float64, device=q.device)
@@ -68,7 +68,7 @@ def reference_solve(
 def _integrated(f: Derivative, x0: Tensor, span: Tensor, max_substeps: int) -> tuple[Tensor, Tensor]:
     """ẋ = f(x) integrated, the number of substeps doubled from 2 until a sample agrees with itself.
 
-    x at the end, (..., d), and the error of the coarser of its last two results, (...).
+    x at the end, (..., d), and the error of the coarser of the last two results, (...).
     """
     span, substeps = span[..., None], 2
     # One substep, and the first of two: one batch.
@@ -143,8 +143,9 @@ def path_action(lagrangian: Lagrangian, path: Path, s0: Tensor, T: Tensor | floa
     """s(T) of ds/dt = L(q(t), q̇(t), s), s(0) = s0, along a path that need not be a motion; shape (...).
 
     s(T) − s0 is Herglotz's action of the path. Among the paths with the same ends and the same s0 it is stationary
-    exactly at the solutions of Herglotz's equations; there it is L_d(q(0), q(T), s0), the exact discrete Lagrangian.
-    Raise InputError if the integration does not converge.  Source: Cauchy problem and Herglotz action of the paper.
+    exactly at the solutions of Herglotz's equations; there the action is L_d(q(0), q(T), s0), the exact discrete
+    Lagrangian. Raise InputError if the integration does not converge.  Source: Cauchy problem and Herglotz action of
+    the paper.
     """
 
     def field(t: Tensor, _: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,7 +1,7 @@
 """Quadrature rules: a continuous Lagrangian L(q, v, s) becomes a discrete one, L_d(q0, q1, s0, h).
 
 With v = (q1 − q0)/h and q̄ = (q0 + q1)/2. Once there is damping the order depends on *where s is taken* (trap 1 of
-`docs/mathematics.md`); ORDERS says what each rule reaches, and a test measures it.
+`docs/mathematics.md`); ORDERS has the order of each rule, which a test measures.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def right(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tenso
 def midpoint(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = h L(q̄, v, s0 + L_d/2), implicit in one scalar: order 2, c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
 
-    Its own adjoint. Where Newton's method for the scalar does not converge the value is NaN.
+    Self-adjoint. NaN where Newton's method for the scalar does not converge.
     """
     q = 0.5 * (q0 + q1)
     return _implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
@@ -105,7 +105,7 @@ def trapezoid_plain(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor
 def strang(potential: Callable[[Tensor], Tensor], m: float, gamma: float) -> Rule:
     """L_d = (E−1)s0 + √E [m|Δ|²/2h − (h/2)(V0 + V1)], E = e^{−γh}: order 2, its own adjoint, explicit to step.
 
-    It generates the splitting damp(h/2) ∘ kick(h/2) ∘ drift(h) ∘ kick(h/2) ∘ damp(h/2) of H = |p|²/2m + V(q) + γs into
+    L_d generates the splitting damp(h/2) ∘ kick(h/2) ∘ drift(h) ∘ kick(h/2) ∘ damp(h/2) of H = |p|²/2m + V(q) + γs into
     γs, V and |p|²/2m. c = E, exactly.
     """
 
@@ -136,7 +136,7 @@ def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Te
     """The scalar x = action(x) of each sample, by Newton's method from 0; NaN where it has not converged.
 
     Solved outside the graph. Where gradients are on and the action wants them, further steps inside the graph carry the
-    first three derivatives of x with respect to whatever the action depends on.
+    first three derivatives of x with respect to all that the action depends on.
     """
     start = s0.new_zeros(*torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape), 1)
 

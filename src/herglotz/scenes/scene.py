@@ -13,6 +13,7 @@ from herglotz.mechanics import DiscreteLagrangian
 StateFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 State = tuple[Tensor, Tensor, Tensor]
 Step = Tensor | float
+DiscreteHamiltonian = Callable[[Tensor, Tensor, Tensor, Step], Tensor]
 Range = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]  # (low, high), a number or one a coordinate
 
 
@@ -69,8 +70,8 @@ class Scene:
     v_range: Range
     h: float
     time_unit: str = "s"
-    H_plus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
-    H_minus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
+    H_plus: DiscreteHamiltonian | None = None
+    H_minus: DiscreteHamiltonian | None = None
     numerical: DiscreteLagrangian | None = None
     examples: tuple[Mapping[str, float], ...] = ()
 
@@ -90,6 +91,11 @@ class Scene:
     def angles(self) -> tuple[bool, ...]:
         """Which coordinates are angles: those in rad."""
         return tuple(unit == "rad" for unit in self.units)
+
+
+def left_of(H_plus: DiscreteHamiltonian) -> DiscreteHamiltonian:
+    """H⁻(p0, q1, s1, h) = −H⁺(q1, p0, s1, −h) of an exact L_d: the step of −h is the step back."""
+    return lambda p0, q1, s1, h: -H_plus(q1, p0, s1, -h)
 
 
 def require_positive(scene: str, **numbers: float) -> None:

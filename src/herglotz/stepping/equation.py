@@ -5,8 +5,8 @@ A model's L_d = (c − 1) A + √c K − h/2 (V0 + V1) + N with A = s0 − h/2 V
     F = a c + α D1 g − √c m v + D1 N + F⁻,    a = p0 − h/2 V0′,    α = c A + √c K / 2,
     J = ∂F/∂q1 = (c a − √c m v / 2) ⊗ D2 g + α D12 g + D1 g ⊗ ∂α/∂q1 − √c m / h + D12 N + ∂F⁻/∂q1,
 
-so V is evaluated once a step, at q0 (where the step before has left it) and at the end, and what an iteration costs
-are the networks of (q̄, v), by sweeps of n tangents.
+so V is evaluated once a step (V at q0 is left from the step before) and an iteration costs only the networks of
+(q̄, v), by sweeps of n tangents.
 """
 
 from __future__ import annotations
@@ -56,23 +56,23 @@ class _Slopes(NamedTuple):
 
 
 class _Constants(NamedTuple):
-    """What depends on h, the shape of the batch and the parameters only."""
+    """Factors that depend only on h, the shape of the batch and the parameters."""
 
     h: Tensor  # (...)
     half: Tensor  # (..., 1) h/2
     rate: Tensor  # (..., 1) 1/h
     minus_2_rate: Tensor  # (..., n)
-    c: Tensor  # (...) and its root, where they are constant
+    c: Tensor  # (...) and √c, where constant
     c_minus_1: Tensor
     minus_root: Tensor  # (..., 1)
     J: Tensor  # (..., n, n) −m/h, times √c where that is constant
     N: Sweep | None  # times h
     G: Sweep | None  # times −h
-    times: Tensor | None  # (...) h where it is not folded into the networks
+    times: Tensor | None  # (...) h, if not folded into the networks
 
 
 class ModelEquation:
-    """Makes the step equations of one model at its present parameters; keeps what they share.
+    """Makes the step equations of a model at the present parameters; keeps shared factors.
 
     `fold` puts h into the networks' last layers: fewer operations where h is one number for all samples.
     """
@@ -89,7 +89,7 @@ class ModelEquation:
         self._key: tuple[Tensor, torch.Size] | None = None
 
     def at(self, state: State, h: Tensor, u: Tensor | None, increments: bool, here: Field | None = None) -> StepOfModel:
-        """The equation of one step; `here` is the potential at q0 where it is known."""
+        """The equation of a step; `here` is the potential at q0, if known."""
         return StepOfModel(self, state, self._at(h, state.q), u, increments, here)
 
     def _at(self, h: Tensor, q0: Tensor) -> _Constants:
@@ -187,7 +187,7 @@ class StepOfModel:
         return dp if force is None else dp + (k.half * (1.0 + c)) * force
 
     def leap(self) -> Tensor:
-        """Δ without networks of (q̄, v), forces and drag, (..., n): near the solution where they are weak."""
+        """Δ without networks of (q̄, v), forces and drag, (..., n): near the solution if these terms are weak."""
         a = self.a if self.maker.affine is None else self.a * -self.constants.minus_root
         return -self.over_kinetic(a)
 
@@ -197,13 +197,13 @@ class StepOfModel:
         return (x @ torch.linalg.inv_ex(self.maker.mass)[0]) * (k.h[..., None] / k.minus_root)
 
     def at(self, x: Tensor, point: Point) -> Point:
-        """Return the point with the velocity and momentum of x, and its other entries unchanged."""
+        """Return the point with the velocity and momentum of x, and the other entries unchanged."""
         v = (x if self.increments else x - self.q0) * self.constants.rate
         mv = v if v.shape[-1] == 1 else v @ self.maker.mass
         return Point(point.F, point.J, (v, mv, *point.rest[2:]))
 
     def end_without_field(self, point: Point) -> End:
-        """What `end` gives, without −h/2 V′(q1) in p1 and −h/2 V(q1) in L."""
+        """The result of `end`, without −h/2 V′(q1) in p1 and −h/2 V(q1) in L."""
         k, maker = self.constants, self.maker
         v, mv, N, damping, force = point.rest
         half = k.half[..., 0]
@@ -276,5 +276,5 @@ class StepOfModel:
 
 
 def model_equation(L_d: DiscreteLagrangian, fold: bool = True) -> ModelEquation | None:
-    """The step equations of L_d by terms, or None where only its partials know them; `fold` as in `ModelEquation`."""
+    """The step equations of L_d by terms, or None if L_d has only partials; `fold` as in `ModelEquation`."""
     return ModelEquation(L_d, fold) if type(L_d) is ContactLagrangian and L_d.capabilities.by_terms else None

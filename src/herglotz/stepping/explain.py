@@ -13,7 +13,7 @@ from herglotz.stepping.state import State, Status
 
 ATTEMPTS, ESCAPE = 60, 4.0
 CORRECTIONS = 15  # Newton iterations of an extrapolated start; one that needs more took too long a stride
-STEPPING = ("finite", "c", "M", "pole")  # what a step needs; H⁺ and H⁻ may be lost
+STEPPING = ("finite", "c", "M", "pole")  # quantities that a step needs; H⁺ and H⁻ may be lost
 
 
 def explain_step(

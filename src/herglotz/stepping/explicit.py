@@ -29,7 +29,7 @@ from herglotz.stepping.state import State, Status
 
 
 class Move(NamedTuple):
-    """What one explicit step gives."""
+    """The result of an explicit step."""
 
     delta: Tensor  # (..., n) q1 − q0
     q1: Tensor  # (..., n)
@@ -41,7 +41,7 @@ class Move(NamedTuple):
 
 
 class _Constants(NamedTuple):
-    """What depends on h and the parameters only."""
+    """Factors that depend only on h and the parameters."""
 
     half: Tensor  # (..., 1) h/2
     half_h: Tensor  # (...)

@@ -1,22 +1,22 @@
 """An extended Kalman filter on the step of a model: measured positions in; state, velocity and covariance out.
 
-The twin of `export/runtime/filter.h`, operation by operation. The filter's state x is (q, p), s where the motion
-depends on it, and chosen numbers θ of the model as slow states. Over a step h whose derivative by x is A, forces that
-the model does not know add w²h to the variance of p, half of it before the step and half after it,
+The twin of `export/runtime/filter.h`, operation by operation. The filter's state x is (q, p), s if the motion
+depends on s, and chosen numbers θ of the model as slow states. Over a step h whose derivative by x is A, forces that
+the model does not know add w²h to the variance of p, half before the step and half after,
 
     P ← A (P + W/2) Aᵀ + W/2,        W = diag(0, w² h, 0, w_θ² h),
 
-so that q and p get their share of each other. Positions y = q + e are taken in one by one, as e is independent:
+so that q and p are correlated. Positions y = q + e are taken in singly, as the components of e are independent:
 
     S = P_ii + σ_i²,    x ← x + P_i (y_i − q_i)/S,    P ← P − P_i P_iᵀ/S.
 
-What a model misses is seldom as large in one motion as in another: the common scale κ of all variances is learned,
+The error of a model differs from motion to motion: the common scale κ of all variances is learned,
 
     w ← (1 − a) w + 1,    κ ← κ + (r − 1) κ/w,        r = Σ (y_i − q_i)²/(κ S_i n),
 
-which changes no estimate (a = 0: it is not learned). A fixed-lag smoother is the same filter of a longer state: x and
+which changes no estimate (a = 0: κ is not learned). A fixed-lag smoother is the same filter of a longer state: x and
 copies of x at the last samples, which steps leave as they are and positions move by their covariance.
-`export/runtime/smoother.h` keeps only the blocks of it that change.
+`export/runtime/smoother.h` keeps only the blocks of P that change.
 
 Source: A. Gelb (ed.), Applied optimal estimation (1974), sections 4.2 and 6.1; B. D. O. Anderson & J. B. Moore, Optimal
 filtering (1979), section 7.3; M. West & J. Harrison, Bayesian forecasting and dynamic models (1997), section 10.8.
@@ -43,25 +43,25 @@ class Noise(NamedTuple):
     """Standard deviations, in the units of q, of p a root of time, and of θ a root of time; the last two grow so."""
 
     position: Sequence[float]  # (n,) of a measured position
-    momentum: Sequence[float]  # (n,) of what unknown forces add to p
+    momentum: Sequence[float]  # (n,) of the change of p by unknown forces
     theta: Sequence[float] = ()  # (K,) of how far the numbers wander
     adaptation: float = 0.0  # of the common scale of all variances, of which 1/adaptation updates tell; 0: as given
 
 
 class Belief(NamedTuple):
-    """What a filter knows at one time."""
+    """The estimate of a filter at a time."""
 
     state: State  # (n,), (n,), ()
     theta: Tensor  # (K,)
-    # (F, F) of q, p, s where the motion depends on it, and θ, over the scale; (F + FL, F + FL) with earlier samples
+    # (F, F) of q, p, s if the motion depends on s, and θ, over the scale; (F + FL, F + FL) with earlier samples
     covariance: Tensor
-    earlier: Tensor | None = None  # (L, F) the same numbers at these, the newest first
+    earlier: Tensor | None = None  # (L, F) the same numbers at the earlier samples, the newest first
     scale: Tensor | float = 1.0  # of all variances, () or (B,)
     weight: float = 1.0  # updates that have told the scale
 
 
 class KalmanFilter:
-    """The filter of one model, with the noise and the numbers θ that it estimates.
+    """The filter of a model, with the noise and the estimated numbers θ.
 
     Parameters
     ----------
@@ -72,9 +72,9 @@ class KalmanFilter:
     parameters
         Names of numbers of the model, as of `chosen`, that are estimated too.
     bounds
-        (low, high) of some of them, by name; their estimates stay within.
+        (low, high) of some parameters, by name; the estimates stay within.
     stepper
-        What steps and differentiates the model, its numbers set by `with_parameters`; by default `Stepper`.
+        Steps and differentiates the model, with numbers set by `with_parameters`; by default `Stepper`.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class KalmanFilter:
         noise: Noise,
         parameters: Sequence[str] = (),
         bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
-        stepper: Any = None,  # an `ExportedStepper`: this room is below its
+        stepper: Any = None,  # an `ExportedStepper`: this package cannot import `export`
     ):
         self.stepper = stepper
         self.model, self.noise, self.n = model, noise, model.dof
@@ -137,9 +137,9 @@ class KalmanFilter:
         return belief._replace(earlier=earlier, covariance=belief.covariance[places][:, places])
 
     def smoothed(self, belief: Belief, back: int) -> Belief:
-        """What is known of the sample before the last `back` remembered ones.
+        """The belief about the sample that lies `back` samples before the last.
 
-        s is that of the belief where the motion does not depend on it. Raise InputError if there is no such sample.
+        If the motion does not depend on s, s is that of the belief. Raise InputError if fewer samples are remembered.
         """
         count = 0 if belief.earlier is None else len(belief.earlier)
         if not 0 <= back <= count:
@@ -181,12 +181,12 @@ class KalmanFilter:
         return torch.cat([torch.cat([q, p, s[None]])[: self.kept], belief.theta])
 
     def _parts(self, x: Tensor, s: Tensor) -> tuple[State, Tensor]:
-        """State and θ of these numbers, with this s where the motion does not depend on it."""
+        """State and θ of these numbers; s is given if the motion does not depend on s."""
         n, kept = self.n, self.kept
         return State(x[:n], x[n : 2 * n], x[2 * n] if kept > 2 * n else s), x[kept:]
 
     def velocity(self, belief: Belief, h: Tensor | float, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The velocity (n,) and its covariance (n, n); of many beliefs at once where no θ is estimated.
+        """The velocity (n,) and its covariance (n, n); of a batch of beliefs if no θ is estimated.
 
         v = 4 d(h/2)/h − d(h)/h from the moves d of steps of h and h/2, exact to order 2 in h. Raise InputError if the
         model has no step there.

@@ -89,7 +89,7 @@ def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
         point = form(x, False)
         end, F = form.end(x, point), point.F
         if isinstance(form, PartialsEquation) and point.rest.force is not None and point.rest.force.held is not None:
-            F = torch.where(point.rest.force.held > 0, delta, F)  # what dry friction holds has Δ = 0
+            F = torch.where(point.rest.force.held > 0, delta, F)  # a sticking coordinate has Δ = 0
         return F, end.p1, end.L
 
     return functions

@@ -1,4 +1,4 @@
-"""What a stepper is: `step` takes one step, and the one driver of rollouts takes any number of them."""
+"""The interface of a stepper: `step` takes a single step, and the common driver of rollouts any number of steps."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, 
 
 
 class OneStepMethod(ABC):
-    """A stepper of states (q, p, s). A concrete one implements `step`; what follows is the same for all."""
+    """A stepper of states (q, p, s). A concrete stepper implements `step`; rollouts are the same for all steppers."""
 
     throw: bool = False  # raise `StepError` at the first sample that fails
     iterates: bool = False  # whether steps want a guess
 
     @abstractmethod
     def step(self, state: Any, h: Tensor | float, guess: Tensor | None = None) -> Step:
-        """One step of h > 0, scalar or (...)."""
+        """A step of h > 0, scalar or (...)."""
 
     def rollout(
         self,
@@ -56,13 +56,13 @@ class OneStepMethod(ABC):
         every
             Keep each m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
         events
-            `Event`s, or functions of the state that stop a sample where they change sign. A sample that stopped keeps
+            `Event`s, or functions of the state; a sample stops where a function changes sign. A stopped sample keeps
             its state at the event, with `Status.STOPPED`. The time of an event is a constant for the gradient.
         checkpoint
             Length of the segments whose inner steps the backward pass computes again: with K steps, memory for about
-            K / length + length of them instead of K. Without gradients it does nothing.
+            K / length + length steps instead of K. Without gradients `checkpoint` has no effect.
         chunk
-            Steps gathered before they are written into the result.
+            Number of steps that are gathered before writing into the result.
 
         Returns
         -------
@@ -72,7 +72,7 @@ class OneStepMethod(ABC):
         Raises
         ------
         InputError
-            If h is not positive, lengths disagree, no inputs are taken, or options do not fit together.
+            If h is not positive, lengths disagree, the L_d takes no inputs, or options do not fit together.
         """
         start = self._checked(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
         if inputs is not None:
@@ -94,7 +94,7 @@ class OneStepMethod(ABC):
         watch: Watch | None = None,
         **plan: Any,
     ) -> Track:
-        """The rollout of any named tuple of tensors whose last entry is (...); exported files have their own loop."""
+        """The rollout of a named tuple of tensors, the last of shape (...); exported files have a loop of their own."""
         h_all = step_sizes(check_h(h, start[-1]), steps)
         if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
             raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
@@ -106,12 +106,12 @@ class OneStepMethod(ABC):
         return check_state(state)
 
     def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:  # noqa: ARG002
-        """The inputs (K, m) or (..., K, m) as a step takes them, beside positions `like`; refused if it takes none."""
+        """The inputs (K, m) or (..., K, m) for positions `like`; raise InputError if the stepper takes no inputs."""
         raise InputError(f"{type(self).__name__} takes no inputs, got {tuple(inputs.shape)}; leave them out")
 
     def _single_step(self) -> OneStep:
         """The function that a rollout's steps are taken by."""
-        return lambda state, h, guess, u, low: (self.step(state, h, guess), None)  # noqa: ARG005  one signature for all
+        return lambda state, h, guess, u, low: (self.step(state, h, guess), None)  # noqa: ARG005  same signature for all
 
     def _check_step(self, step: Step, state: Any, h: Tensor, u: Tensor | None) -> None:  # noqa: ARG002
         """With `throw`, raise `StepError` if a sample failed."""

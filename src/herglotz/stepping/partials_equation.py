@@ -1,4 +1,4 @@
-"""What a step equation is, and that of any L_d through its partials."""
+"""The protocol of a step equation, and the equation of any L_d by partials."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from herglotz.stepping.state import State
 
 
 class End(NamedTuple):
-    """What a solved step hands on."""
+    """The result of a solved step."""
 
     p1: Tensor  # (..., n)
     L: Tensor  # (...) s1 − s0

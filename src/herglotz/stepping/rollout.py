@@ -1,8 +1,8 @@
 """Many steps: inputs, decimation, events, and memory that does not grow with the number of steps.
 
-A rollout is a chain of segments. A segment steps `Carry` to `Carry` and returns the block of states it keeps. Without
-gradients a block is written into buffers made beforehand; with `checkpoint` a segment saves its start only and is run
-again by the backward pass.
+A rollout is a chain of segments. A segment steps `Carry` to `Carry` and returns a block of kept states. Without
+gradients a block is written into buffers made beforehand; with `checkpoint` a segment saves its start only, and the
+backward pass runs the segment again.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from herglotz.stepping.events import Watch
 from herglotz.stepping.guess import LENGTH, Extrapolation
 from herglotz.stepping.state import Crossings, Status, Step, StepError
 
-PROGRESS_AFTER = 2.0  # seconds of a rollout before it has a bar
+PROGRESS_AFTER = 2.0  # seconds of a rollout before a progress bar appears
 
 
 class Carry(NamedTuple):
-    """What one step hands to the next."""
+    """The data that a step hands to the next step."""
 
     state: Any  # `State`, or another named tuple of tensors whose first entry is the position
     trail: tuple[Tensor, ...]  # the last positions, for the guess
     sigma: Tensor  # (...)
-    low: Any  # what rounding took from the state so far (compensated sums), where increments are known
+    low: Any  # rounding lost by the state so far (compensated sums), if increments are known
 
 
 class Block(NamedTuple):
-    """The kept entries of a segment of steps, time first: a step then is one contiguous piece of a buffer."""
+    """The kept entries of a segment of steps, time first: the entries of a step are contiguous in a buffer."""
 
     states: tuple[Tensor, ...]  # (N, ..., *) each
     sigma: Tensor  # (N, ...)
@@ -45,7 +45,7 @@ class Block(NamedTuple):
 
 
 class Track(NamedTuple):
-    """All that a rollout keeps; time is the first axis after those of the batch."""
+    """All entries that a rollout keeps; time is the first axis after the batch's axes."""
 
     states: tuple[Tensor, ...]  # (..., K+1, *) each
     sigma: Tensor  # (..., K+1)
@@ -87,9 +87,9 @@ class Plan:
 
 @dataclass(frozen=True)
 class Drive:
-    """What is rolled out, and how."""
+    """The arguments of a rollout."""
 
-    # Makes the function that takes one step; called once for each segment, whose steps may share work.
+    # Makes the function that takes a step; called once for each segment, so that its steps may share work.
     single_step: Callable[[], OneStep]
     h: Tensor  # (..., K) all steps
     plan: Plan
@@ -105,11 +105,11 @@ class Drive:
 
     @cached_property
     def equal(self) -> Tensor | None:
-        """The step, where all are equal: one tensor, so that what depends on h alone is kept."""
+        """The step, if all steps are equal: the same tensor each time, so that functions of h alone are kept."""
         return self.h[..., 0] if self.h.stride(-1) == 0 else None
 
     def take(self, single: OneStep, k: int, carry: Carry) -> tuple[Step, Any]:
-        """Step k as the events leave it."""
+        """Step k after its events."""
         state, low = carry.state, carry.low
         h = self.h[..., k] if self.equal is None else self.equal
         u = None if self.inputs is None else self.inputs[..., k, :]
@@ -147,7 +147,7 @@ def roll_out(start: Any, drive: Drive) -> Track:
         progress.close()
     parts = [_flat(block) for block in blocks]
     *states, sigma, status, residual = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
-    axis = sigma.ndim - 1  # behind those of the batch
+    axis = sigma.ndim - 1  # the time's axis, behind the batch's
     events = () if drive.watch is None else drive.watch.crossings(carry.state)
     move = lambda x: x.movedim(0, axis)  # noqa: E731
     track = Track(tuple(map(move, states)), move(sigma), move(status), move(residual), events)
@@ -155,7 +155,7 @@ def roll_out(start: Any, drive: Drive) -> Track:
 
 
 def without_lost_factors(track: Track) -> Track:
-    """Steps from where σ = ∏ c_j is too large a number are lost: they are NaN and have a status, as in C."""
+    """Steps behind an overflow of σ = ∏ c_j are lost: their states are NaN, with a status, as in C."""
     if bool(torch.isfinite(track.sigma[..., -1]).all()):
         return track
     lost = ~torch.isfinite(track.sigma) & (torch.arange(track.sigma.shape[-1]) > 0).to(track.sigma.device)

@@ -1,4 +1,4 @@
-"""One step of one discrete Lagrangian, by the cheapest way its form allows: closed form, increments, or positions."""
+"""A step of a discrete Lagrangian by the cheapest way that its form allows: closed form, increments, or positions."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from herglotz.stepping.newton import find_root, status_of
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import State, Status, Step
 
-# Steps below this part of a model's time, typical q over typical v, are solved for Δ: p ~ mΔ/h then would have errors
-# of eps/SHORT = 2e-10 of its size (7e-13 were measured at h = 1e-3 times, 1e-9 at 1e-6, 1e-3 at 1e-12).
+# Steps below this part of a model's time, typical q over typical v, are solved for Δ: p ~ mΔ/h then would have a
+# relative error of eps/SHORT = 2e-10 (7e-13 were measured at h = 1e-3 times, 1e-9 at 1e-6, 1e-3 at 1e-12).
 SHORT = 1e-6
 
 
 class SingleStep:
-    """Steps whose inputs are already checked; keeps what consecutive steps share (the force at the common point).
+    """Steps whose inputs are already checked; keeps the force at the point that consecutive steps share.
 
-    In float32, and at very short h, steps are taken in increments Δ = q1 − q0 where L_d offers them, and rollouts sum
-    them compensated:
-    q1 − q0 and q0 + Δ would round away a small step.
+    In float32, and at very short h, the unknown is the increment Δ = q1 − q0 if L_d offers increments, and rollouts
+    add Δ by compensated summation: q1 − q0 and q0 + Δ would round away a small step.
     """
 
     def __init__(self, L_d: DiscreteLagrangian, tol: float | None, max_iterations: int, explicit: bool):
@@ -38,13 +37,13 @@ class SingleStep:
         self._at: Tensor | None = None
         self._terms: ModelEquation | None = None  # made at the first step that iterates
         self._tried = False
-        self._short: tuple[Tensor, bool] | None = None  # the last h, and whether it is
+        self._short: tuple[Tensor, bool] | None = None  # the last h, and whether that h is short
         self._fine: tuple[Tensor, Tensor] | None = None  # the status and the residual of explicit steps
 
     def __call__(
         self, state: State, h: Tensor, guess: Tensor | None = None, u: Tensor | None = None, low: State | None = None
     ) -> tuple[Step, State | None]:
-        """The step with input u, and the rounding errors to carry on; `low` is what the step before has handed on."""
+        """The step with input u, and the rounding errors to carry on; `low` has those of the step before."""
         if self.leapfrog is not None:
             return self._explicit(self.leapfrog, state, h, u, low)
         return self._implicit(state, h, state.q if guess is None else guess, u, low)
@@ -74,7 +73,7 @@ class SingleStep:
         q0, p0, s0 = state
         L_d = driven_by(self.L_d, u)
         increments = self._in_increments(q0, h) and hasattr(L_d, "partials_increment")
-        # What is left of q1 goes into p divided by h at every step, and adds up: steps are solved to rounding.
+        # The error of q1, divided by h, enters p at every step and adds up: steps are solved to rounding.
         tol = self.tol if self.tol is not None else 4 * torch.finfo(q0.dtype).eps
         order = 2 if torch.is_grad_enabled() else 1
         with torch.no_grad():
@@ -94,7 +93,7 @@ class SingleStep:
             new = new._replace(p=end.p1) if end.dp is None else new
         else:
             new = State(x, end.p1, s0 + end.L)
-        if good:  # the equation is solved; a number of the new state may still be too large, or s0 no number
+        if good:  # the equation is solved; a number of the new state may still be too large, or s0 NaN
             with torch.no_grad():
                 unseen = explicit_status(*new, end.c, True)
             status, good = (status, True) if unseen is None else (unseen, False)
@@ -134,8 +133,8 @@ def driven_by(L_d: DiscreteLagrangian, u: Tensor | None) -> DiscreteLagrangian:
 def _at_pole(L_d: DiscreteLagrangian, state: State, h: Tensor, q1: Tensor, found: Found, status: Tensor) -> Tensor:
     """The status of every sample, SINGULAR where L_d has a pole at this h: q1 is right there, p1 and s1 are rounding.
 
-    |F| / |J⁻¹F| tells the size of J for nothing, and eps |J| |q| the rounding of p1. Only where that leaves p1
-    less than a third of its digits, as it may also for a body almost at rest, L_d is asked beside h.
+    |F| / |J⁻¹F| estimates |J| at no cost, and eps |J| |q| the rounding of p1. Only if that rounding leaves p1 less than
+    a third of its digits, as also for a body almost at rest, L_d is evaluated at neighbours of h.
     """
     q0, p0, s0 = state
     size = torch.maximum(q0.abs(), q1.abs()).amax(-1)
@@ -152,11 +151,11 @@ def _at_pole(L_d: DiscreteLagrangian, state: State, h: Tensor, q1: Tensor, found
 def _attach(
     L_d: DiscreteLagrangian, state: State, h: Tensor, x: Tensor, J: Tensor, increments: bool
 ) -> tuple[Tensor, End]:
-    """Give the solved x its derivative: one Newton step, which is zero in value and dx = −J⁻¹ dF in slope."""
+    """Attach the derivative to the solved x: a Newton step of value zero and slope dx = −J⁻¹ dF."""
     q0, p0, s0 = state
     P = _evaluate(L_d, q0, x, s0, h, increments)
     F = momentum_residual(P, p0)
-    if P.force is not None and P.force.held is not None and not increments:  # what is held has q1 = q0
+    if P.force is not None and P.force.held is not None and not increments:  # a sticking coordinate has q1 = q0
         F = F + torch.where(P.force.held > 0, J.diagonal(0, -2, -1) * (x - q0), 0.0)
     if F.requires_grad:  # an argument, or a parameter of L_d
         x = attached(x, J, F)
@@ -173,7 +172,7 @@ def _evaluate(L_d: DiscreteLagrangian, q0: Tensor, x: Tensor, s0: Tensor, h: Ten
 
 
 def _compensated(state: State, change: State, low: State | None) -> tuple[State, State]:
-    """Kahan's sum: state + change, and what rounding took from it, to be added to the next change."""
+    """Kahan's sum: state + change, and the rounding error, to be added to the next change."""
     wanted = change if low is None else State(*(a + b for a, b in zip(change, low, strict=True)))
     new = State(*(a + b for a, b in zip(state, wanted, strict=True)))
     with torch.no_grad():

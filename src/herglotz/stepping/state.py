@@ -1,4 +1,4 @@
-"""What steppers take and give: states, steps, rollouts and the checks of their inputs."""
+"""Arguments and results of steppers: states, steps, rollouts and the checks of inputs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from herglotz.mechanics.partials import check_arguments
 
 
 class Status(IntEnum):
-    """How the solve for one step ended."""
+    """The end of the solve for a step."""
 
     CONVERGED = 0
     MAX_ITERATIONS = 1  # no convergence within the allowed iterations
     SINGULAR = 2  # det J = 0 (or c = 0): the step is not defined there, erratum E4
-    DIVERGED = 3  # an input, or a number of the state before the step or after it, is not finite
+    DIVERGED = 3  # an input, or a number of the state before or after the step, is not finite
     STOPPED = 4  # no failure: a terminal event ended the trajectory in or before this step
     BAD_INPUT = 5  # h is no step: of exported files by themselves, for a stepper raises
     UNRESOLVED = 6  # solved, but h does not see the motion: set by `tune.flag_unresolved`, never by a stepper
@@ -60,18 +60,18 @@ class State(NamedTuple):
 
 
 def state_of(x: Tensor) -> State:
-    """The point whose numbers stand side by side, (..., 2n+1)."""
+    """The point of numbers side by side, (..., 2n+1)."""
     return State(*split(x))
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step and how it went."""
+    """A step: the new state, its status and its residual."""
 
     state: Any  # `State`, or `herglotz.theory.BodyState`
     c: Tensor  # (...) conformal factor of the step
     status: Tensor  # (...) Status values
-    residual: Tensor  # (...) |J⁻¹F|: what is left of the step equation, in units of q
+    residual: Tensor  # (...) |J⁻¹F| of the step equation, in units of q
     iterations: int
     outside: Tensor | None = None  # (...) of an exported file: 1 where the step leaves the box it was fitted in
 
@@ -88,10 +88,10 @@ class Step:
 
 @dataclass(frozen=True, repr=False)
 class Crossings:
-    """Where one event happened, over all samples of a rollout, in the order of the steps."""
+    """The crossings of an event, over all samples of a rollout, in the order of the steps."""
 
     sample: Tensor  # (M, batch dimensions) index of the sample
-    step: Tensor  # (M,) the step k in which it happened
+    step: Tensor  # (M,) the step k of each crossing
     t: Tensor  # (M,) time since the start
     state: State  # (M, n), (M, n), (M,)
 
@@ -103,7 +103,7 @@ class Crossings:
 class Rollout:
     """A trajectory of K steps; entry 0 is the start. Everything after a failed step is NaN, with its status.
 
-    With `every=m` there is one entry for m steps, and status and residual are the worst of the m.
+    With `every=m` an entry stands for m steps, and status and residual are the worst of the m steps.
     """
 
     q: Tensor  # (..., K+1, n)
@@ -112,7 +112,7 @@ class Rollout:
     sigma: Tensor  # (..., K+1) accumulated conformal factor σ_k = ∏ c_j
     status: Tensor  # (..., K)
     residual: Tensor  # (..., K)
-    events: tuple[Crossings, ...] = ()  # one for each event asked for
+    events: tuple[Crossings, ...] = ()  # the crossings of each event
     outside: Tensor | None = None  # (..., K) of an exported file: 1 where a step leaves the box it was fitted in
 
     def __repr__(self) -> str:
@@ -137,7 +137,7 @@ class Rollout:
 
 
 def check_batch(states: tuple[Tensor, Tensor, Tensor]) -> State:
-    """The states, one batch (B, n), (B, n), (B); raise InputError if they are no tensors, or of other shapes."""
+    """The states as a batch (B, n), (B, n), (B); raise InputError for other types or shapes."""
     q, p, s = states
     check_arguments(q, p, s, ("q", "p", "s"))
     if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
@@ -150,8 +150,8 @@ def check_state(
 ) -> State:
     """The same state.
 
-    Raise InputError if shapes or dtypes do not fit together, or not the parameters of L_d, where it has any (an
-    exported file: its `dof` and `dtype`); with `finite`, if a number is not.
+    Raise InputError if shapes or dtypes fit neither each other nor the parameters of L_d (of an exported file: `dof`
+    and `dtype`); with `finite`, also if a number is not finite.
     """
     q, p, s = state
     check_arguments(q, p, s, names)
@@ -177,7 +177,7 @@ def check_state(
 
 
 def check_started(state: State) -> State:
-    """The same state, made by `init`; raise StepError if a number of it is not finite."""
+    """The same state, made by `init`; raise StepError if any of its numbers is not finite."""
     good = torch.isfinite(state.p).all(-1) & torch.isfinite(state.s)
     if not bool(good.all()):
         sample = tuple(int(i) for i in (~good).nonzero()[0])
@@ -199,7 +199,7 @@ def check_moving(v: Tensor, status: Tensor) -> Tensor:
 def check_h(h: Tensor | float, like: Tensor) -> Tensor:
     """The time step as a tensor of the dtype and device of `like`.
 
-    Raise InputError if it is not positive and finite.
+    Raise InputError if h is not positive and finite.
     """
     h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
     if not h.numel():
@@ -211,7 +211,7 @@ def check_h(h: Tensor | float, like: Tensor) -> Tensor:
 
 
 def check_rows(inputs: Tensor) -> None:
-    """Refuse inputs of a rollout that are no rows: one row (m) a step is wanted."""
+    """Raise InputError if the inputs of a rollout are no rows: each step takes a row (m)."""
     if inputs.ndim < 2:
         raise InputError(f"inputs need the shape (K, m) or (..., K, m), got {tuple(inputs.shape)}")
 
@@ -219,7 +219,7 @@ def check_rows(inputs: Tensor) -> None:
 def step_sizes(h: Tensor, steps: int | None) -> Tensor:
     """All K steps, (K,) or (..., K), from a scalar and a count or from a list.
 
-    Raise InputError if a scalar comes without a count, or a list with another one.
+    Raise InputError if a scalar comes without a count, or a list has another length than the count.
     """
     if h.ndim == 0:
         if steps is None or steps < 1:
@@ -233,7 +233,7 @@ def step_sizes(h: Tensor, steps: int | None) -> Tensor:
 def status_of_root(
     root: Root,
     finite: Tensor,  # (...) whether the step has finite numbers
-    singular: Tensor | None = None,  # (...) whether it is not defined at the solution, beside where J is singular
+    singular: Tensor | None = None,  # (...) whether the step is undefined at the solution, beside a singular J
 ) -> Tensor:
     """The status of each sample from where its iteration ended, uint8."""
     singular = ~torch.isfinite(root.error) if singular is None else singular | ~torch.isfinite(root.error)
@@ -243,7 +243,7 @@ def status_of_root(
 
 
 def throw_failure(status: Tensor, residual: Tensor) -> None:
-    """Raise `StepError` for the first sample that failed, if one did: how, and what to do."""
+    """Raise `StepError` for the first failed sample, if any, with the reason and the remedy."""
     failed = (status != Status.CONVERGED) & (status != Status.STOPPED)
     if bool(failed.any()):
         index = tuple(int(i) for i in failed.nonzero()[0])

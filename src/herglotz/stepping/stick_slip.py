@@ -38,7 +38,7 @@ class PartialsAtHand(StepEquation, Protocol):
 
 
 class Rest(NamedTuple):
-    """What the equation at Δ = 0 says of a step, (..., n) each."""
+    """The terms of the equation of a step at Δ = 0, (..., n) each."""
 
     start: Tensor  # z of the equation that is linear in Δ
     stiffness: Tensor  # K
@@ -76,7 +76,7 @@ class StickSlip:
         self.equation, self.stiffness, self.bound = equation, stiffness, bound
 
     def unknown(self, z: Tensor) -> Tensor:
-        """What the equation itself has for its unknown: Δ, or q1."""
+        """The unknown of the equation: Δ, or q1."""
         delta = soft_threshold(z, self.bound)
         return delta if self.equation.increments else self.equation.q0 + delta
 

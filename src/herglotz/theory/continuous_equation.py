@@ -1,4 +1,4 @@
-"""The continuous equation of a discrete Lagrangian: backward error analysis of its step, without a fit.
+"""The continuous equation of a discrete Lagrangian: backward error analysis of the step, without a fit.
 
 The step Φ̃ of L_d at one h is, up to terms that no power of h sees, the time-h flow of a contact vector field X̃. Its
 iterates x_j = Φ̃ʲ(x_0) lie on one smooth motion, so X̃ and the motion between them are sums over iterates:
@@ -9,7 +9,7 @@ with the weights of differences of order 2m and of Lagrange's polynomials. Both 
 analysis, cut at h^{2m}; m is chosen for every sample where two orders agree best, and their difference is the error
 estimate. The series is asymptotic: a step of a map that is not integrable is the flow of no field beyond an error that
 is exponentially small in 1/h, and that no m removes (Hénon–Heiles at 12 samples a period: 4e-6 with 18 and with 28).
-X̃ is contact because Φ̃ is, and its Hamiltonian needs no integration: H̃ = −η(X̃) = p·q̇ − ṡ, L̃ = ṡ, and
+X̃ is contact because Φ̃ is, and the Hamiltonian needs no integration: H̃ = −η(X̃) = p·q̇ − ṡ, L̃ = ṡ, and
 dH̃/dt = −(∂H̃/∂s) H̃.
 
 Sources: M. Vermeeren, A. Bravetti, M. Seri, J. Phys. A 52 (2019) 445206, for contact integrators; S. Ober-Blöbaum,
@@ -86,17 +86,17 @@ def weights(nodes: Tensor, theta: float) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class ContinuousEquation:
-    """X̃, H̃ and L̃ of a discrete Lagrangian at one step, and its motion between the steps.
+    """X̃, H̃ and L̃ of a discrete Lagrangian at a step h, and the motion between the steps.
 
-    With forces the step is no contact map: X̃ and the motion stand, H̃ = p·q̇ − ṡ is the energy, and dH̃/dt has the power
-    of the forces, too.
+    With forces the step is no contact map: X̃ and the motion stand, H̃ = p·q̇ − ṡ is the energy, and dH̃/dt has the
+    power of the forces, too.
 
     Parameters
     ----------
     L_d
         The discrete Lagrangian; of a driven one, `L_d.at(u)`.
     h
-        The step at which it was learned, or is to be understood.
+        The step at which L_d was learned, or is to be understood.
     order
         2m, even; None: chosen for every sample. Order 2m is the series in h cut after h^{2m}.
     """
@@ -147,7 +147,7 @@ class ContinuousEquation:
 
 
 class _Iterates:
-    """The iterates of a state, made when they are asked for: x_j with ln σ_j, (..., 2n+2), j of either sign."""
+    """The iterates of a state, made on demand: x_j with ln σ_j, (..., 2n+2), j of either sign."""
 
     def __init__(self, equation: ContinuousEquation, state: State):
         state = State(*check_state(state))
@@ -157,7 +157,7 @@ class _Iterates:
         self.nodes = {0: (first, torch.zeros_like(state.s, dtype=torch.uint8))}
 
     def node(self, j: int) -> tuple[Tensor, Tensor]:
-        """x_j and the status of the steps that lead to it."""
+        """x_j and the status of the steps from x_0 to x_j."""
         while j > max(self.nodes):
             self._add(max(self.nodes), 1)
         while j < min(self.nodes):
@@ -165,7 +165,7 @@ class _Iterates:
         return self.nodes[j]
 
     def forget(self, before: int) -> None:
-        """Drop what lies before a node."""
+        """Drop the iterates before a node."""
         self.nodes = {j: x for j, x in self.nodes.items() if j >= before}
 
     def _add(self, last: int, sign: int) -> None:
@@ -201,7 +201,7 @@ def _summed(iterates: _Iterates, centre: int, theta: float, derivative: int) -> 
     for m in range(1, iterates.most + 1):
         window = [iterates.node(j) for j in range(centre - m, centre + m + 1)]
         w = weights(torch.arange(-m, m + 1, dtype=torch.float64), theta)[derivative].tolist()
-        # differences to the centre: their sum with weights that add up to 0 or 1 loses no digits to it
+        # differences to the centre: a sum with weights that add up to 0 or 1 then loses no digits
         total = sum(weight * (x - middle) for weight, (x, _) in zip(w, window, strict=True))
         sound = torch.stack([status == Status.CONVERGED for _, status in window]).all(0)
         total = total + (middle if derivative == 0 else 0.0)
@@ -219,10 +219,10 @@ def _summed(iterates: _Iterates, centre: int, theta: float, derivative: int) -> 
 
 
 class FractionalStepper(OneStepMethod):
-    """Steps of any length along the motion of a `ContinuousEquation`: whole steps of its L_d, and parts between them.
+    """Steps of any length along the motion of a `ContinuousEquation`: whole steps of L_d, and parts between.
 
-    A rollout keeps the iterates of its start: it costs the whole steps over its time, at most `MOST` on either side
-    of it, and sums.
+    A rollout keeps the iterates of the start, and costs the whole steps over the time, at most `MOST` on either side,
+    and sums.
     The status is `UNRESOLVED` where two orders differ by more than `tolerance`, relative to a whole step.
     """
 
@@ -231,7 +231,7 @@ class FractionalStepper(OneStepMethod):
         self._last: tuple[Tensor, _Iterates, float, Tensor] | None = None  # the last q, its motion, time and ln σ
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
-        """One step of a scalar h > 0."""
+        """A step of a scalar h > 0."""
         state = check_state(state)
         size = check_h(h, state.q)
         if size.ndim:
@@ -255,7 +255,7 @@ class FractionalStepper(OneStepMethod):
 
 
 def _parts(time: float) -> tuple[int, float]:
-    """The whole steps of a time in steps, and the rest, 0 where it is a multiple."""
+    """The whole steps of a time in steps, and the rest, 0 for a multiple."""
     whole = round(time)
     if abs(time - whole) <= WHOLE * max(time, 1.0):
         return whole, 0.0

@@ -1,12 +1,12 @@
-"""The affine point symmetries of a discrete Lagrangian, found as a null space, and the quantities that they keep.
+"""The affine point symmetries of a discrete Lagrangian, found as a null space, and their conserved quantities.
 
-A generator ξ(q) = A q + b moves positions, and the action by s ↦ s + ε (a s + χ(q)), χ(q) = k + w·q + ½ q·B q. It is
-a symmetry of L_d where
+A generator ξ(q) = A q + b moves positions, and the action by s ↦ s + ε (a s + χ(q)), χ(q) = k + w·q + ½ q·B q.
+The generator is a symmetry of L_d where
 
     D1·ξ(q0) + D2·ξ(q1) + c (a s0 + χ(q0)) − (a s1 + χ(q1)) = 0,        s1 = s0 + L_d,
 
 at every (q0, q1, s0) of an open set. χ = a = 0 is invariance. χ ≠ 0 is invariance up to a boundary term, which a
-translation in a magnetic field needs, and one along gravity with damping (χ = −mg/γ). a = 2 and A = 1 scale the
+translation needs in a magnetic field, or along gravity with damping (χ = −mg/γ). a = 2 and A = 1 scale the
 solutions of a linear equation. By −D1 = c p_k and D2 = p_{k+1} the left-hand side is J_{k+1} − c_k J_k for
 
     J(q, p, s) = p·ξ(q) − a s − χ(q),
@@ -14,12 +14,12 @@ solutions of a linear equation. By −D1 = c p_k and D2 = p_{k+1} the left-hand 
 so that J_{k+1} = c_k J_k is not a consequence of the symmetry but the symmetry itself (`herglotz.theory.noether`), and
 J_k = σ_k J_0. With forces the same holds of L_d, and J changes by F⁻·ξ(q0) + F⁺·ξ(q1) beside.
 
-The condition is linear in (A, b, a, k, w, B). Its defects are summed along motions of K steps, J_k − σ_k J_0, so that
-what is no symmetry is broken by its whole rate of change and not by h times it; χ is chosen best for every ξ by
-projection; a singular value is then an RMS defect over the RMS of what no boundary term explains of p·ξ − a s, a number
-without a unit that s ↦ s + b(q), b quadratic, does not change: the **drift**. A generator is a symmetry where its drift
-is at most `precision`: rounding of an L_d that is known, the relative error of the free run of a learned one (J is then
-kept as precisely as the model keeps its positions). Positions alone determine L_d up to a gauge (trap 3): a network
+The condition is linear in (A, b, a, k, w, B). The defects are summed along motions of K steps, J_k − σ_k J_0, so that
+the defect of a generator without symmetry grows with the duration and not with h. χ is chosen best for every ξ by
+projection. A singular value is then the RMS defect over the RMS of the part of p·ξ − a s outside all boundary terms: a
+number without a unit that s ↦ s + b(q), b quadratic, does not change, the **drift**. A generator is a symmetry if the
+drift is at most `precision`: the rounding of a known L_d, or the relative error of the free run of a learned L_d (J is
+then kept as precisely as the model keeps positions). Positions alone determine L_d up to a gauge (trap 3): a network
 that was fitted to them may hide a symmetry behind a boundary term that is not quadratic; named terms do not.
 
 Sources: E. Lishkova, P. Scherer, S. Ridderbusch, M. Jamnik, P. Liò, S. Ober-Blöbaum, C. Offen, Discrete Lagrangian
@@ -41,19 +41,19 @@ from herglotz.stepping import State, Status, Stepper
 from herglotz.stepping.state import check_batch
 from herglotz.theory.symmetry_words import formula, name_of
 
-# Of drift, for an L_d that is known: its symmetries leave 1e-16 to 1e-13 (float32: 1e-6), and one that is broken by
-# 1e-7 of the force leaves more (`tests/unit/theory/test_symmetries.py`).
+# Of drift, for a known L_d: symmetries leave 1e-16 to 1e-13 (float32: 1e-6), and a symmetry that is broken by 1e-7 of
+# the force leaves more (`tests/unit/theory/test_symmetries.py`).
 PRECISION = {torch.float64: 1e-9, torch.float32: 1e-4}
-SEEN = 1e-7  # of the largest: a generator whose p·ξ − a s is smaller on all motions is not determined by them
-FLAT = 1e-12  # of its terms: a boundary term whose defect is smaller is trivial, as a constant where c = 1
-NEAR = 0.05  # of its largest entry: entries so near to ½, 1, … are tried there
+SEEN = 1e-7  # of the largest: the motions do not determine a generator whose p·ξ − a s is smaller on all motions
+FLAT = 1e-12  # of the terms: a boundary term with a smaller defect is trivial, as a constant where c = 1
+NEAR = 0.05  # of the largest entry: entries this near to ½, 1, … are tried as ½, 1, …
 
 
 @dataclass(frozen=True, repr=False)
 class Symmetries:
-    """r generators in the order translations, rotations and others; `print` says each in words, with its J.
+    """r generators in the order translations, rotations and others; `print` says each in words, with J.
 
-    `len` is r. A basis of the algebra is reduced to entries 0 and 1 as far as it can be.
+    `len` is r. A basis of the algebra is reduced to entries 0 and 1 as far as possible.
     """
 
     A: Tensor  # (r, n, n) ξ(q) = A q + b
@@ -82,7 +82,7 @@ class Symmetries:
         return (self.A.to(q) @ q[..., None, :, None])[..., 0] + self.b.to(q)
 
     def shift(self, q: Tensor, s: Tensor) -> Tensor:
-        """What a generator adds to s: a s + χ(q), (..., n) and (...) → (..., r)."""
+        """The change of s by each generator: a s + χ(q), (..., n) and (...) → (..., r)."""
         bent = (q[..., None, None, :] @ self.B.to(q) @ q[..., None, :, None])[..., 0, 0]
         return self.a.to(s) * s[..., None] + self.k.to(q) + q @ self.w.to(q).mT + 0.5 * bent
 
@@ -92,7 +92,7 @@ class Symmetries:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every symmetry in words, such as "translation along x" or "rotation in the plane (x, y)"."""
+        """Every symmetry in words, for example "translation along x" or "rotation in the plane (x, y)"."""
         return tuple(name_of(self.A[i], self.b[i], float(self.a[i]), self.coordinates) for i in range(len(self)))
 
     def to_dict(self) -> dict[str, object]:
@@ -138,11 +138,11 @@ def symmetries(
     states
         Starts of motions that fill an open set; of a single motion not every direction is determined (`unseen`).
     steps
-        K, the steps of each motion; the motions should last long enough for what is no symmetry to change.
+        K, the steps of each motion; the motions should last long enough to break every generator that is no symmetry.
     precision
         Largest drift of a symmetry; by default 1e-9, in float32 1e-4.
     angles
-        Which coordinates are angles: ξ and χ do not depend on those, which keeps them single-valued.
+        Which coordinates are angles: ξ and χ do not depend on angles, and so are single-valued.
     coordinates
         Names for the words; by default q1, q2, ….
 
@@ -170,7 +170,7 @@ class _Columns:
     """
 
     defect: Tensor  # (R, m) J_k − σ_k J_0
-    size: Tensor  # (R, m) p·ξ − a s without what boundary terms explain
+    size: Tensor  # (R, m) p·ξ − a s without the part in the span of boundary terms
     shift: Tensor  # (R, m') J_k − σ_k J_0 of the boundary terms
     terms: Tensor  # (m') RMS of the boundary terms
     centre: Tensor  # (n) q̄
@@ -193,7 +193,7 @@ class _Columns:
         return chi
 
     def drift(self, rows: Tensor) -> Tensor:
-        """RMS of what is left over RMS of the size, (r)."""
+        """RMS defect over RMS size, (r)."""
         left = rows @ self.defect.mT + self.chi(rows) @ self.shift.mT
         return _rms(left.mT) / _rms(self.size @ rows.mT)
 
@@ -228,7 +228,7 @@ def _columns(L_d: DiscreteLagrangian, states: State, h: Tensor | float, steps: i
     defect = torch.stack(rows, 1).flatten(0, 1)
     size = torch.cat([pair(P.D2, q1), P.D2, -s1[..., None]], -1).flatten(0, 1)
     chi, m = chi1.flatten(0, 1), size.shape[-1]
-    # what a boundary term explains is no size, as a gauge adds it to p; nor is what s keeps of its start
+    # the size leaves out boundary terms, which a gauge adds to p, and the part of s from the start value
     start = torch.cat([s0[:, :1, None], chi0[:, :1]], -1)
     kept = (P.c.cumprod(-1)[..., None] * start).flatten(0, 1)
     size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, kept], -1), size[:, -1:])], -1)
@@ -238,7 +238,7 @@ def _columns(L_d: DiscreteLagrangian, states: State, h: Tensor | float, steps: i
 
 
 def _beside(known: Tensor, columns: Tensor) -> Tensor:
-    """What columns have beside the span of others."""
+    """The part of the columns outside the span of others."""
     U, S, _ = torch.linalg.svd(known / _rms(known).clamp_min(FLAT), full_matrices=False)
     U = U[:, FLAT * S[0] < S]
     return columns - U @ (U.mT @ columns)
@@ -250,7 +250,7 @@ def _null_space(x: _Columns, precision: float, names: tuple[str, ...]) -> Symmet
     basis, drift, unseen = _small(x, list(range(wide + n + 1)), precision)
     moved, _, _ = _small(x, list(range(wide, wide + n)), precision)
     moved = _reduced(moved, range(wide, wide + n))
-    # what is left beside the translations: the directions of the basis that are furthest from them
+    # the rest beside the translations: the directions of the basis that are furthest from them
     Q, _ = torch.linalg.qr(x.size @ moved.mT)
     beside = x.size @ basis.mT
     _, _, V = torch.linalg.svd(beside - Q @ (Q.mT @ beside), full_matrices=False)
@@ -297,13 +297,13 @@ def _reduced(rows: Tensor, columns: Sequence[int]) -> Tensor:
 
 
 def _snapped(x: _Columns, row: Tensor, precision: float) -> Tensor:
-    """A generator with its largest entry 1, and entries near halves of whole numbers put there if it stays one."""
+    """A generator with largest entry 1, and entries near half-integers rounded if the drift stays small."""
     n = len(x.centre)
     A, b = row[: -n - 1], row[-n - 1 : -1]
     for lead in (A, b, row[-1:]):
         size = lead.abs().amax() if len(lead) else row.new_zeros(())
         if float(size) > NEAR * float(row.abs().amax()):
-            row = row / lead[int((lead.abs() > 0.999 * size).nonzero()[-1])]  # of equal ones the last: x p_y − y p_x
+            row = row / lead[int((lead.abs() > 0.999 * size).nonzero()[-1])]  # the last of equal entries: x p_y − y p_x
             break
     whole = torch.round(2 * row) / 2
     snapped = torch.where((row - whole).abs() < NEAR, whole, row)
@@ -317,7 +317,7 @@ def _boundary(q: Tensor) -> Tensor:
 
 
 def _expanded(chi: Tensor, x: _Columns, a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """k, w, B of χ(q) = k + w·q + ½ q·B q from its terms about q̄, and of a s from those about s̄."""
+    """k, w, B of χ(q) = k + w·q + ½ q·B q from the terms about q̄, and of a s from those about s̄."""
     n, size = len(x.centre), len(x.straight)
     slope, B = chi.new_zeros(len(chi), n), chi.new_zeros(len(chi), n, n)
     i, j = (torch.tensor(x.straight, dtype=torch.int64)[y] for y in torch.triu_indices(size, size))

@@ -1,4 +1,4 @@
-"""The result of `tune`: every setting with its error and cost, the front, and the choice as a run."""
+"""The result of `tune`: every setting with error and cost, the front, and the choice as a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from herglotz.tune.kick_composition import KickStepper
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to step: a model, a step size and a form."""
+    """A way to step: a model, a step size and a form."""
 
     multiple: float  # of the run's step
     h: float
@@ -42,7 +42,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting with its measured error and cost."""
+    """A setting with the measured error and cost."""
 
     setting: Setting
     median: float  # error of the median start: largest |q − reference| over the horizon, in units of q
@@ -55,7 +55,7 @@ class Candidate:
 
     @property
     def us(self) -> float:
-        """Return microseconds for one unit of simulated time."""
+        """Return microseconds for a unit of simulated time."""
         return self.cost.step_us / self.setting.h
 
     @property
@@ -86,7 +86,7 @@ def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 @dataclass(frozen=True)
 class Tuning:
-    """All settings tried, the chosen one, and its errors on starts that had no part in the choice."""
+    """All settings tried, the choice, and the errors of the choice on starts that had no part in choosing."""
 
     run: Run
     config: TuneConfig
@@ -105,27 +105,27 @@ class Tuning:
 
     @property
     def own(self) -> Candidate:
-        """Return the run as it is: its own model at its own step, eager."""
+        """Return the run unchanged: the model at the step of the data, eager."""
         return self.candidates[0]
 
     @property
     def own_in_c(self) -> Candidate | None:
-        """Return the run's own model at its own step in C, in the faster precision; None without C."""
+        """Return the unchanged run in C, in the faster precision; None without C."""
         found = [c for c in self.candidates if c.setting.artefact == "c" and c.model is self.own.model]
         found = [c for c in found if c.setting.multiple == 1]
         return min(found, key=lambda c: c.us, default=None)
 
     @property
     def model_error(self) -> dict[str, float | None]:
-        """Return the RMS errors of the run against its data, in units of q; errors of stepping add to them."""
+        """Return the RMS errors of the run against its data, in units of q; errors of stepping come on top."""
         names = ("extrapolation_rms", "train_rms", "one_step_rms")
         return {name: self.run.metrics.get(name) for name in names}
 
     def tuned_run(self) -> Run:
-        """Return the chosen model as a run with its own step, on motions of the reference, for `save_run` and export.
+        """Return the chosen model as a run at the chosen step, on motions of the reference, for `save_run` and export.
 
-        States (q, p, s) of the old run are states of this one. Where kicks were chosen, which are no model, it is the
-        old run's model at its own step: `export_kicks_c(tuning.chosen.kicks, …)` writes the kicks.
+        States (q, p, s) of the old run are states of the new run. If kicks were chosen, which are no model, the old run
+        is returned: `export_kicks_c(tuning.chosen.kicks, …)` writes the kicks.
         """
         if self.chosen.kicks is not None:
             return self.run
@@ -149,7 +149,7 @@ class Tuning:
         )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
-        """The choice and its measurements, for JSON."""
+        """The choice and the measurements, for JSON."""
         return {
             "asked": self.asked, "chosen": self.chosen.to_dict(), "held_out": self.held_out,
             "horizon": self.horizon, "model_error": self.model_error,
@@ -168,7 +168,7 @@ class Tuning:
         }
 
     def table(self) -> str:
-        """The front, the run as it is and the choice (*), for people, in 80 columns."""
+        """The front, the unchanged run and the choice (*), for people, in 80 columns."""
         per, share = time_label(self.run), f"{100 * self.config.quantile:g} %"
         shown = self.front
         shown += [c for c in (self.own, self.chosen) if c not in shown]

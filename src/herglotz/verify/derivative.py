@@ -15,14 +15,14 @@ from herglotz.verify.sampled_rollout import SampledRollout, rounded, worst
 from herglotz.verify.subject import Subject
 
 # Offset of the differences of order 8, in units of each component's spread over the samples. float64: truncation and
-# rounding are of one size there; float32: rounding decides.
+# rounding are of equal size there; float32: rounding decides.
 OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
 # Sound maps leave 5e-14 to 9e-12 in float64 (every scene, 32 samples). A potential that autograd does not see leaves
 # 0.1 at h = 0.1 and 0.001 at h = 0.001.
 AGREES = {torch.float64: 1e-6, torch.float32: 1e-2}
 NARROW = (0.1, 1e-3)  # of the offset: further differences, where the first do not agree
-COARSE = 0.01  # that these must agree with the wide ones to: a jump is seen by a wide stencil only
-VARIES = 1e4  # roundings of a component: a smaller spread is that of one value
+COARSE = 0.01  # to which narrow differences must agree with the wide: only a wide stencil sees a jump
+VARIES = 1e4  # roundings of a component: with a smaller spread the component is constant
 MOST = 4096  # steps in all: the points are drawn from all rollouts, 170 of one coordinate, 48 of ten
 
 
@@ -30,12 +30,12 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
     """Compare DΦ̃ at steps of all rollouts with central differences, in units of the components' spreads.
 
     A jump is seen where a stencil meets it, so there are many points: each covers 8 % of a spread. A map that bends
-    within that (near a wall, a collision) is compared with narrower differences, and by `COARSE` with the wide ones.
+    within 8 % (near a wall, a collision) is compared with narrower differences, and by `COARSE` with the wide.
     The error is the largest |ΔDΦ̃_ij| spread_j, over the largest |DΦ̃_ij| spread_j of row i.
 
     Set-valued friction has kinks, at which no derivative exists. Samples are judged whose stencil, wide or narrow,
-    stays on one branch of the map; the wide ones have no say where narrow ones do, for Stribeck's curve bends sharply.
-    Of other forces nobody knows where the kinks are: the median of the samples is judged.
+    stays on one branch of the map; wide differences do not count where narrow ones do, as Stribeck's curve bends
+    sharply. Of other forces nobody knows where the kinks are: the median of the samples is judged.
     """
     x = torch.cat([w.q[:, :-1], w.p[:, :-1], w.s[:, :-1, None]], -1)[w.ok]
     count, make = MOST // (2 * len(WEIGHTS) * x.shape[-1]), torch.Generator().manual_seed(0)
@@ -62,7 +62,7 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
 
 
 def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: float) -> Tensor:
-    """The largest error of a sample, (B), over the largest entry of its row; NaN where no differences exist."""
+    """The largest error of a sample, (B), over the largest entry of the row; NaN where no differences exist."""
     with torch.no_grad():
         found = central_differences(lambda y: stepped(subject.step, y, subject.h), x, offset * spread, subject.sticks)
     scaled, error = D.abs() * spread, (D - found).abs() * spread
@@ -71,7 +71,7 @@ def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: floa
 
 
 def _spread(x: Tensor) -> Tensor:
-    """Standard deviation of every component; of one that does not vary its size, or 1."""
+    """Standard deviation of every component; of a constant component the size, or 1."""
     if not len(x):
         return torch.ones_like(x[0:1].sum(0))
     spread, floor = x.std(0, correction=0), x.abs().amax(0)

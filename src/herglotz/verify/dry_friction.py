@@ -1,10 +1,10 @@
-"""Set-valued dry friction: its step map is smooth on branches, and what it holds has an identity of its own.
+"""Set-valued dry friction: the step map is smooth on branches, and a stuck coordinate has an identity of its own.
 
-A step is on one branch while every coordinate keeps to sliding forward, sliding back or standing still (stuck). On a
-branch the map is differentiable, and the identities of a forced contact map hold. A stuck coordinate stays exactly
-where it is, q1 = q0, whatever the state is nearby: it does not answer to p0, so M = −c (∂q1/∂p0)⁻¹ is that of the
-coordinates which slide. The impulse that holds it is what balances its momentum, F⁻ = −D1 − c p0, and friction has it
-where λ, that of dry friction, is within c h (τ + ε). Source: `herglotz.stepping.stick_slip`.
+A step stays on a branch while every coordinate keeps to sliding forward, sliding back or standing still (stuck). On a
+branch the map is differentiable, and the identities of a forced contact map hold. A stuck coordinate stays at q1 = q0
+for all states nearby: q1 does not depend on p0, so that M = −c (∂q1/∂p0)⁻¹ is defined for the sliding coordinates
+alone. The holding impulse balances the momentum, F⁻ = −D1 − c p0, and friction can supply the impulse if its part λ of
+dry friction is within c h (τ + ε). Source: `herglotz.stepping.stick_slip`.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ HOLDS = "dry friction holds within its bound: |λ| ≤ c h (τ + ε)"
 
 
 def forces(known: Subject, w: SampledRollout) -> Forces | None:
-    """Return F⁻ and F⁺ at the steps that are ok; None where the subject has no forces.
+    """Return F⁻ and F⁺ at the steps that are ok; None if the subject has no forces.
 
-    Of a coordinate that dry friction holds, F⁻ has what holds it: all of D1 + c p0 + F⁻ that friction can.
+    For a stuck coordinate F⁻ includes the holding impulse: as much of D1 + c p0 + F⁻ as dry friction can supply.
     """
     if known.L_d is None:
         return None
@@ -42,9 +42,9 @@ def forces(known: Subject, w: SampledRollout) -> Forces | None:
 
 
 def holding(known: Subject, w: SampledRollout, bound: float) -> Check:
-    """Check that the impulse which a stuck coordinate needs is one that dry friction can have.
+    """Check that dry friction can supply the impulse that a stuck coordinate needs.
 
-    The value is what is missing, relative to the terms that cancel. Sliding coordinates have no such bound.
+    The value is the missing impulse, relative to the terms that cancel. Sliding coordinates have no bound.
     """
     assert known.L_d is not None
     done = w.status == Status.CONVERGED  # the derivative of the map has no say
@@ -61,6 +61,6 @@ def holding(known: Subject, w: SampledRollout, bound: float) -> Check:
 
 
 def on_sliding(X: Tensor, slides: Tensor, rest: float) -> Tensor:
-    """X (..., n, n) between coordinates that slide (..., n); of the others `rest` on the diagonal, and 0 beside it."""
+    """X (..., n, n) between sliding coordinates (..., n); for the others `rest` on the diagonal and 0 elsewhere."""
     both = slides[..., :, None] & slides[..., None, :]
     return torch.where(both, X, torch.diag_embed(torch.where(slides, 0.0, rest).to(X)))

@@ -169,7 +169,7 @@ def _details(known: Subject, steps: int, seed: int) -> dict[str, Any]:
 
 
 def _not_judged(known: Subject) -> str:
-    """What a reader could take the table for and it does not say."""
+    """Notes against misreadings of the table."""
     if known.run is not None:
         return "whether p, s and γ are true, other h, and motions unlike the recorded ones."
     if known.scene is not None and known.scene.exact:

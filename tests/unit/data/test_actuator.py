@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -34,11 +35,11 @@ def stepped_finely(t, u, hold, delay, lag, fine=2000):
     grid = torch.cat([(t[:-1, None] + part * t.diff()[:, None]).flatten(), t[-1:]])
     late = ((grid[1:] + grid[:-1]) / 2 - delay).clamp_min(float(t[0]))
     row = (torch.searchsorted(t, late, right=True) - 1).clamp(0, len(t) - 2)
-    source = held(hold, t, u, [len(t)], row, (late - t[row]) / (t[row + 1] - t[row]))
-    decay, values = torch.exp(-grid.diff() / lag), [u[0]]
-    for k in range(len(source)):
-        values.append(source[k] + (values[-1] - source[k]) * decay[k])
-    return torch.stack(values), fine
+    source = held(hold, t, u, [len(t)], row, (late - t[row]) / (t[row + 1] - t[row])).numpy()
+    decay, values = torch.exp(-grid.diff() / lag).tolist(), [u[0].numpy()]
+    for wanted, left in zip(source, decay, strict=True):
+        values.append(wanted + (values[-1] - wanted) * left)
+    return torch.from_numpy(np.stack(values)), fine
 
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
@@ -76,8 +77,8 @@ def test_polynomials_are_delayed():
 
 @pytest.mark.parametrize("suffix", ["csv", "npz"])
 def test_files_say_delay_and_lag(tmp_path, suffix):
-    # fails if a file loses them, takes "0" for "not said", or the digest does not see them
-    for said in ({}, {"hold": "first", "delay": 0.25, "lag": 0.0}):
+    # fails if a file loses the hold, the delay or the lag, takes "0" for "not said", or the digest does not see them
+    for said in ({}, {"hold": "smooth"}, {"hold": "first", "delay": 0.25, "lag": 0.0}):
         save(tmp_path / f"a.{suffix}", recorded(**said))
         again = load(tmp_path / f"a.{suffix}", show=False)
         assert again.arrival == recorded(**said).arrival

@@ -170,7 +170,7 @@ def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize(("count", "shown"), [(199, 200), (200, 201), (5000, 201)])
+@pytest.mark.parametrize(("count", "shown"), [(199, 200), (200, 201), (1000, 201)])
 def test_a_table_of_many_columns_is_short(tmp_path, capsys, count, shown):
     # fails if a wide table is printed line by line (100 000 of them), its ends are missing, or one that fits is cut
     read(tmp_path, ",".join(["t", *(f"x{k}" for k in range(count))]) + "\n" + rows([0, 1, 2], *([[1, 2, 3]] * count)))

@@ -1,6 +1,5 @@
 """The csv format: roles of columns, messages, exact round trips, and no surprise on any input."""
 
-import os
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -60,18 +59,6 @@ def test_roles(tmp_path):  # fails if a velocity is taken for a coordinate, p is
     assert data.p[0].tolist() == [8, 1]
     assert data.s.tolist() == [9, 19, 29]
     assert data.u[0].tolist() == [0, 10]
-
-
-def test_options(tmp_path):  # fails if time=, coordinates= or angles= is ignored
-    text = "clock,s,a,b,u\n0,1,2,3,4\n1,2,3,4,5\n2,3,4,5,6\n"
-    data = read(tmp_path, text, time="clock", coordinates=("b", "s"), angles="b")
-    assert (data.names, data.units, data.angles) == (("b", "s"), ("rad", "1"), (True, False))
-    assert data.q[0].tolist() == [3, 1]
-    assert data.s is None
-    assert data.u is not None
-    assert data.u[:, 0].tolist() == [4, 5, 6]
-    assert read(tmp_path, text, time="clock", coordinates="a").names == ("a",)
-    assert read(tmp_path, GOOD, angles=()).angles == (False,)
 
 
 def test_what_spreadsheets_write(tmp_path):  # fails if a BOM, CRLF, quotes, blank lines, spaces or comments are refused
@@ -144,13 +131,7 @@ def test_every_mistake_has_its_message(tmp_path, text, message):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_absent_options(tmp_path):  # fails if a misspelt name is ignored
-    with pytest.raises(InputError, match=r"row 1: there is no column 'w'; the columns are trajectory, t, q"):
-        read(tmp_path, GOOD, coordinates=["w"])
-    with pytest.raises(InputError, match=r"row 1: there is no column 'clock'; the columns are"):
-        read(tmp_path, GOOD, time="clock")
-    with pytest.raises(InputError, match=r"angles names 'w', but the coordinates are \('q',\)"):
-        read(tmp_path, GOOD, angles=["w"])
+def test_no_coordinates(tmp_path):  # fails if a table whose coordinates are none of its columns is read
     with pytest.raises(InputError, match=r"no coordinate column"):
         read(tmp_path, GOOD, coordinates=())
 
@@ -200,20 +181,6 @@ def test_names_that_a_header_cannot_hold(tmp_path, name):  # fails if such a fil
 def test_units_that_a_header_cannot_hold(tmp_path, unit):  # fails if the unit comes back changed
     with pytest.raises(InputError, match="rename"):
         write_csv(tmp_path / "a.csv", Trajectories.of([0, 1, 2], [0, 1, 2], units=(unit,)))
-
-
-def test_writing_is_atomic(tmp_path, monkeypatch):  # fails if the target is opened directly or a temporary file stays
-    path = tmp_path / "a.csv"
-    path.write_text("old")
-
-    def full_disk(_descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(InputError, match=r"a.csv: cannot be written \(No space left on device\)"):
-        write_csv(path, rich())
-    assert path.read_text() == "old"
-    assert [x.name for x in tmp_path.iterdir()] == ["a.csv"]
 
 
 def test_writing_into_no_folder(tmp_path):  # fails if an OSError escapes

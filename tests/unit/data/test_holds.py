@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.data import Trajectories, load, save
+from herglotz.data import Trajectories, load
 from herglotz.errors import InputError
 
 
@@ -41,16 +41,6 @@ def test_thinned_inputs_are_those_of_steps():
     assert thinned.hold == "zero"
     torch.testing.assert_close(thinned.inputs_of_steps()[0], mean)
     assert data.thinned(1).hold == "first"
-
-
-@pytest.mark.parametrize("suffix", ["csv", "npz"])
-def test_files_say_their_hold(tmp_path, suffix):
-    # fails if a file loses the hold, or one that says nothing gains one
-    for hold in ("", "smooth"):
-        save(tmp_path / f"a.{suffix}", recorded(hold))
-        again = load(tmp_path / f"a.{suffix}")
-        assert again.hold == hold
-        assert again.digest() == recorded(hold).digest()
 
 
 def test_an_unknown_hold_is_refused(tmp_path):

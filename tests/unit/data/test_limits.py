@@ -27,7 +27,7 @@ def test_a_header_costs_what_its_length_is():
         assign(cells, "header")
         return time.process_time() - start
 
-    few, many = min(seconds(8000) for _ in range(3)), min(seconds(64000) for _ in range(2))
+    few, many = min(seconds(4000) for _ in range(3)), min(seconds(32000) for _ in range(2))
     assert many < 25 * max(few, 0.004)
 
 

@@ -155,6 +155,6 @@ def test_frames_and_the_command_line(tmp_path, capsys):
     frame = as_trajectories({"t": both[:, 0], "x": both[:, 1], "u": both[:, 2]})
     assert frame.u.tolist() == read_csv(written(tmp_path, both, "t,x,u")).u.tolist()  # type: ignore[union-attr]
     path = written(tmp_path, both)
-    out = ["--out", str(tmp_path / "run"), "--no-plots", "--quiet", "--iterations", "3", "--level", "forced"]
-    assert main(["fit", str(path), "--hold", "first", "--every", "2", *out]) in (0, 3)
+    # every 99th of 38 samples is one: the command ends when the recording has been read
+    assert main(["fit", str(path), "--hold", "first", "--every", "99", "--out", str(tmp_path / "run")]) == 2
     assert "straight lines go there" in capsys.readouterr().err

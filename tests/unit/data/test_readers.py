@@ -39,7 +39,7 @@ def test_angles_are_unwrapped_unless_told(tmp_path):  # fails if unwrapping or e
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.xyz", "x", r"a.xyz: cannot read .xyz; known formats: .*\.csv.*\.npz.*Schmidt & Lipson.*\.txt"),
+        ("a.xyz", "x", r"a.xyz: cannot read .xyz; known formats: .*\.npz.*Schmidt & Lipson.*\.txt.*\.csv"),
         ("a", "x", r"a: cannot read a file without extension"),
         ("a.txt", "t,q\n", r"a.txt: there is a header but no samples"),
         ("a.npz", "t,q\n", r"a.npz: is not a .npz archive"),

@@ -16,7 +16,6 @@ from herglotz.mechanics import (
 from herglotz.mechanics.contact import flow_derivative
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.theory import RightHamiltonian, contact_vector_field
 
 
 def polynomial(q0, q1, s0, h):
@@ -139,27 +138,6 @@ def test_step_derivative_is_the_derivative_of_the_step():
     e = 1e-6  # and both are the derivative of the map itself
     plus, minus = flow(q + e, p, s), flow(q - e, p, s)
     torch.testing.assert_close(D[:, :2, :2].sum(-1), (plus[0] - minus[0]) / (2 * e), rtol=1e-7, atol=1e-8)
-
-
-def test_right_hamiltonian_by_newton_matches_the_closed_form():
-    # fails if H⁺ carries the wrong sign of L_d
-    oscillator = scene("damped_oscillator", m=1.3, gamma=0.4)
-    q = torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]
-    p, s = torch.ones_like(q), torch.full((5,), 0.2, dtype=torch.float64)
-    q1, p1, _ = oscillator.flow(q, p, s, 0.3)
-    H = RightHamiltonian(oscillator.L_d, q1 + 0.3)(q, p1, s, 0.3)
-    assert oscillator.H_plus is not None
-    torch.testing.assert_close(H, oscillator.H_plus(q, p1, s, 0.3), rtol=1e-12, atol=1e-13)
-
-
-def test_contact_vector_field_of_the_damped_oscillator():
-    # fails if ṗ forgets p H_s or ṡ forgets −H
-    H = lambda q, p, s: (p**2 / 2 + q**2 / 2).sum(-1) + 0.2 * s  # noqa: E731
-    q, p, s, _ = points(n=1)
-    dq, dp, ds = contact_vector_field(H, q, p, s)
-    torch.testing.assert_close(dq, p)
-    torch.testing.assert_close(dp, -(q + 0.2 * p))
-    torch.testing.assert_close(ds, (p**2 / 2 - q**2 / 2)[:, 0] - 0.2 * s)
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests import runge_kutta
 
 import herglotz as hz
 from herglotz.errors import InputError
 from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.features import parse
 from herglotz.training.named_terms import candidates
+from tests import runge_kutta
 
 Q = torch.tensor([[-1.3, 0.4], [-0.2, -0.7], [0.6, 1.1], [1.7, -2.0]], dtype=torch.float64)
 

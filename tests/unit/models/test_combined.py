@@ -72,7 +72,7 @@ def test_numbers_that_cannot_be_moved_are_refused():
         ("payload", {"friction.viscous[1]": 0.5}, "must be a word"),
         ("friction", {"friction.viscous[1]": 0.5}, "must be a word"),
         ("2nd", {"friction.viscous[1]": 0.5}, "must be a word"),
-        ("tool", {"friction.viscous[0]": 0.7}, "friction.viscous cannot be moved"),
+        ("tool", {"friction.viscous[0]": 0.7}, r"friction.viscous\[0\] cannot be moved"),
         ("tool", {"friction.viscous[0]": 0.0}, "nothing differs"),
         ("tool", {"friction.mass": 0.7}, "no number 'friction.mass'"),
         ("tool", {"potential.tilt[0]": math.nan}, "finite"),

@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.mechanics import autograd_partials
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import unit_increment
 from herglotz.models.jet import Jet
@@ -145,16 +144,6 @@ def test_damping_can_rise_and_fall_with_s_and_c_stays_positive():
         for seed in range(20):
             model = random_networks(ModelConfig(level="full", seed=seed), size=3.0)
             assert model.partials(q, q + 0.3, s, h).c.min() > 0
-
-
-def test_second_derivatives_in_s_are_those_of_the_map():
-    # fails if D33 is left at zero, as where L_d is affine in s
-    model = random_networks(ModelConfig(level="full"))
-    q0, s0 = torch.zeros(4, 1, dtype=torch.float64), torch.linspace(-1, 1, 4, dtype=torch.float64)
-    x = (q0, q0 + 0.1, s0, torch.tensor(0.2, dtype=torch.float64))
-    closed, twin = model.partials(*x, order=2), autograd_partials(model, *x, order=2)
-    assert closed.D33.abs().min() > 1e-4
-    torch.testing.assert_close(closed.D33, twin.D33, rtol=1e-12, atol=1e-13)
 
 
 def test_mass_is_positive_definite_bounded_and_fixed_at_the_origin():

@@ -122,7 +122,7 @@ def test_it_is_verified():
     [("c", torch.float64), ("c", torch.float32), ("onnx", torch.float64)]
     + [pytest.param(*x, marks=pytest.mark.slow) for x in FILES],
 )
-def test_files_step_as_eager_does(form, dtype, tmp_path):
+def test_files_step_as_eager_does(form, dtype, tmp_path, request):
     # fails if a file leaves the potential or the force out
     if form == "c" and not any(map(shutil.which, ("cc", "gcc", "clang"))):
         pytest.skip("no C compiler in the PATH")
@@ -131,6 +131,7 @@ def test_files_step_as_eager_does(form, dtype, tmp_path):
         other = compile_c(model)
     else:
         pytest.importorskip("onnxruntime")
+        request.getfixturevalue("registered_once")
         write = export_onnx if form == "onnx" else export_pt2
         other = load_exported(write(model, tmp_path / f"a.{form}", h=0.1))
     with torch.no_grad():

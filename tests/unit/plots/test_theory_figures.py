@@ -17,12 +17,7 @@ from herglotz.plots.fan import point_fan, spread_fan
 from herglotz.plots.hamilton_jacobi import STEPS, plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.parachute import physical_fall
 from herglotz.scenes import scene
-
-
-def pendulum(q0, q1, s0, h):
-    v = (q1 - q0) / h[..., None]
-    return h * ((v * v / 2 + torch.cos(q0)).sum(-1) - 0.2 * s0)
-
+from tests.lagrangians import verlet_pendulum as pendulum
 
 FLOOR = torch.finfo(torch.float64).eps / 200  # where differences of exactly 0 are drawn
 STATES = (

@@ -7,6 +7,7 @@ from herglotz.errors import InputError
 from herglotz.scenes import ExactForcedOscillator
 from herglotz.stepping import State
 from herglotz.theory import TimeDependent, energies
+from tests.lagrangians import states_in_turn
 
 F64 = torch.float64
 EXACT = ExactForcedOscillator(0.9, 1.7, 0.6, m=1.4, omega0=1.3, gamma=0.4)
@@ -16,12 +17,6 @@ SYSTEMS = {
     "undamped": ExactForcedOscillator(0.9, 1.7, 0.6, m=1.4, omega0=1.3, gamma=0.0),
     "free fall": ExactForcedOscillator(0.9, 1.7, 0.6, omega0=0.0, gamma=0.0),
 }
-
-
-def states(count=9, seed=0):
-    make = torch.Generator().manual_seed(seed)
-    q, p = (torch.randn(count, 1, generator=make, dtype=F64) for _ in range(2))
-    return State(q, p, torch.randn(count, generator=make, dtype=F64))
 
 
 def test_a_step_of_the_forced_oscillator_against_40_digits():
@@ -39,7 +34,7 @@ def test_a_step_of_the_forced_oscillator_against_40_digits():
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_exact_step_is_the_flow_and_its_energies_are_H(name):
     # fails if an energy has the wrong sign or is divided by c on the wrong side, at any damping
-    L_d, x, t0, h = SYSTEMS[name], states(), 2.3, 0.4
+    L_d, x, t0, h = SYSTEMS[name], states_in_turn(), 2.3, 0.4
     end = TimeDependent(L_d).step_at(x, t0, h).state
     for a, b in zip(end, L_d.flow(*x, t0, h), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13)

@@ -13,6 +13,7 @@ from herglotz.stepping import State, Status, StepError, Stepper, explain_step
 from herglotz.stepping.explain import longest_step
 from herglotz.theory import LeftHamiltonian, RightHamiltonian
 from herglotz.verify import verify
+from tests.lagrangians import cubic
 
 OSCILLATOR = scene("damped_oscillator")  # m = Ω = 1, γ = 0.2
 CONJUGATE = 3.15741941699827646
@@ -201,9 +202,6 @@ def test_the_escape_is_found_at_its_time(factor):
 
 def test_a_step_without_a_solution_is_explained():
     # fails if a status comes without a reason where no condition is lost: F = q1 − q1³/3 − p0 turns at 2/3
-    def cubic(q0, q1, s0, h):
-        return (-q0 * (q1 - q1**3 / 3)).sum(-1) + 0 * s0 * h
-
     q = torch.zeros(2, 1, dtype=torch.float64)
     p = torch.tensor([[0.1], [5.0]], dtype=torch.float64)
     (line,) = explain_step(cubic, State(q, p, q[:, 0]), 1.0, max_iterations=8)

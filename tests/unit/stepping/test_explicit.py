@@ -9,6 +9,7 @@ from herglotz.models import TERMS, ContactLagrangian, ModelConfig, Term
 from herglotz.stepping import State, Status, Stepper
 from herglotz.stepping.explicit import leapfrog
 from herglotz.stepping.field import FieldOf
+from tests.lagrangians import random_model, states_in_turn
 
 SETTINGS = {
     "pendulum": ModelConfig(),
@@ -59,19 +60,8 @@ class Quartic(Term):
         return x * x * x * x * 0.5
 
 
-def random_model(config, dtype=torch.float64):
-    model = ContactLagrangian(config)
-    make = torch.Generator().manual_seed(3)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.3 * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
-    return model.to(dtype)
-
-
 def states(config, batch=5, dtype=torch.float64):
-    make = torch.Generator().manual_seed(4)
-    q, p = (torch.randn(batch, config.dof, generator=make, dtype=torch.float64).to(dtype) for _ in range(2))
-    return State(q, p, torch.randn(batch, generator=make, dtype=torch.float64).to(dtype))
+    return states_in_turn(config.dof, batch, 4, dtype)
 
 
 @pytest.fixture(params=SETTINGS, ids=lambda name: name.replace(" ", "_"))

@@ -8,6 +8,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Solution, State, Status, Stepper, solve, solve_step
 from herglotz.stepping.newton import find_root, status_of
 from herglotz.stepping.partials_equation import End, PartialsEquation
+from tests.lagrangians import states_in_turn
 
 LEVELS = {
     "correction": ModelConfig(correction_width=6),
@@ -44,9 +45,7 @@ def solved(L_d, state, h, guess, limit=30, order=2):
 
 
 def states(n, batch=6, dtype=torch.float64):
-    make = torch.Generator().manual_seed(4)
-    q, p = (torch.randn(batch, n, generator=make, dtype=torch.float64).to(dtype) for _ in range(2))
-    return State(q, p, torch.randn(batch, generator=make, dtype=torch.float64).to(dtype))
+    return states_in_turn(n, batch, 4, dtype)
 
 
 class Counted:

@@ -7,16 +7,12 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Status, StepError, Stepper
+from tests.lagrangians import cubic, even_model
 
 
 def start(batch=3, dtype=torch.float64):
     q = torch.linspace(-1, 1, batch, dtype=dtype)[:, None]
     return State(q, torch.cos(q), torch.zeros(batch, dtype=dtype))
-
-
-def cubic(q0, q1, s0, h):
-    """No step exists for a large positive momentum at q0 = 0: F = −q1 + q1³/3·… has a turning point (det M = 0)."""
-    return (-q0 * (q1 - q1**3 / 3)).sum(-1) + 0 * s0 * h
 
 
 def test_step_solves_the_equation_in_both_precisions():
@@ -143,18 +139,6 @@ def test_rest_stays_at_rest():
     out = Stepper(scene("damped_pendulum").L_d).rollout(q, q, q[:, 0], h=0.1, steps=5)
     assert bool(out.ok.all())
     assert float(out.q.abs().max()) == 0
-
-
-def even_model():
-    """A learned model that rests at q = 0: units come in pairs, (q̄, v) → −(q̄, v), whose forces cancel to rounding."""
-    model = ContactLagrangian(ModelConfig(rate=0.5, correction_width=16, correction_depth=1, seed=1))
-    assert model.correction is not None
-    (weight, last), (bias,) = model.correction.network.weights, model.correction.network.biases
-    with torch.no_grad():
-        weight[8:] = weight[:8] * torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
-        bias[8:] = bias[:8]
-        last[:] = 0.1
-    return model
 
 
 @pytest.mark.parametrize("shape", [(1,), (5, 1)], ids=["alone", "batch"])

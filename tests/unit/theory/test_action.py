@@ -7,15 +7,7 @@ from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.theory import curve_action, herglotz_action
-
-
-def nonlinear(q0, q1, s0, h):
-    """Two degrees of freedom, nonlinear in s, not symmetric in the coordinates."""
-    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
-    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
-    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
-
+from tests.lagrangians import nonlinear
 
 CASES = {
     "nonlinear": (nonlinear, 2),

@@ -1,24 +1,13 @@
 """Discrete curves with fixed ends against stepping, the Cauchy problem, conjugate points."""
 
-import math
-
 import pytest
 import torch
 
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.stepping import Status, StepError, Stepper
-from herglotz.stepping.block_tridiagonal import multiply, solve_blocks
 from herglotz.theory import boundary_value, herglotz_action, initial_value
-
-
-def nonlinear(q0, q1, s0, h):
-    """Golden 2-dof system of section 4, nonlinear in s."""
-    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
-    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
-    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
-
+from tests.lagrangians import nonlinear
 
 OSCILLATOR = scene("damped_oscillator")
 CONJUGATE = 3.15741941699827646  # π/ω, section 4
@@ -152,18 +141,6 @@ def test_many_points():
     assert curve.iterations <= 2
     assert relative(curve.p[-1], p1) < 1e-9
     assert abs(float(curve.s[-1] - s1)) < 1e-11
-
-
-def test_blocks_against_a_dense_solve():
-    # fails if a block of the elimination is transposed, or a singular leading block is not solved densely
-    make = torch.Generator().manual_seed(0)
-    diagonal, upper, lower = torch.randn(3, 4, 6, 3, 3, generator=make, dtype=torch.float64)
-    diagonal[1, 0] = 0.0
-    blocks = (diagonal, upper, lower)
-    u = torch.randn(4, 6, 3, generator=make, dtype=torch.float64)
-    found = solve_blocks(blocks, multiply(blocks, u))
-    assert relative(found, u) < 1e-9
-    assert math.isfinite(float(found.sum()))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import partials
 from herglotz.scenes import scene
 from herglotz.theory import PointSource, Propagated, Quadratic, check, riccati_step
+from tests.lagrangians import bowl, nonlinear
 
 OSCILLATOR = scene("damped_oscillator").L_d
 
@@ -18,14 +19,6 @@ def f64(*x):
 def quadratic(q0, q1, s0, h):
     """The L_d of E10."""
     return -0.07 * s0 + (0.45 * q0**2 - 1.4 * q0 * q1 + 0.55 * q1**2).sum(-1) + 0 * h
-
-
-def nonlinear(q0, q1, s0, h):
-    """Golden 2-dof system of section 4, nonlinear in s."""
-    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
-    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
-    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
 
 
 Q1, Q2 = torch.linspace(-1.5, 2.0, 15).double()[:, None], torch.rand(12, 2, generator=torch.Generator().manual_seed(0))
@@ -41,9 +34,6 @@ def successor(L_d, S, h):
 def test_a_solution_passes():
     # fails if S, dS, H± and the step do not belong together, in one or two coordinates, exact or propagated
     assert check(quadratic, S, successor(quadratic, S, 1.0), Q1, h=1.0).passed
-
-    def bowl(q):
-        return 0.6 * (q * q).sum(-1) + 0.1 * torch.cos(q.sum(-1)) + 0.2 * q[..., 0]
 
     found = check(nonlinear, bowl, Propagated(nonlinear, bowl, 0.2), Q2, h=0.2)
     assert found.passed, str(found)

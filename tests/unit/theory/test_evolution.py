@@ -18,6 +18,7 @@ from herglotz.theory import (
     legendrian_defect,
     prolongation,
 )
+from tests.lagrangians import wavy
 
 PENDULUM = scene("damped_pendulum").hamiltonian
 
@@ -113,10 +114,6 @@ def test_discrete_hamilton_jacobi_of_a_quadratic_section():
     assert float(commutation_defect(step, overdamped, overdamped, q).abs().max()) < 1e-14
     # fails if any section passes
     assert float(commutation_defect(step, lambda q: 1.1 * overdamped(q), overdamped, q).abs().max()) > 1e-2
-
-
-def wavy(q):
-    return torch.sin(q[..., 0]) + 0.4 * q[..., 1] ** 3 + q[..., 0] * q[..., 1]
 
 
 def made_for_wavy(q, p, s):

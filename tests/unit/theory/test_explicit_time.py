@@ -5,54 +5,44 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.scenes import ExactForcedOscillator
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import Stepper
 from herglotz.theory import Propagated, TimeDependent, check, energies, hopf_lax, time_defect
+from tests.lagrangians import pendulum_of_time, states_in_turn
 
 F64 = torch.float64
 EXACT = ExactForcedOscillator(0.9, 1.7, 0.6, m=1.4, omega0=1.3, gamma=0.4)
-
-
-def pendulum(q0, q1, s0, t0, h):
-    """Midpoint rule for a pendulum whose pivot and damping change with time."""
-    v, q, t = (q1 - q0) / h[..., None], 0.5 * (q0 + q1), t0 + 0.5 * h
-    L = (0.5 * v * v * (1 + 0.3 * torch.sin(q)) + torch.cos(q) * (1 + 0.5 * torch.cos(2 * t)[..., None])).sum(-1)
-    return h * (L - 0.2 * s0 - 0.1 * torch.sin(s0) * torch.sin(t))
-
-
-def states(count=9, seed=0):
-    make = torch.Generator().manual_seed(seed)
-    q, p = (torch.randn(count, 1, generator=make, dtype=F64) for _ in range(2))
-    return State(q, p, torch.randn(count, generator=make, dtype=F64))
 
 
 def test_a_rule_matches_energies_to_its_order():
     # fails if E± are not the energies at the ends: those of two steps meet within O(h²)
     gaps = []
     for h in (0.1, 0.05):
-        out = TimeDependent(pendulum).rollout(states(), 0.3, h, 2)
+        out = TimeDependent(pendulum_of_time).rollout(states_in_turn(), 0.3, h, 2)
         q, s = out.q, out.s
-        _, end = energies(pendulum, q[:, 0], q[:, 1], s[:, 0], 0.3, h)
-        start, _ = energies(pendulum, q[:, 1], q[:, 2], s[:, 1], 0.3 + h, h)
+        _, end = energies(pendulum_of_time, q[:, 0], q[:, 1], s[:, 0], 0.3, h)
+        start, _ = energies(pendulum_of_time, q[:, 1], q[:, 2], s[:, 1], 0.3 + h, h)
         gaps.append(float((start - end).abs().max()))
     assert 1.8 < gaps[0] / gaps[1] < 4.5  # the plain s of this rule leaves a part of order 1
 
 
 def test_the_step_keeps_the_form_with_time():
     # fails if the step is taken at another time than the energies: η + E dt is kept up to c
-    for L_d in (EXACT, pendulum):
-        for defect in time_defect(TimeDependent(L_d), states(), 1.1, 0.3):
+    for L_d in (EXACT, pendulum_of_time):
+        for defect in time_defect(TimeDependent(L_d), states_in_turn(), 1.1, 0.3):
             assert float(defect.abs().max()) < 1e-13
-    x, family = states(), TimeDependent(pendulum)
+    x, family = states_in_turn(), TimeDependent(pendulum_of_time)
     step = family.step_at(x, 1.1, 0.3)
-    E0, E1 = energies(pendulum, x.q, step.state.q, x.s, 1.1, 0.3)
+    E0, E1 = energies(pendulum_of_time, x.q, step.state.q, x.s, 1.1, 0.3)
     size = torch.tensor(0.3, dtype=F64)
-    ahead, behind = (pendulum(x.q, step.state.q, x.s, torch.tensor(1.1 + d, dtype=F64), size) for d in (1e-5, -1e-5))
+    ahead, behind = (
+        pendulum_of_time(x.q, step.state.q, x.s, torch.tensor(1.1 + d, dtype=F64), size) for d in (1e-5, -1e-5)
+    )
     torch.testing.assert_close(E1, step.c * E0 - (ahead - behind) / 2e-5, rtol=0, atol=1e-8)
 
 
 def test_rollouts_step_at_their_times():
     # fails if a rollout starts at another time or its times do not advance by h
-    x = states()
+    x = states_in_turn()
     out = TimeDependent(EXACT).rollout(x, 0.7, 0.1, 30)
     for a, b in zip((out.q[:, -1], out.p[:, -1], out.s[:, -1]), EXACT.flow(*x, 0.7, 3.0), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
@@ -65,7 +55,7 @@ def test_the_time_dependent_hamilton_jacobi_equation():
     # fails if H⁺ of a step is that of another time: two steps from a bowl, right, left and diagram
     points, h = torch.linspace(-1, 1, 9, dtype=F64)[:, None], 0.3
     bowl = lambda q: 0.3 * (q * q).sum(-1)  # noqa: E731
-    at = [TimeDependent(pendulum, t) for t in (1.1, 1.4)]
+    at = [TimeDependent(pendulum_of_time, t) for t in (1.1, 1.4)]
     first = Propagated(at[0], bowl, h)
     assert check(at[0], bowl, first, points, h=h).passed
     second = Propagated(at[1], first, h)

@@ -22,6 +22,7 @@ from herglotz.theory import (
     transport_section,
 )
 from herglotz.theory.hj_on_qxr import section_derivatives
+from tests.lagrangians import wavy
 
 GAMMA = 3.0  # overdamped with Ω = 1
 
@@ -55,10 +56,6 @@ def roots():
 def mixed(q):
     """F = ½ Σ aᵢ qᵢ²: the first coordinate decays slowly, the second fast."""
     return 0.5 * (torch.tensor(roots(), dtype=q.dtype) * q * q).sum(-1)
-
-
-def wavy(q):
-    return torch.sin(q[..., 0]) + 0.4 * q[..., 1] ** 3 + q[..., 0] * q[..., 1]
 
 
 def made_for_wavy(q, p, s):

@@ -7,22 +7,10 @@ from herglotz.mechanics import partials
 from herglotz.scenes import scene
 from herglotz.stepping import Status, StepError, Stepper
 from herglotz.theory import PointSource, Propagated, Quadratic, germ, hopf_lax, riccati_step
+from tests.lagrangians import bowl, nonlinear
 
 OSCILLATOR = scene("damped_oscillator")
 GOLDEN = (-0.26006580555808590321, 0.30739377267571633841, 0.1460659481608371959)
-
-
-def nonlinear(q0, q1, s0, h):
-    """Golden 2-dof system of section 4, nonlinear in s."""
-    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
-    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
-    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
-
-
-def bowl(q):
-    """A convex function that is not quadratic."""
-    return 0.6 * (q * q).sum(-1) + 0.1 * torch.cos(q.sum(-1)) + 0.2 * q[..., 0]
 
 
 def tensor(x):

@@ -18,15 +18,7 @@ from herglotz.theory import (
     right_equations,
     right_step,
 )
-
-
-def nonlinear(q0, q1, s0, h):
-    """Golden 2-dof system of section 4, nonlinear in s."""
-    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
-    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
-    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
-
+from tests.lagrangians import nonlinear
 
 OSCILLATOR = scene("damped_oscillator", m=1.7, omega0=1.3, gamma=0.6)
 CASES = {

@@ -6,13 +6,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from tests import runge_kutta
 
 from herglotz.data import Trajectories
 from herglotz.data.smoothing import local_polynomials
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_terms import start_of
 from herglotz.training.named_terms import candidates, chains
+from tests import runge_kutta
 
 STEP, PARTS = 0.008, 4
 

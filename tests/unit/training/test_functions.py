@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tests import runge_kutta
 
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
@@ -23,6 +22,7 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.search import Search
 from herglotz.training.task import build_model
 from herglotz.training.trials import Variant
+from tests import runge_kutta
 
 H, NOISE = 0.05, 0.002
 

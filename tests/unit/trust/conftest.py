@@ -16,7 +16,7 @@ def model() -> ContactLagrangian:
 
 
 @pytest.fixture(scope="session")
-def files(model, tmp_path_factory):
+def files(request, model, tmp_path_factory):
     """The file of a kind, pt2, onnx or h; made once."""
     folder, made = tmp_path_factory.mktemp("files"), {}
 
@@ -24,6 +24,7 @@ def files(model, tmp_path_factory):
         if kind == "onnx":
             pytest.importorskip("onnx")
             pytest.importorskip("onnxruntime")
+            request.getfixturevalue("registered_once")
         if kind not in made:
             write = {"pt2": export_pt2, "onnx": export_onnx, "h": export_c}[kind]
             made[kind] = write(model, folder / f"model.{kind}", h=0.1, box=BOX)

@@ -1,9 +1,9 @@
 """A slice of `make faults`: one fit struck by every fault; and how a command says that memory is out."""
 
 import pytest
-from tests.faults import FAULTS, faults
 
 from herglotz.cli import main
+from tests.faults import FAULTS, faults
 
 
 @pytest.mark.slow

@@ -92,6 +92,7 @@ def test_what_is_not_finite_is_the_loss_of_one_sample(level, files):
             stepper.init(fine[0], fine[1] * value, fine[2], 0.1)
 
 
+@pytest.mark.usefixtures("registered_once")
 def test_a_momentum_at_the_end_of_the_numbers_moves_a_file(tmp_path):
     # fails if a file calls a guess that it gave up CONVERGED: q stayed where it was for p > 1.63e308, where the size of
     # the equation and of its first move are numbers, and their sum is none

@@ -90,31 +90,14 @@ def test_the_second_signal_ends_at_once():
     assert (process.returncode, error.strip()) == (130, "herglotz: interrupted")
 
 
-def test_the_handlers_come_back():
-    # fails if `main`, called from a program, keeps the program's signals
-    before = signal.getsignal(signal.SIGTERM)
-    assert main(["--version"]) == 0
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_nothing_is_overwritten_unasked(tmp_path, capsys):
-    # fails if `simulate`, `rollout` or `export` writes over a file without --force
+def test_force_overwrites(tmp_path):
+    # fails if --force is not heard; that files are not overwritten without is in cli/test_wrong_input.py
     out = tmp_path / "a.csv"
     simulate = ["simulate", "damped_oscillator", "--trajectories", "1", "--steps", "9", "--out", str(out)]
     assert main(simulate) == 0
     content = out.read_bytes()
-    capsys.readouterr()
-    for command in (
-        simulate,
-        ["rollout", "x", "--steps", "3", "--out", str(out)],
-        ["predict", "x", str(out), "--out", str(out)],
-    ):
-        assert main([*command, "--seed", "1"] if command is simulate else command) == 2
-        assert "exists already; choose another name, or overwrite it with --force" in capsys.readouterr().err
-        assert out.read_bytes() == content
-    (tmp_path / "a.h").write_text("mine")
-    assert main(["export", "x", "--out", str(tmp_path / "a.h")]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert main([*simulate, "--seed", "1"]) == 2
+    assert out.read_bytes() == content
     assert main([*simulate, "--seed", "1", "--force"]) == 0
     assert out.read_bytes() != content
 

@@ -7,11 +7,7 @@ import torch
 from herglotz.scenes import scene
 from herglotz.stepping import State
 from herglotz.verify import verify
-
-
-def states(n=1, count=32):
-    x = torch.randn(count, 2 * n + 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+from tests.lagrangians import states
 
 
 def kinetic(q0, q1, s0, h):
@@ -41,14 +37,14 @@ def failed(report):
 @pytest.mark.parametrize("hidden", [detached, table, jump])
 def test_what_autograd_does_not_see_fails_this_row_alone(hidden):
     # fails if DΦ̃ is compared with itself: p, c and DΦ̃ share one autograd, and all other identities hold
-    report = verify((hidden, states()), h=0.1)
+    report = verify((hidden, states(count=32)), h=0.1)
     assert failed(report) == {"derivative"}, report.table()
     assert report["derivative"].value > 3e-5  # the jump 6e-5, the others 0.1
 
 
 def test_the_scale_of_the_sample_does_not_matter():
     # fails if offsets are absolute: here q is of size 1e-6, p of 1e16 and s of 1e10
-    q, p, s = states()
+    q, p, s = states(count=32)
 
     def scaled(q0, q1, s0, h):
         return 1e10 * kinetic(q0 * 1e6, q1 * 1e6, s0 / 1e10, h) + 1e10 * h * torch.cos(1e6 * q0).sum(-1)
@@ -72,7 +68,7 @@ def test_a_kink_inside_a_stencil_is_met_by_a_narrower_one():
     def hard(q0, q1, s0, h):
         return kinetic(q0, q1, s0, h) - h * ((0.5 * (q0 + q1)).abs() ** 3).sum(-1)
 
-    q, p, s = states()
+    q, p, s = states(count=32)
     near = 2e-4 * torch.linspace(-1, 1, 8, dtype=torch.float64)[:, None] - 0.05 * p[:8]  # half a step before
     start = State(torch.cat([near, q[8:]]), p, s)
     assert verify((hard, start), h=0.1, steps=2)["derivative"].passed  # 9e-8, bound 1e-6
@@ -81,7 +77,7 @@ def test_a_kink_inside_a_stencil_is_met_by_a_narrower_one():
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_sound_maps_pass(dtype):
     # fails if the bound is below the rounding of differences, or a stencil is not that of order 8
-    start = State(*(x.to(dtype) for x in states(2)))
+    start = State(*(x.to(dtype) for x in states(2, 32)))
     report = verify((scene("double_pendulum").L_d, start), h=0.05, steps=3)
     assert report["derivative"].value < (1e-9 if dtype == torch.float64 else 1e-3), report.table()
 
@@ -98,7 +94,7 @@ class Kinked:
 
 def test_forces_with_kinks_are_judged_by_the_median():
     # fails if a sample beside a kink, where no derivative exists, is taken for an error
-    row = verify((Kinked(), states()), h=0.1)["derivative"]
+    row = verify((Kinked(), states(count=32)), h=0.1)["derivative"]
     assert row.passed
     assert "median" in row.statement
 
@@ -108,7 +104,7 @@ def test_a_sample_beside_a_failed_step_is_left_out_and_counted():
     def walled(q0, q1, s0, h):
         return kinetic(q0, q1, s0, h) + h * torch.log(q0).sum(-1)
 
-    q, p, s = states()
+    q, p, s = states(count=32)
     report = verify((walled, State(q.abs() + 0.01, 0.1 * p, s)), h=0.001, steps=2)
     assert "left out: a step beside them failed" in report["derivative"].note
     assert report["derivative"].passed

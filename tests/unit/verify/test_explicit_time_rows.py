@@ -6,18 +6,12 @@ import torch
 from herglotz.scenes import ExactForcedOscillator
 from herglotz.theory import TimeDependent
 from herglotz.verify import verify
+from tests.lagrangians import pendulum_of_time
 
 EXACT = ExactForcedOscillator(0.9, 1.7, 0.6, m=1.4, omega0=1.3, gamma=0.4)
 
 
-def pendulum(q0, q1, s0, t0, h):
-    """Midpoint rule for a pendulum whose pivot and damping change with time."""
-    v, q, t = (q1 - q0) / h[..., None], 0.5 * (q0 + q1), t0 + 0.5 * h
-    L = (0.5 * v * v * (1 + 0.3 * torch.sin(q)) + torch.cos(q) * (1 + 0.5 * torch.cos(2 * t)[..., None])).sum(-1)
-    return h * (L - 0.2 * s0 - 0.1 * torch.sin(s0) * torch.sin(t))
-
-
-@pytest.mark.parametrize("L_d", [EXACT, pendulum])
+@pytest.mark.parametrize("L_d", [EXACT, pendulum_of_time])
 def test_verify_has_rows_of_time(L_d):
     # fails if a row is computed at another step's time; measured ≤ 2e-14
     report = verify(TimeDependent(L_d, 0.7), h=0.3, samples=24, steps=5)
@@ -35,7 +29,7 @@ class Late(TimeDependent):
 
 def test_verify_refuses_a_family_at_wrong_times():
     # fails if the row of time looks at the step alone: this null model's step is that of 0.9 t
-    report = verify(Late(pendulum, 0.7), h=0.3, samples=24, steps=5)
+    report = verify(Late(pendulum_of_time, 0.7), h=0.3, samples=24, steps=5)
     assert not report["time"].passed
     assert report["contact"].passed  # at a fixed time it is a contact map all the same
 
@@ -49,13 +43,13 @@ class Hidden(TimeDependent):
 
 def test_both_directions_of_time_are_judged():
     # fails if the row looks at dh alone, which is right here
-    assert not verify(Hidden(pendulum, 0.7), h=0.3, samples=24, steps=5)["time"].passed
+    assert not verify(Hidden(pendulum_of_time, 0.7), h=0.3, samples=24, steps=5)["time"].passed
 
 
 def test_every_step_has_its_own_time():
     # fails if all steps of a motion begin at t0: from the third step on, at t = 1.3, this L_d is no number
     def until(q0, q1, s0, t0, h):
-        return torch.where(t0 > 1.2, torch.nan, pendulum(q0, q1, s0, t0, h))
+        return torch.where(t0 > 1.2, torch.nan, pendulum_of_time(q0, q1, s0, t0, h))
 
     assert verify(TimeDependent(until, 0.7), h=0.3, samples=8, steps=2).passed
     assert not verify(TimeDependent(until, 0.7), h=0.3, samples=8, steps=3).passed
@@ -63,5 +57,5 @@ def test_every_step_has_its_own_time():
 
 def test_rows_of_time_are_measured():
     # fails if a row says 0 whatever it is given: rounding of 24 motions leaves something
-    report = verify(TimeDependent(pendulum, 0.7), h=0.3, samples=24, steps=5)
+    report = verify(TimeDependent(pendulum_of_time, 0.7), h=0.3, samples=24, steps=5)
     assert all(report[name].value > 0 for name in ("time", "momentum"))
