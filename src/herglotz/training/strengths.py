@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 from herglotz.training.trials import Fitter, Trial
 
 
 def likeliest(trial: Trial, most: int) -> Trial:
     """The model with strengths of its bands that follow from its fit, as long as held-out blocks are missed by less.
 
-    A fit takes `most` iterations. A model without functions has no strengths, and stays.
+    A fit takes `most` iterations. The last one gains less than a number costs. A model without functions has no
+    strengths, and stays.
     """
-    while trial.sizes:
+    gain = math.inf
+    while trial.sizes and gain > math.log(trial.score.count) / 2:
         other = trial.fitter.fit(trial.taken, trial.values, trial.length, trial, most)
-        if other is None or not float((trial.score.losses - other.score.losses).sum()) > 0:
+        if other is None or not (gain := float((trial.score.losses - other.score.losses).sum())) > 0:
             break
         trial = other
     return trial
