@@ -88,7 +88,7 @@ def filter(
     if len(kalman.names) != len(chosen):
         raise InputError(f"{', '.join(chosen)} stand for several numbers of the model; name each of them")
     std = torch.tensor([first for first, _ in chosen.values()], dtype=torch.float64)
-    beliefs, surprises, steps = [], [], []
+    beliefs, surprises, steps, most = [], [], [], run.h_range[1]
     _check_lengths(data, lag)
     for first, length in zip(data.offsets, data.lengths, strict=True):
         belief, surprise = _started(kalman, data, first, std), math.nan
@@ -96,14 +96,14 @@ def filter(
             h = float(data.t[row] - data.t[row - 1]) if row > first else float(data.t[row + 1] - data.t[row])
             if row > first:
                 belief = kalman.remember(belief, lag) if lag else belief
-                before = _carried(kalman, model, data, belief, row, h, run.h_range[1])
+                before = _carried(kalman, model, data, belief, row, h, most)
                 belief, surprise = kalman.update(before, data.q[row])
             beliefs.append(kalman.smoothed(belief, 0))
             # The sample that waits no longer; all of them at the end.
             for back in range(1, lag + 1) if row + 1 == first + length else [lag] * (lag <= row - first):
                 beliefs[row - back] = kalman.smoothed(belief, back)
             surprises.append(surprise)
-            steps.append(min(h, run.h_range[1]))
+            steps.append(min(h, most))
     return _told(kalman, model, data, beliefs, surprises, steps)
 
 
