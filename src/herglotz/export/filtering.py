@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from herglotz.codegen.c_compiler import compiler
-from herglotz.data import Trajectories
+from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.gaps import complete
 from herglotz.errors import InputError
 from herglotz.export.c_compile import compile_c
@@ -42,7 +43,7 @@ class Filtered:
 
 def filter(
     run: FittedRun,
-    recording: Trajectories,
+    recording: Any,
     parameters: Mapping[str, tuple[float, float]] | None = None,
     noise: Noise | None = None,
     lag: int = 0,
@@ -60,7 +61,8 @@ def filter(
     run
         What `fit` returned.
     recording
-        Positions of the same coordinates, in the same units, with inputs where the model takes them.
+        Positions of the same coordinates, in the same units, with inputs where the model takes them: anything that
+        `fit` takes.
     parameters
         Numbers of the model that are estimated too: by name, the standard deviation that each starts with, and how far
         it wanders in the root of a unit of time, in the number's own unit.
@@ -78,11 +80,18 @@ def filter(
     ------
     InputError
         If the recording is not of the run, has trajectories of fewer than two samples or of no more than the lag, or
-        leaves where the model has steps.
+        leaves where the model has steps; or a deviation is none.
     """
     chosen = dict(parameters or {})
+    for name, pair in chosen.items():
+        if not (isinstance(pair, Sequence) and len(pair) == 2 and all(0 <= x < math.inf for x in pair)):
+            raise InputError(f"parameters: {name} needs two finite numbers >= 0, (deviation, wander), got {pair}")
     model = copy.deepcopy(run.model).double()
-    data = complete(of_the_run(run, recording)).unwrapped().to(dtype=torch.float64, device="cpu")
+    data = (
+        complete(of_the_run(run, as_trajectories(recording, like=run.data)))
+        .unwrapped()
+        .to(dtype=torch.float64, device="cpu")
+    )
     wander = tuple(each for _, each in chosen.values())
     kalman = KalmanFilter(model, noise or noise_of(run, wander), list(chosen), stepper=_compiled(model, list(chosen)))
     if len(kalman.names) != len(chosen):
@@ -111,8 +120,10 @@ def _check_lengths(data: Trajectories, lag: int) -> None:
     shortest = min(data.lengths)
     if shortest < 2:
         raise InputError(f"{data.source or 'data'}: a trajectory has {shortest} sample; a filter starts at two")
-    if not 0 <= lag < shortest:
-        raise InputError(f"lag must be 0 to {shortest - 1}, as a trajectory has {shortest} samples, got {lag}")
+    if not (isinstance(lag, int) and 0 <= lag < shortest):
+        raise InputError(
+            f"lag must be a whole number from 0 to {shortest - 1}, as a trajectory has {shortest} samples, got {lag}"
+        )
 
 
 def _carried(

@@ -108,6 +108,7 @@ def checked_values(entries: Mapping[str, Any], values: Mapping[str, float]) -> l
         value = float(values.get(name, default))
         inside = (low is None or value >= low) and (high is None or value <= high)
         if not (math.isfinite(value) and inside):
-            raise InputError(f"{name} must be a finite number between {low} and {high}, got {value}")
+            ends = [f" {word} {x:g}" for word, x in ((">=", low), ("<=", high)) if x is not None]
+            raise InputError(f"{name} must be a finite number{' and'.join(ends)}, got {value}")
         found.append(value)
     return found

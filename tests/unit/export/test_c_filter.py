@@ -1,6 +1,7 @@
 """The Kalman filter of a header: its twin in Python, its covariance against its errors, and its velocity."""
 
 import ctypes
+import math
 import re
 import shutil
 import subprocess
@@ -470,9 +471,14 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     truth = exact[:, kept].reshape(-1, 1)
     misses = [float((x.state.q - truth)[5:-5].square().mean().sqrt()) for x in (found, smooth)]
     assert misses[1] <= 0.8 * misses[0]
-    for lag in (-1, len(kept)):
-        with pytest.raises(InputError, match=f"lag must be 0 to {len(kept) - 1}.*got {lag}"):
-            hz.filter(run, data, lag=lag)
+    for lag in (-1, len(kept), 1.5):
+        with pytest.raises(InputError, match=f"lag must be a whole number from 0 to {len(kept) - 1}.*got {lag}"):
+            hz.filter(run, data, lag=lag)  # pyright: ignore[reportArgumentType]
+    for pair in (0.3, (0.3,), (-0.3, 0.0), (0.3, math.nan)):
+        with pytest.raises(InputError, match=r"friction.viscous needs two finite numbers >= 0, .*got"):
+            hz.filter(run, data, {"friction.viscous": pair})  # pyright: ignore[reportArgumentType]
+    table = {"t[s]": t[: len(kept)], "a[rad]": y[: len(kept), 0]}  # anything that `fit` takes
+    torch.testing.assert_close(hz.filter(run, table).state.q, hz.filter(run, data.select([0])).state.q)
 
 
 def test_the_noise_of_a_fit_is_that_of_its_recording():
