@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.codegen.c_compiler import compiler
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.gaps import complete
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.export.c_compile import compile_c
 from herglotz.export.c_header import MAX_DERIVATIVES
 from herglotz.export.exported import ExportedStepper
@@ -25,6 +25,7 @@ from herglotz.stepping import State
 from herglotz.stepping.filter import Belief, KalmanFilter, Noise
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.predict import of_the_run
+from herglotz.training.problems.grid import step_inputs
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,12 @@ def filter(
     for name, pair in chosen.items():
         if not (isinstance(pair, Sequence) and len(pair) == 2 and all(0 <= x < math.inf for x in pair)):
             raise InputError(f"parameters: {name} needs two finite numbers >= 0, (deviation, wander), got {pair}")
+    refuse({f"filter takes a run, got {type(run).__name__}; load_run(folder) reads one": not hasattr(run, "model")})
     model = copy.deepcopy(run.model).double()
-    data = (
-        complete(of_the_run(run, as_trajectories(recording, like=run.data)))
-        .unwrapped()
-        .to(dtype=torch.float64, device="cpu")
-    )
+    data = of_the_run(run, as_trajectories(recording, like=run.data))
+    data = complete(data).unwrapped().to(dtype=torch.float64, device="cpu")
+    # A recording without the model's inputs is refused.
+    step_inputs(model, data)
     wander = tuple(each for _, each in chosen.values())
     kalman = KalmanFilter(model, noise or noise_of(run, wander), list(chosen), stepper=_compiled(model, list(chosen)))
     if len(kalman.names) != len(chosen):

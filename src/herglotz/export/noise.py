@@ -76,7 +76,7 @@ def input_at(model: ContactLagrangian, data: Trajectories, row: int, part: Tenso
     if not model.inputs:
         return None
     u = data.inputs_of_steps(torch.tensor([row]), part[None])
-    assert u is not None  # `of_the_run` has checked
+    assert u is not None  # `step_inputs` has checked
     return u[0]
 
 

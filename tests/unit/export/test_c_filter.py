@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from statistics import NormalDist
 from types import SimpleNamespace
 from typing import Any
@@ -497,9 +498,16 @@ def test_the_noise_of_a_fit_is_that_of_its_recording():
     y = torch.stack(q) + 0.02 * torch.randn(600, 1, generator=make, dtype=torch.float64)
     t = (torch.arange(600) * H).double()
     data = Trajectories.of(t, y, (600,), u=u, names=("a",), units=("rad",), angles=(True,))
-    found = noise_of(run_of(model, data, 0.002))
+    run = run_of(model, data, 0.002)
+    found = noise_of(run)
     assert found.position[0] == pytest.approx(0.02, rel=0.2)
     assert found.momentum[0] == pytest.approx(0.3, rel=0.2)
+    # fails if a recording without inputs ends in an AssertionError, or one with too many in words on a shape
+    for wrong, said in ((None, "the model is driven by 1 input"), (u.repeat(1, 2), r"2 input\(s\) u are recorded")):
+        with pytest.raises(InputError, match=said):
+            hz.filter(run, replace(data, u=wrong), noise=found)
+    with pytest.raises(InputError, match="filter takes a run, got str; load_run"):
+        hz.filter("runs/arm", data)  # pyright: ignore[reportArgumentType]
 
 
 def test_positions_that_were_not_read_tell_nothing_of_the_noise(double_pendulum):
