@@ -2,10 +2,9 @@
 
 `nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
 as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `l4casadi`: the same by L4CasADi,
-where it is installed (`control_l4casadi.py` says how). `loop`: `rti.c` of `examples/real_time_iteration` in closed loop
-with the true plant from random starts. `jacobian`: a step with its Jacobian over a step, in C. One thread, processor
-time; what is compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json
-and control.md.
+where it is installed (`control_l4casadi.py` says how). `loop`: a real-time iteration in closed loop
+(`control_loop.py`). `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time; what is
+compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and control.md.
 """
 
 from __future__ import annotations
@@ -16,10 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,17 +26,23 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
+from benchmarks.control_loop import (
+    FORCE,
+    FORCE_WEIGHT,
+    INTERVAL,
+    LAST,
+    STEPS,
+    TRACK,
+    UPRIGHT,
+    WEIGHT,
+    N,
+    from_random_starts,
+)  # fmt: skip
 from benchmarks.control_model import H, model, sx_steps
 from herglotz.codegen.c_compiler import compiler
-from herglotz.export import compile_c, export_c, export_casadi
+from herglotz.export import export_c, export_casadi
 from herglotz.models import ContactLagrangian, ModelConfig
 
-N, STEPS = 50, 8  # intervals, and steps in one
-INTERVAL = STEPS * H  # s
-UPRIGHT, WEIGHT = np.array([0.0, np.pi, 0.0, 0.0, 0.0]), np.array([1.0, 2.0, 0.05, 0.5, 0.0])
-FORCE, FORCE_WEIGHT, LAST = 12.0, 0.003, 20.0
-TRACK, BARRIER = 0.9, 10.0  # m to either side; the barrier's weight
-MISS = 1e-3  # m: what the model misses in an interval
 NEAR = 0.1  # rad from upright
 FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
 Row = dict[str, Any]
@@ -175,77 +178,12 @@ def l4casadi(quick: bool, folder: Path) -> list[Row]:
     ]
 
 
-class Controller(ctypes.Structure):
-    """`rti` of rti.c."""
-
-    _fields_ = [
-        ("H", ctypes.c_double), ("X", ctypes.c_double * 5), ("Q", ctypes.c_double * 5), ("E", ctypes.c_double * 5),
-        ("R", ctypes.c_double), ("U", ctypes.c_double), ("B", ctypes.c_double * 5), ("barrier", ctypes.c_double),
-        ("near", ctypes.c_double), ("x", ctypes.c_double * (5 * (N + 1))),
-        ("u", ctypes.c_double * N), ("K", ctypes.c_double * (5 * N)), ("k", ctypes.c_double * N),
-        ("damping", ctypes.c_double), ("cost", ctypes.c_double),
-    ]  # fmt: skip
-
-
-def plant() -> Callable[..., np.ndarray]:
-    """The true plant: the first cells of the example."""
-    text = (harness.ROOT / "examples" / "mpc_swing_up.py").read_text(encoding="utf-8")
-    known: dict[str, Any] = {}
-    exec(text[: text.index("# Four recordings")], known)
-    return known["plant"]
-
-
-def closed(library: ctypes.CDLL, stepper: Any, true: Callable[..., np.ndarray], z: np.ndarray, count: int) -> Row:
-    """`count` samples from z = (x, θ, x′, θ′): the angle after each, the largest |x|, ms of both phases.
-
-    And how many iterations it took before the first sample.
-    """
-    tensor = lambda x: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1)  # noqa: E731
-
-    def measured(q0: np.ndarray, q1: np.ndarray, force: float) -> Any:
-        """The state of two positions, one step of the model apart."""
-        at = stepper.init(tensor(q0), tensor(q1), torch.zeros(1, dtype=torch.float64), H, u=tensor(force))
-        return (ctypes.c_double * 5)(*q1, *at.p[0].tolist(), 0.0)
-
-    it, force = Controller(H=INTERVAL, R=FORCE_WEIGHT, U=FORCE, barrier=BARRIER, near=MISS / TRACK), ctypes.c_double()
-    it.B[0] = TRACK
-    it.X[:], it.Q[:], it.E[:] = UPRIGHT, WEIGHT, LAST * WEIGHT
-    it.u[:] = [0.1] * N
-    state = measured(z[:2] - H * z[2:], z[:2], 0.0)
-    failed = library.rti_feedback(ctypes.byref(it), state, ctypes.byref(force))  # the first motion: no law yet
-    first = 0
-    while max(map(abs, it.x[::5])) > TRACK and not failed:  # up to a plan that keeps the bounds
-        failed = library.rti_prepare(ctypes.byref(it))
-        failed |= library.rti_feedback(ctypes.byref(it), state, ctypes.byref(force))
-        first += 1
-    angles, widest, ms = [], 0.0, []
-    for _ in range(count):
-        times = [time.perf_counter()]
-        failed |= library.rti_prepare(ctypes.byref(it))
-        times.append(time.perf_counter())
-        failed |= library.rti_feedback(ctypes.byref(it), state, ctypes.byref(force))
-        times.append(time.perf_counter())
-        failed |= library.rti_shift(ctypes.byref(it))
-        assert not failed
-        before = true(z, force.value, INTERVAL - H, 5)
-        z = true(before, force.value, H, 1)
-        state = measured(before[:2], z[:2], force.value)
-        angles.append(z[1])
-        widest = max(widest, abs(z[0]))
-        ms.append([1e3 * (b - a) for a, b in pairwise(times)])
-    return {"angles": np.array(angles), "widest": widest, "ms": np.array(ms), "first": first}
-
-
 def loop(quick: bool, folder: Path) -> list[Row]:
     """From random starts: up for 10 s after at most 5 s, and the time of an iteration."""
     export_casadi(model(), folder / "model.c", h=H, name="model")
     source = folder / "rti.c"
     source.write_text((harness.ROOT / "examples" / "real_time_iteration" / "rti.c").read_text(encoding="utf-8"))
-    library, stepper, true = ctypes.CDLL(str(built(source))), compile_c(model(), h=H), plant()
-    draw, found = np.random.default_rng(0), []
-    for _ in range(1 if quick else 100):
-        start = np.array([draw.uniform(-0.5, 0.5), draw.uniform(-np.pi, np.pi), *draw.normal(size=2) * [0.5, 2.0]])
-        found.append(closed(library, stepper, true, start, round(15.0 / INTERVAL)))
+    found = from_random_starts(ctypes.CDLL(str(built(source))), 1 if quick else 100, round(15.0 / INTERVAL))
     off = [abs((one["angles"] % (2 * np.pi)) - np.pi) for one in found]
     last = [np.flatnonzero(x >= NEAR)[-1] + 1 if (x >= NEAR).any() else 0 for x in off]  # samples until it stays up
     up = sum(int(INTERVAL * k <= 5.0) for k in last)
