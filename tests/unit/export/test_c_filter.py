@@ -513,13 +513,13 @@ def test_the_noise_of_a_fit_is_that_of_its_recording():
 
 def test_the_steps_that_lead_to_each_sample():
     # fails if a gap is one step, its parts begin at another row, or an input is read where a part begins
-    t = torch.tensor([0.0, 0.1, 0.4, 0.0, 0.1], dtype=torch.float64)
-    data = Trajectories.of(t, t[:, None], (3, 2), names=("a",), units=("m",), angles=(False,))
+    t = torch.tensor([0.0, 0.1, 0.4, 0.0, 0.1, 0.2], dtype=torch.float64)
+    data = Trajectories.of(t, t[:, None], (3, 3), names=("a",), units=("m",), angles=(False,))
     parts, rows, places, h = _parts(data, 0.1)
-    assert parts.tolist() == [0, 1, 3, 0, 1]
-    assert rows.tolist() == [0, 1, 1, 1, 3]
-    assert places.tolist() == pytest.approx([1 / 2, 1 / 6, 1 / 2, 5 / 6, 1 / 2])
-    assert h.tolist() == pytest.approx([0.1] * 5)
+    assert parts.tolist() == [0, 1, 3, 0, 1, 1]
+    assert rows.tolist() == [0, 1, 1, 1, 3, 4]
+    assert places.tolist() == pytest.approx([1 / 2, 1 / 6, 1 / 2, 5 / 6, 1 / 2, 1 / 2])
+    assert h.tolist() == pytest.approx([0.1] * 6)
 
 
 def test_positions_that_were_not_read_tell_nothing_of_the_noise(double_pendulum):
