@@ -1,10 +1,10 @@
 """The exported step in control: `python benchmarks/control.py [--quick] [--only PART ...] [--out FOLDER]`.
 
 `nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
-as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `loop`: `rti.c` of
-`examples/real_time_iteration` in closed loop with the true plant from random starts. `jacobian`: a step with its
-Jacobian over a step, in C. One thread, processor time; what is compared is timed in turn within each repeat, and a
-ratio is one of a single repeat. Writes control.json and control.md.
+as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `l4casadi`: the same by L4CasADi,
+where it is installed (`control_l4casadi.py` says how). `loop`: a real-time iteration in closed loop
+(`control_loop.py`). `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time; what is
+compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and control.md.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from itertools import pairwise
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +26,23 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
+from benchmarks.control_loop import (
+    FORCE,
+    FORCE_WEIGHT,
+    INTERVAL,
+    LAST,
+    STEPS,
+    TRACK,
+    UPRIGHT,
+    WEIGHT,
+    N,
+    from_random_starts,
+)  # fmt: skip
 from benchmarks.control_model import H, model, sx_steps
 from herglotz.codegen.c_compiler import compiler
-from herglotz.export import compile_c, export_c, export_casadi
+from herglotz.export import export_c, export_casadi
 from herglotz.models import ContactLagrangian, ModelConfig
 
-N, STEPS = 50, 8  # intervals, and steps in one
-INTERVAL = STEPS * H  # s
-UPRIGHT, WEIGHT = np.array([0.0, np.pi, 0.0, 0.0, 0.0]), np.array([1.0, 2.0, 0.05, 0.5, 0.0])
-FORCE, FORCE_WEIGHT, LAST = 12.0, 0.003, 20.0
-TRACK, BARRIER = 0.9, 10.0  # m to either side; the barrier's weight
-START = 20  # iterations before the first sample
 NEAR = 0.1  # rad from upright
 FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
 Row = dict[str, Any]
@@ -100,14 +106,20 @@ def solve(solver: ca.Function) -> tuple[float, float, float]:
     return took, sum(x for key, x in stats.items() if key.startswith("t_proc_nlp")), float(found["f"])
 
 
+def exported(folder: Path) -> tuple[str, ca.Function]:
+    """The compiled file for CasADi, and all intervals by its one call."""
+    library = str(built(export_casadi(model(), folder / "cart.c", h=H), f"-Dcart_HORIZON={N}"))
+    shoot, X, U = ca.external("cart_shoot", library), ca.MX.sym("X", 5, N), ca.MX.sym("U", 1, N)
+    return library, ca.Function("ahead", [X, U], [shoot(X, U, INTERVAL)])
+
+
 def nlp(quick: bool, folder: Path) -> list[Row]:
     """The whole solution and its functions, ours and others in turn."""
-    library = str(built(export_casadi(model(), folder / "cart.c", h=H), f"-Dcart_HORIZON={N}"))
+    library, shoot = exported(folder)
     hold, x, u = ca.external("cart_hold", library), ca.MX.sym("x", 5), ca.MX.sym("u")
-    shoot, X, U = ca.external("cart_shoot", library), ca.MX.sym("X", 5, N), ca.MX.sym("U", 1, N)
     own = sx_steps()
     forms = {
-        "ours": solver(ca.Function("ahead", [X, U], [shoot(X, U, INTERVAL)])),
+        "ours": solver(shoot),
         "ours, 50 calls of a hold": solver(ca.Function("ahead", [x, u], [hold(x, u, INTERVAL)]).map(N)),
         "ours, 8 calls of a step": solver(repeated(ca.external("cart_step", library))),
         "SX, fast_newton": solver(repeated(own["rootfinder"])),
@@ -127,61 +139,43 @@ def nlp(quick: bool, folder: Path) -> list[Row]:
     return rows
 
 
-class Controller(ctypes.Structure):
-    """`rti` of rti.c."""
+def l4casadi(quick: bool, folder: Path) -> list[Row]:
+    """What all gaps and their Jacobian take, over ours, and what IPOPT makes of them."""
+    from benchmarks.control_l4casadi import interval
 
-    _fields_ = [
-        ("H", ctypes.c_double), ("X", ctypes.c_double * 5), ("Q", ctypes.c_double * 5), ("E", ctypes.c_double * 5),
-        ("R", ctypes.c_double), ("U", ctypes.c_double), ("B", ctypes.c_double * 5), ("barrier", ctypes.c_double),
-        ("near", ctypes.c_double), ("x", ctypes.c_double * (5 * (N + 1))),
-        ("u", ctypes.c_double * N), ("K", ctypes.c_double * (5 * N)), ("k", ctypes.c_double * N),
-        ("damping", ctypes.c_double), ("cost", ctypes.c_double),
-    ]  # fmt: skip
-
-
-def plant() -> Callable[..., np.ndarray]:
-    """The true plant: the first cells of the example."""
-    text = (harness.ROOT / "examples" / "mpc_swing_up.py").read_text(encoding="utf-8")
-    known: dict[str, Any] = {}
-    exec(text[: text.index("# Four recordings")], known)
-    return known["plant"]
-
-
-def closed(library: ctypes.CDLL, stepper: Any, true: Callable[..., np.ndarray], z: np.ndarray, count: int) -> Row:
-    """`count` samples from z = (x, θ, x′, θ′): the angle after each, the largest |x|, and ms of both phases."""
-    tensor = lambda x: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1)  # noqa: E731
-
-    def measured(q0: np.ndarray, q1: np.ndarray, force: float) -> Any:
-        """The state of two positions, one step of the model apart."""
-        at = stepper.init(tensor(q0), tensor(q1), torch.zeros(1, dtype=torch.float64), H, u=tensor(force))
-        return (ctypes.c_double * 5)(*q1, *at.p[0].tolist(), 0.0)
-
-    it, force = Controller(H=INTERVAL, R=FORCE_WEIGHT, U=FORCE, barrier=BARRIER, near=0.05), ctypes.c_double()
-    it.B[0] = TRACK
-    it.X[:], it.Q[:], it.E[:] = UPRIGHT, WEIGHT, LAST * WEIGHT
-    it.u[:] = [0.1] * N
-    state = measured(z[:2] - H * z[2:], z[:2], 0.0)
-    failed = library.rti_feedback(ctypes.byref(it), state, ctypes.byref(force))  # the first motion: no law yet
-    for _ in range(START):
-        failed |= library.rti_prepare(ctypes.byref(it)) | library.rti_feedback(
-            ctypes.byref(it), state, ctypes.byref(force)
-        )
-    angles, widest, ms = [], 0.0, []
-    for _ in range(count):
-        times = [time.perf_counter()]
-        failed |= library.rti_prepare(ctypes.byref(it))
-        times.append(time.perf_counter())
-        failed |= library.rti_feedback(ctypes.byref(it), state, ctypes.byref(force))
-        times.append(time.perf_counter())
-        failed |= library.rti_shift(ctypes.byref(it))
-        assert not failed
-        before = true(z, force.value, INTERVAL - H, 5)
-        z = true(before, force.value, H, 1)
-        state = measured(before[:2], z[:2], force.value)
-        angles.append(z[1])
-        widest = max(widest, abs(z[0]))
-        ms.append([1e3 * (b - a) for a, b in pairwise(times)])
-    return {"angles": np.array(angles), "widest": widest, "ms": np.array(ms)}
+    calls, at = [], np.concatenate([np.linspace(np.zeros(5), UPRIGHT, N + 1).ravel(), np.full(N, 0.1)])
+    forms = (exported(folder)[1], interval(N, STEPS, folder))
+    for ahead in forms:
+        of = problem(ahead)[0]
+        calls.append(ca.Function("both", [of["x"], of["p"]], [of["g"], ca.jacobian(of["g"], of["x"])]))
+    (ours, slopes), (theirs, others) = ([np.array(ca.densify(x)) for x in call(at, np.zeros(5))] for call in calls)
+    apart = max(float(abs(ours - theirs).max()), float(abs(slopes - others).max() / abs(slopes).max()))
+    assert apart < 1e-3, apart  # the same functions, in float32
+    ratios, ms = [], []
+    for k in range(15 if quick else 50):
+        taken = []
+        for call, count in zip(calls, (20, 2), strict=True):
+            began = time.process_time()
+            for _ in range(count):
+                call(at, np.zeros(5))
+            taken.append((time.process_time() - began) / count)
+        if k >= 10:  # TorchScript compiles in the first calls
+            ratios.append(taken[1] / taken[0])
+            ms.append(1e3 * taken[1])
+    of, options = problem(forms[1])
+    options["ipopt"] |= {"max_iter": 500}
+    solved = ca.nlpsol("solver", "ipopt", of, options)
+    with suppress(AssertionError):
+        solve(solved)
+    stats = solved.stats()
+    inside = sum(x for key, x in stats.items() if key.startswith("t_proc_nlp"))
+    note = f"{statistics.median(ms):.1f} ms; {min(ratios):.0f} to {max(ratios):.0f}"
+    ended = f"{stats['return_status']}, at a tolerance of 1e-4 in float32; functions took {inside:.1f} s"
+    what = "gaps of the swing-up with their Jacobian, L4CasADi over ours"
+    return [
+        {"what": what, "value": statistics.median(ratios), "target": ">= 10", "note": note},
+        {"what": "iterations of IPOPT on L4CasADi's", "value": stats["iter_count"], "note": ended},
+    ]
 
 
 def loop(quick: bool, folder: Path) -> list[Row]:
@@ -189,11 +183,7 @@ def loop(quick: bool, folder: Path) -> list[Row]:
     export_casadi(model(), folder / "model.c", h=H, name="model")
     source = folder / "rti.c"
     source.write_text((harness.ROOT / "examples" / "real_time_iteration" / "rti.c").read_text(encoding="utf-8"))
-    library, stepper, true = ctypes.CDLL(str(built(source))), compile_c(model(), h=H), plant()
-    draw, found = np.random.default_rng(0), []
-    for _ in range(1 if quick else 20):
-        start = np.array([draw.uniform(-0.5, 0.5), draw.uniform(-np.pi, np.pi), *draw.normal(size=2) * [0.5, 2.0]])
-        found.append(closed(library, stepper, true, start, round(15.0 / INTERVAL)))
+    found = from_random_starts(ctypes.CDLL(str(built(source))), 1 if quick else 100, round(15.0 / INTERVAL))
     off = [abs((one["angles"] % (2 * np.pi)) - np.pi) for one in found]
     last = [np.flatnonzero(x >= NEAR)[-1] + 1 if (x >= NEAR).any() else 0 for x in off]  # samples until it stays up
     up = sum(int(INTERVAL * k <= 5.0) for k in last)
@@ -203,6 +193,7 @@ def loop(quick: bool, folder: Path) -> list[Row]:
         {"what": "last time not within 0.1 rad of upright, s", "value": INTERVAL * max(last)},
         {"what": "farthest from upright in the last 10 s, rad", "value": float(max(x[-200:].max() for x in off))},
         {"what": "widest way of the cart, m", "value": max(one["widest"] for one in found), "target": f"<= {TRACK:g}"},
+        {"what": "iterations before the first sample, at most", "value": max(one["first"] for one in found)},
         {"what": "an iteration, ms (median; clock)", "value": float(np.median(ms.sum(1))), "target": "<= 1"},
         {"what": "of it the feedback, ms (median; clock)", "value": float(np.median(ms[:, 1]))},
         {"what": "an iteration, ms (99 of 100; clock)", "value": float(np.quantile(ms.sum(1), 0.99))},
@@ -244,7 +235,7 @@ def jacobian(quick: bool, folder: Path) -> list[Row]:
     return rows
 
 
-PARTS = {"nlp": nlp, "loop": loop, "jacobian": jacobian}
+PARTS = {"nlp": nlp, "l4casadi": l4casadi, "loop": loop, "jacobian": jacobian}
 
 
 def table(rows: list[Row]) -> str:
@@ -269,6 +260,9 @@ def main(argv: list[str] | None = None) -> None:
     path = harness.json_file(arguments, "control")
     parts = harness.load(path, {"parts": {}})["parts"]
     for name in arguments.only or PARTS:
+        if name == "l4casadi" and find_spec(name) is None:
+            print("l4casadi is not installed: its rows are those of the last run with it")
+            continue
         with tempfile.TemporaryDirectory(prefix="herglotz-bench-") as folder:
             parts[name] = PARTS[name](arguments.quick, Path(folder))
         rows = [row for part in PARTS for row in parts.get(part, [])]

@@ -5,10 +5,12 @@
                |x_k| <= B
 
    `rti_prepare` runs before the sample is there: Jacobians of all intervals, and a Riccati recursion whose problem at
-   each interval keeps the bounds by an active set (differential dynamic programming with control limits: Tassa, Mansard and
-   Todorov, ICRA 2014; Gauss-Newton, as a step has first derivatives). Bounds of states are a logarithmic barrier that goes
-   on as a parabola from where `near` of the way to the bound is left (Hauser and Saccon, CDC 2006; Feller and Ebenbauer,
-   IEEE Trans. Autom. Control 62, 2017), so that a motion beyond a bound has a cost, too, and leads back. `rti_feedback` takes the measured state, runs the
+   each interval keeps the bounds by an active set (differential dynamic programming with control limits: Tassa, Mansard
+   and Todorov, ICRA 2014; Gauss-Newton, as a step has first derivatives). Bounds of states are a logarithmic barrier that
+   goes on as a parabola from where `near` of the way to the bound is left (Hauser and Saccon, CDC 2006; Feller and
+   Ebenbauer, IEEE Trans. Autom. Control 62, 2017), so that a motion beyond a bound has a cost, too, and leads back. Take
+   for `near` what the model misses in an interval, over the bound: a plan that keeps the bound then never leaves it by
+   much more. Before the first sample iterate until the plan keeps it. `rti_feedback` takes the measured state, runs the
    law through the model, and gives the input. Compile with: cc -O3 -march=native rti.c -lm (or -shared -fPIC). */
 
 #include <math.h>

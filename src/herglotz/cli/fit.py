@@ -8,7 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_folder, exit_code, flag, import_torch, print_json, print_next_of, say
+from herglotz.cli.common import (
+    check_output_folder,
+    existing,
+    exit_code,
+    flag,
+    import_torch,
+    print_json,
+    print_next_of,
+    say,
+)
 from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
 from herglotz.cli.settings import EXPERT, MACHINE, MODEL, OPTIMISER, data_of, settings_of
 
@@ -29,6 +38,7 @@ and samples may be missing.
 examples:
   herglotz fit pendulum.csv --out runs/pendulum
   herglotz fit another.csv --out runs/another --config runs/pendulum --seed 1
+  herglotz fit loaded.csv --out runs/loaded --plan runs/pendulum
 """
 
 
@@ -37,6 +47,8 @@ HELP = "train a model on measured positions"
 FLAGS = (
     *RUN, *PROGRESS,
     flag("--no-plots", "do not draw figures", action="store_true"),
+    flag("--plan", "follow the plan of this run instead of choosing one: the same terms, from its values, as for "
+         "another load", type=existing, metavar="RUN"),
     flag("--tensorboard", "log for TensorBoard, as the fit runs (RUN holds history.csv too)",
          type=Path, metavar="FOLDER"),
     *MACHINE, *READING, *MODEL, *OPTIMISER, *EXPERT,
@@ -51,11 +63,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.training import load_run
 
-    config = settings_of(arguments)
+    config, plan = settings_of(arguments), None if arguments.plan is None else load_run(arguments.plan)
     if arguments.tensorboard is not None:
         check_output_folder(arguments.tensorboard)
     data, reading = data_of(arguments, columns_of(arguments))
-    _fit_into(out, data, config, reading, arguments)
+    _fit_into(out, data, config, plan, reading, arguments)
     result = load_run(out)  # what later commands will see, and on the cpu
     drawn: list[Path] = []
     if not arguments.no_plots:
@@ -70,8 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _fit_into(
-    out: Path, data: Trajectories, config: FitConfig, reading: dict[str, Any], arguments: argparse.Namespace
-) -> None:
+    out: Path, data: Trajectories, config: FitConfig, plan: Run | None, reading: dict[str, Any],
+    arguments: argparse.Namespace,
+) -> None:  # fmt: skip
     """Train and save; a folder that was made for nothing goes again."""
     from herglotz.data.lock import locked
     from herglotz.training import fit, save_run
@@ -80,7 +93,7 @@ def _fit_into(
     try:
         with locked(out):
             shown = {"progress": progress(arguments), "tensorboard": arguments.tensorboard}
-            done = fit(data, config, out=out, resume=arguments.resume, **shown)
+            done = fit(data, config, plan=plan, out=out, resume=arguments.resume, **shown)
             save_run(replace(done, reading=reading), out)
     except KeyboardInterrupt:
         if (out / "checkpoint.pt").exists():

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from herglotz.codegen.c_compiler import compiler
-from herglotz.data import Trajectories
+from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.gaps import complete
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.export.c_compile import compile_c
 from herglotz.export.c_header import MAX_DERIVATIVES
 from herglotz.export.exported import ExportedStepper
@@ -24,6 +25,7 @@ from herglotz.stepping import State
 from herglotz.stepping.filter import Belief, KalmanFilter, Noise
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.predict import of_the_run
+from herglotz.training.problems.grid import step_inputs
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Filtered:
 
 def filter(
     run: FittedRun,
-    recording: Trajectories,
+    recording: Any,
     parameters: Mapping[str, tuple[float, float]] | None = None,
     noise: Noise | None = None,
     lag: int = 0,
@@ -60,7 +62,8 @@ def filter(
     run
         What `fit` returned.
     recording
-        Positions of the same coordinates, in the same units, with inputs where the model takes them.
+        Positions of the same coordinates, in the same units, with inputs where the model takes them: anything that
+        `fit` takes.
     parameters
         Numbers of the model that are estimated too: by name, the standard deviation that each starts with, and how far
         it wanders in the root of a unit of time, in the number's own unit.
@@ -78,17 +81,24 @@ def filter(
     ------
     InputError
         If the recording is not of the run, has trajectories of fewer than two samples or of no more than the lag, or
-        leaves where the model has steps.
+        leaves where the model has steps; or a deviation is none.
     """
     chosen = dict(parameters or {})
+    for name, pair in chosen.items():
+        if not (isinstance(pair, Sequence) and len(pair) == 2 and all(0 <= x < math.inf for x in pair)):
+            raise InputError(f"parameters: {name} needs two finite numbers >= 0, (deviation, wander), got {pair}")
+    refuse({f"filter takes a run, got {type(run).__name__}; load_run(folder) reads one": not hasattr(run, "model")})
     model = copy.deepcopy(run.model).double()
-    data = complete(of_the_run(run, recording)).unwrapped().to(dtype=torch.float64, device="cpu")
+    data = of_the_run(run, as_trajectories(recording, like=run.data))
+    data = complete(data).unwrapped().to(dtype=torch.float64, device="cpu")
+    # A recording without the model's inputs is refused.
+    step_inputs(model, data)
     wander = tuple(each for _, each in chosen.values())
     kalman = KalmanFilter(model, noise or noise_of(run, wander), list(chosen), stepper=_compiled(model, list(chosen)))
     if len(kalman.names) != len(chosen):
         raise InputError(f"{', '.join(chosen)} stand for several numbers of the model; name each of them")
     std = torch.tensor([first for first, _ in chosen.values()], dtype=torch.float64)
-    beliefs, surprises, steps = [], [], []
+    beliefs, surprises, steps, most = [], [], [], run.h_range[1]
     _check_lengths(data, lag)
     for first, length in zip(data.offsets, data.lengths, strict=True):
         belief, surprise = _started(kalman, data, first, std), math.nan
@@ -96,14 +106,14 @@ def filter(
             h = float(data.t[row] - data.t[row - 1]) if row > first else float(data.t[row + 1] - data.t[row])
             if row > first:
                 belief = kalman.remember(belief, lag) if lag else belief
-                before = _carried(kalman, model, data, belief, row, h, run.h_range[1])
+                before = _carried(kalman, model, data, belief, row, h, most)
                 belief, surprise = kalman.update(before, data.q[row])
             beliefs.append(kalman.smoothed(belief, 0))
             # The sample that waits no longer; all of them at the end.
             for back in range(1, lag + 1) if row + 1 == first + length else [lag] * (lag <= row - first):
                 beliefs[row - back] = kalman.smoothed(belief, back)
             surprises.append(surprise)
-            steps.append(min(h, run.h_range[1]))
+            steps.append(min(h, most))
     return _told(kalman, model, data, beliefs, surprises, steps)
 
 
@@ -111,8 +121,10 @@ def _check_lengths(data: Trajectories, lag: int) -> None:
     shortest = min(data.lengths)
     if shortest < 2:
         raise InputError(f"{data.source or 'data'}: a trajectory has {shortest} sample; a filter starts at two")
-    if not 0 <= lag < shortest:
-        raise InputError(f"lag must be 0 to {shortest - 1}, as a trajectory has {shortest} samples, got {lag}")
+    if not (isinstance(lag, int) and 0 <= lag < shortest):
+        raise InputError(
+            f"lag must be a whole number from 0 to {shortest - 1}, as a trajectory has {shortest} samples, got {lag}"
+        )
 
 
 def _carried(

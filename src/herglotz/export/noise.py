@@ -15,6 +15,7 @@ from torch import Tensor
 
 from herglotz.codegen.c_compiler import build, compiler
 from herglotz.data import Trajectories
+from herglotz.data.gaps import complete
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, export_c, runtime
 from herglotz.export.lower.c_parameters import without_parameters
@@ -35,8 +36,8 @@ ADAPTATION = 0.02
 def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
     """The noise of positions and of unknown forces under which the filter finds the data of the fit the likeliest.
 
-    They minimise −2 log p = Σ (y_i − q_i)²/S_i + log S_i over the innovations of the run's own samples. Beyond 8
-    coordinates and where there is no C compiler they are what the fit itself assumes.
+    They minimise −2 log p = Σ (y_i − q_i)²/S_i + log S_i over the innovations of the run's own samples whose positions
+    were all read. Beyond 8 coordinates and where there is no C compiler they are what the fit itself assumes.
 
     Source: A. C. Harvey, Forecasting, structural time series models and the Kalman filter (1989), section 3.4.
 
@@ -75,7 +76,7 @@ def input_at(model: ContactLagrangian, data: Trajectories, row: int, part: Tenso
     if not model.inputs:
         return None
     u = data.inputs_of_steps(torch.tensor([row]), part[None])
-    assert u is not None  # `of_the_run` has checked
+    assert u is not None  # `step_inputs` has checked
     return u[0]
 
 
@@ -107,38 +108,46 @@ def _compiles() -> bool:
 
 def _likelihood(run: FittedRun) -> Callable[[Tensor], float]:
     """−2 log p of the run's data as a function of the logarithms of the levels (2n,); infinite where a step fails."""
-    model, data = copy.deepcopy(run.model).double(), run.data.unwrapped().to(dtype=torch.float64, device="cpu")
+    model = copy.deepcopy(run.model).double()
+    data = complete(run.data).unwrapped().to(dtype=torch.float64, device="cpu")
     with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
         path = export_c(model, Path(folder, "noise.h"), h=run.h, name="noise", extras=["filter"])
         header = path.read_text(encoding="utf-8")
     library = build(header, re.sub(r"\bhz_", "noise_", without_parameters(runtime("innovations.c"))))
-    parts, steps, starts, slopes, inputs = [], [], [], [], list[Tensor]()
-    for first, length in zip(data.offsets, data.lengths, strict=True):
+    parts, rows, places, steps = _parts(data, run.h_range[1])
+    starts, slopes = [], []
+    for first in data.offsets:
         p, by_q = momentum_at(model, data, first)
         starts.append(torch.cat([data.q[first], p]))
         slopes.append(by_q)
-        parts.append(0)
-        for row in range(first, first + length - 1):
-            h = float(data.t[row + 1] - data.t[row])
-            count = parts_of(h, run.h_range[1])
-            parts.append(count)
-            steps += [h / count] * count
-            acting = (
-                input_at(model, data, row, torch.tensor((k + 0.5) / count, dtype=torch.float64)) for k in range(count)
-            )
-            inputs += [u for u in acting if u is not None]
     zero = torch.zeros(1, dtype=torch.float64)
-    u = torch.stack(inputs).contiguous() if inputs else zero
-    whole = (torch.tensor(x) for x in (list(data.lengths), parts))
-    lists = [*whole, zero.new_tensor(steps), u, data.q.contiguous(), torch.stack(starts), torch.stack(slopes)]
+    u = data.inputs_of_steps(rows, places) if model.inputs else None
+    lists = [torch.tensor(data.lengths), parts, steps, zero if u is None else u.contiguous(), data.q.contiguous()]
+    lists += [torch.stack(starts), torch.stack(slopes)]
 
     def found(levels: Tensor) -> float:
         deviations, total = levels.exp().contiguous(), torch.zeros_like(zero)
         pointers = (ctypes.c_void_p(x.data_ptr()) for x in (*lists, deviations, total))
-        failed = library.herglotz_likelihood(ctypes.c_long(len(starts)), *pointers)
+        failed = library.herglotz_likelihood(ctypes.c_long(len(data)), *pointers)
         return math.inf if failed or not math.isfinite(float(total)) else float(total)
 
     return found
+
+
+def _parts(data: Trajectories, most: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The steps of the model, as few equal ones of each recorded one as are no longer than `most`.
+
+    How many of them lead to each sample (N,); of each, the row where its recorded step starts, where in that its middle
+    is, from 0 to 1, and its length, all (K,).
+    """
+    recorded = data.steps()
+    counts = torch.tensor([parts_of(h, most) for h in recorded.h.tolist()])
+    parts = torch.zeros(data.samples, dtype=torch.int64).index_copy(0, recorded.index + 1, counts)
+    rows, h, spread, before = (
+        x.repeat_interleave(counts) for x in (recorded.index, recorded.h, counts, counts.cumsum(0) - counts)
+    )
+    places = (torch.arange(len(spread)).double() - before + 0.5) / spread
+    return parts, rows, places, h / spread
 
 
 def _descended(cost: Callable[[Tensor], float], x: Tensor) -> Tensor:

@@ -69,7 +69,10 @@ def between(run: Run, name: str, other: Run) -> Run:
     """
     own, theirs = numbers_of(run.model), numbers_of(other.model)
     if odd := sorted(set(own) ^ set(theirs)):
-        raise InputError(f"{name}: {odd[0]} is a number of one of the runs alone; fit the other with the first's plan")
+        raise InputError(
+            f"{name}: {odd[0]} is a number of one of the runs alone; fit one with the plan "
+            "of the other: hz.fit(data, plan=run), herglotz fit DATA --plan RUN"
+        )
     values = dict(zip(theirs, values_of(other.model, list(theirs)), strict=True))
     return replace(run, model=combined(run.model, name, values))
 
@@ -108,6 +111,7 @@ def checked_values(entries: Mapping[str, Any], values: Mapping[str, float]) -> l
         value = float(values.get(name, default))
         inside = (low is None or value >= low) and (high is None or value <= high)
         if not (math.isfinite(value) and inside):
-            raise InputError(f"{name} must be a finite number between {low} and {high}, got {value}")
+            ends = [f" {word} {x:g}" for word, x in ((">=", low), ("<=", high)) if x is not None]
+            raise InputError(f"{name} must be a finite number{' and'.join(ends)}, got {value}")
         found.append(value)
     return found

@@ -51,7 +51,7 @@ def fit(
     config: FitConfig | None = None,
     *,
     model: Any = None,
-    plan: Plan | None = None,
+    plan: Plan | Run | None = None,
     out: str | Path | None = None,
     progress: Progress = None,
     resume: bool = False,
@@ -75,7 +75,8 @@ def fit(
         `at(u)` where there are inputs, its derivatives by `partials` or by autograd. Its parameters are trained in
         place. Of the settings those that say how to fit apply (`herglotz.training.own_fit.TAKEN`).
     plan
-        Follow this plan instead of choosing one: `Plan.from_dict(run.metrics["plan"])` repeats a fit's decisions.
+        Follow this plan instead of choosing one, or that of a run: the same terms, from its values. Two loads of one
+        machine are fitted so (`herglotz.export.between`); `Plan.from_dict(run.metrics["plan"])` is a plan to change.
     out
         Folder for the checkpoint (`checkpoint.pt`); nothing is written without it. Use `save_run` for the result.
     progress
@@ -98,8 +99,8 @@ def fit(
     Raises
     ------
     InputError
-        If the data cannot be used, the settings are wrong, TensorBoard is missing, or another process is fitting into
-        `out`.
+        If the data cannot be used, the settings are wrong, the plan is of other coordinates, TensorBoard is missing, or
+        another process is fitting into `out`.
 
     Examples
     --------
@@ -112,6 +113,7 @@ def fit(
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
+    plan = _planned(plan, data)
     data = weighed(data, config.objective if plan is None else plan.objective, config.supervision)
     read = data
     if model is not None:
@@ -133,6 +135,18 @@ def fit(
         if log is not None:
             log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run
+
+
+def _planned(given: Plan | Run | None, data: Trajectories) -> Plan | None:
+    """The plan that is given, or the one of a run."""
+    plan = Plan.from_dict(given.metrics["plan"]) if isinstance(given, Run) and "plan" in given.metrics else given
+    if plan is None:
+        return None
+    if not isinstance(plan, Plan):
+        raise InputError(f"plan must be a Plan, or a run that followed one, got {type(given).__name__}")
+    if (count := len(plan.start["stiffness"])) != data.dof:
+        raise InputError(f"{data.source or 'data'}: the plan is of {count} coordinates, the data have {data.dof}")
+    return plan
 
 
 def weighed(data: Trajectories, objective: str, supervision: str) -> Trajectories:

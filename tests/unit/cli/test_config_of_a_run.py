@@ -11,6 +11,8 @@ import torch
 
 from herglotz.cli import main
 from herglotz.data import load, save, simulate
+from herglotz.export import between
+from herglotz.models.numbers import lines
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, load_run, save_run, select
 
@@ -48,6 +50,17 @@ def test_the_same_fit_from_a_runs_settings(folder):
     assert fitted(folder, "again", "--config", str(folder / "run")) == 0
     assert_same(run, load_run(folder / "again"))
     assert_same(run, fit(load(folder / "motion.csv", show=False), run.config, progress=False))
+
+
+def test_another_recording_by_the_plan_of_a_run(folder):
+    # fails if the terms are searched again: half of the time has no use for those of the run
+    save(folder / "short.csv", simulate(scene("duffing"), trajectories=1, steps=40, h=0.1, noise=0.001, gaps=0, seed=5))
+    flags = ("--out", str(folder / "short"), "--plan", str(folder / "run"), "--no-plots", "--quiet")
+    assert main(["fit", str(folder / "short.csv"), *flags]) == 3  # too little to tell
+    run, other = load_run(folder / "run"), load_run(folder / "short")
+    assert other.decided.features == run.decided.features != ()
+    assert other.config.features != run.decided.features  # it was not told
+    assert "load" in lines(between(run, "load", other).model)
 
 
 READ = ("--time", "clock", "--coordinates", "x", "--inputs", "drive", "--every", "2", "--hold", "first")

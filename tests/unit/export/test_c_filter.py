@@ -1,9 +1,11 @@
 """The Kalman filter of a header: its twin in Python, its covariance against its errors, and its velocity."""
 
 import ctypes
+import math
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from statistics import NormalDist
 from types import SimpleNamespace
 from typing import Any
@@ -15,8 +17,10 @@ from test_c_parameters import COMPILER, WARNINGS, _quick_compiler, address  # no
 import herglotz as hz
 from herglotz.codegen.c_compiler import build
 from herglotz.data import Trajectories
+from herglotz.data.gaps import with_missing
 from herglotz.errors import InputError
 from herglotz.export import export_c, noise_of
+from herglotz.export.noise import _parts
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of
 from herglotz.stepping import State, Stepper
@@ -26,6 +30,23 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="neither gcc nor clang 
 H, NAMES = 0.05, ["friction.viscous[0]", "friction.viscous[1]"]
 NOISE = Noise([0.01, 0.02], [0.2, 0.15], [0.01, 0.01])
 LEARNED = NOISE._replace(adaptation=0.05)
+
+
+class Fitted(SimpleNamespace):
+    """What a run is to a filter; it counts how often it is asked for its steps."""
+
+    asked = 0
+
+    @property
+    def h_range(self):
+        self.asked += 1
+        return H * (1 - 1e-7), H * (1 + 1e-7)
+
+
+def run_of(model, data, sigma) -> Any:
+    """A run with this noise of readings."""
+    config = SimpleNamespace(frequencies=())
+    return Fitted(model=model, metrics={"sigma": sigma}, data=data, h=H, arrival=data.arrival, config=config)
 
 
 def flat(noise):
@@ -414,7 +435,8 @@ def test_noise_that_is_none_is_refused(double_pendulum, tmp_path):
 
 def test_a_recording_is_followed_with_the_noise_of_the_fit():
     # fails if the noise of the fit is not that of the filter (its surprise is then not 1), a gap is one large step, a
-    # recording's input or a number that is estimated is left out, or trajectories run into one another
+    # recording's input or a number that is estimated is left out, or trajectories run into one another; or if the run
+    # is asked for its steps again for every sample, which took most of the time
     config = ModelConfig((True,), "forced", (1.0,), (2.0,), (4.0,), (0.0,), rate=0.0, potential_width=0)
     model = ContactLagrangian(config)
     with torch.no_grad():
@@ -425,12 +447,9 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     kept = torch.cat([torch.arange(30), torch.arange(34, 81)])  # a gap of five steps
     t, y = (kept * H).double().repeat(2), (exact + 0.01 * noise)[:, kept].reshape(-1, 1)
     data = Trajectories.of(t, y, (len(kept),) * 2, names=("a",), units=("rad",), angles=(True,))
-    span = (H * (1 - 1e-7), H * (1 + 1e-7))
-    run: Any = SimpleNamespace(
-        model=model, metrics={"sigma": 0.01}, data=data, h=H, h_range=span, arrival=data.arrival,
-        config=SimpleNamespace(frequencies=()),
-    )  # fmt: skip
+    run = run_of(model, data, 0.01)
     found = hz.filter(run, data, {"friction.viscous": (0.3, 0.0)})
+    assert run.asked <= 5
     assert 0.7 <= float(found.surprise.nanmean()) <= 1.3
     assert found.surprise.isnan().nonzero()[:, 0].tolist() == [0, len(kept)]
     v = (exact[:, 2:] - exact[:, :-2]) / (2 * H)
@@ -454,9 +473,14 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     truth = exact[:, kept].reshape(-1, 1)
     misses = [float((x.state.q - truth)[5:-5].square().mean().sqrt()) for x in (found, smooth)]
     assert misses[1] <= 0.8 * misses[0]
-    for lag in (-1, len(kept)):
-        with pytest.raises(InputError, match=f"lag must be 0 to {len(kept) - 1}.*got {lag}"):
-            hz.filter(run, data, lag=lag)
+    for lag in (-1, len(kept), 1.5):
+        with pytest.raises(InputError, match=f"lag must be a whole number from 0 to {len(kept) - 1}.*got {lag}"):
+            hz.filter(run, data, lag=lag)  # pyright: ignore[reportArgumentType]
+    for pair in (0.3, (0.3,), (-0.3, 0.0), (0.3, math.nan)):
+        with pytest.raises(InputError, match=r"friction.viscous needs two finite numbers >= 0, .*got"):
+            hz.filter(run, data, {"friction.viscous": pair})  # pyright: ignore[reportArgumentType]
+    table = {"t[s]": t[: len(kept)], "a[rad]": y[: len(kept), 0]}  # anything that `fit` takes
+    torch.testing.assert_close(hz.filter(run, table).state.q, hz.filter(run, data.select([0])).state.q)
 
 
 def test_the_noise_of_a_fit_is_that_of_its_recording():
@@ -475,11 +499,43 @@ def test_the_noise_of_a_fit_is_that_of_its_recording():
     y = torch.stack(q) + 0.02 * torch.randn(600, 1, generator=make, dtype=torch.float64)
     t = (torch.arange(600) * H).double()
     data = Trajectories.of(t, y, (600,), u=u, names=("a",), units=("rad",), angles=(True,))
-    span = (H * (1 - 1e-7), H * (1 + 1e-7))
-    run: Any = SimpleNamespace(
-        model=model, metrics={"sigma": 0.002}, data=data, h=H, h_range=span, arrival=data.arrival,
-        config=SimpleNamespace(frequencies=()),
-    )  # fmt: skip
+    run = run_of(model, data, 0.002)
     found = noise_of(run)
     assert found.position[0] == pytest.approx(0.02, rel=0.2)
     assert found.momentum[0] == pytest.approx(0.3, rel=0.2)
+    # fails if a recording without inputs ends in an AssertionError, or one with too many in words on a shape
+    for wrong, said in ((None, "the model is driven by 1 input"), (u.repeat(1, 2), r"2 input\(s\) u are recorded")):
+        with pytest.raises(InputError, match=said):
+            hz.filter(run, replace(data, u=wrong), noise=found)
+    with pytest.raises(InputError, match="filter takes a run, got str; load_run"):
+        hz.filter("runs/arm", data)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_steps_that_lead_to_each_sample():
+    # fails if a gap is one step, its parts begin at another row, or an input is read where a part begins
+    t = torch.tensor([0.0, 0.1, 0.4, 0.0, 0.1, 0.2], dtype=torch.float64)
+    data = Trajectories.of(t, t[:, None], (3, 3), names=("a",), units=("m",), angles=(False,))
+    parts, rows, places, h = _parts(data, 0.1)
+    assert parts.tolist() == [0, 1, 3, 0, 1, 1]
+    assert rows.tolist() == [0, 1, 1, 1, 3, 4]
+    assert places.tolist() == pytest.approx([1 / 2, 1 / 6, 1 / 2, 5 / 6, 1 / 2, 1 / 2])
+    assert h.tolist() == pytest.approx([0.1] * 6)
+
+
+def test_positions_that_were_not_read_tell_nothing_of_the_noise(double_pendulum):
+    # fails if positions that were interpolated over blank cells count as measured, which gave forces of 1.3 times
+    # their size
+    make, std = torch.Generator().manual_seed(0), torch.tensor(NOISE.momentum, dtype=torch.float64) * H**0.5
+    stepper, q = Stepper(double_pendulum), []
+    state = State(*(torch.full(size, 0.5, dtype=torch.float64) for size in ((8, 2), (8, 2), (8,))))
+    for _ in range(100):
+        q.append(state.q)
+        with torch.no_grad():
+            state = stepper.step(state, H).state
+        state = state._replace(p=state.p + std * torch.randn(8, 2, generator=make, dtype=torch.float64))
+    y = torch.stack(q, 1).reshape(-1, 2) + 0.01 * torch.randn(800, 2, generator=make, dtype=torch.float64)
+    t = (torch.arange(100) * H).double().repeat(8)
+    data = Trajectories.of(t, y, (100,) * 8, names=("a", "b"), units=("rad",) * 2, angles=(True, True))
+    data = with_missing(data, torch.rand(800, 2, generator=make) > 0.25, str)
+    found = noise_of(run_of(double_pendulum, data, 0.01))
+    assert found.momentum == pytest.approx(NOISE.momentum, rel=0.15), found

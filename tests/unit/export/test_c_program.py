@@ -275,8 +275,8 @@ def blocks(language):
 
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_program_of_the_docs(tmp_path, compiler):
-    # fails if docs/c.md shows a program that does not compile or run
-    export_c(model(), tmp_path / "stepper.h", h=0.1, box=BOX, units=["rad"], name="arm")
+    # fails if docs/c.md shows a program that does not compile or run with the file that its first line exports
+    export_c(model(), tmp_path / "arm.h", h=0.1, box=BOX, units=["rad"])
     assert len(run(tmp_path, blocks("c")[0], compiler, "-O2")) == 300
 
 
@@ -284,7 +284,7 @@ def test_the_cmake_lines_of_the_docs(tmp_path):
     # fails if the snippet does not configure, build or link
     if not shutil.which("cmake") or not shutil.which("make"):
         pytest.skip("no cmake")
-    export_c(model(), tmp_path / "stepper.h", h=0.1, name="arm")
+    export_c(model(), tmp_path / "arm.h", h=0.1)
     (tmp_path / "example.c").write_text(blocks("c")[0])
     (tmp_path / "CMakeLists.txt").write_text(blocks("cmake")[0])
     for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"]):

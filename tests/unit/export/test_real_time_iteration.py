@@ -60,24 +60,37 @@ def cost_of(model, x, u, it):
     return total
 
 
+@pytest.fixture(scope="module")
+def model():
+    """Two inputs on one coordinate, of different strength."""
+    made = damped("forced", torch.float64, inputs=2)
+    with torch.no_grad():
+        made.get_parameter("friction.input_map").copy_(torch.tensor([[1.0, 0.6]]))
+    return made
+
+
+@pytest.fixture(scope="module")
+def own(model, tmp_path_factory):
+    """The controller of the model."""
+    folder = tmp_path_factory.mktemp("rti")
+    export_casadi(model, folder / "model.c", h=0.1, name="model")
+    library = folder / "rti.so"
+    command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{folder}", str(RTI), "-o", str(library), "-lm"]
+    built = subprocess.run(command, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr[:2000]
+    return ctypes.CDLL(str(library))
+
+
 BOUNDS = {"free": ((50.0, 50.0), 0.0), "inputs": ((0.7, 0.5), 0.0), "position": ((50.0, 50.0), 0.38)}
 
 
 @pytest.mark.parametrize(("bounds", "position"), BOUNDS.values(), ids=BOUNDS)
-def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, position, tmp_path):
+def test_it_ends_where_no_input_within_the_bounds_costs_less(own, model, bounds, position):
     # fails if a block is transposed, the recursion forgets the cross term, a bound is left, an input that rests on a
     # bound takes part in the law, two inputs are solved as if one did not act on the other, the barrier's slope is not
     # that of its value, on either side or beyond the bound, where the motion starts, or an end that no
     # iteration betters is taken for a failure, which damps the next ones
-    model = damped("forced", torch.float64, inputs=2)
-    with torch.no_grad():
-        model.get_parameter("friction.input_map").copy_(torch.tensor([[1.0, 0.6]]))
-    export_casadi(model, tmp_path / "model.c", h=0.1, name="model")
-    library = tmp_path / "rti.so"
-    command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{tmp_path}", str(RTI), "-o", str(library), "-lm"]
-    built = subprocess.run(command, capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr[:2000]
-    own, it = ctypes.CDLL(str(library)), controller(bounds, position)
+    it = controller(bounds, position)
     x, first = np.array([-0.4, 0.3, 0.1]), (double * NU)()
     given = (double * NX)(*x)
     assert own.rti_feedback(ctypes.byref(it), given, first) == 0  # the first motion
@@ -112,13 +125,26 @@ def test_it_ends_where_no_input_within_the_bounds_costs_less(bounds, position, t
     assert np.array(it.u).reshape(N, NU)[:-1].tolist() == u[1:].tolist()
 
 
-def test_a_state_without_a_motion_is_an_error(tmp_path):
+def test_a_sharp_barrier_keeps_every_plan_within_the_bounds(own):
+    # fails if an iteration takes a plan farther beyond the bound than `near` of it, though the barrier weighs little:
+    # one that goes on as a parabola from half of the way is left
+    farthest = {}
+    for near in (1e-3, 0.5):
+        it, first, given = controller((50.0, 50.0), 0.38), (double * NU)(), (double * NX)(-0.2, 0.0, 0.0)
+        it.barrier, it.near, plans = 0.05, near, []
+        assert own.rti_feedback(ctypes.byref(it), given, first) == 0
+        for _ in range(25):
+            assert own.rti_prepare(ctypes.byref(it)) == 0
+            assert own.rti_feedback(ctypes.byref(it), given, first) == 0
+            plans.append(abs(np.array(it.x).reshape(N + 1, NX)[:, 0]).max())
+        farthest[near] = max(plans)
+    assert 0.37 <= farthest[1e-3] <= 0.38 * (1 + 1e-3)
+    assert farthest[0.5] > 0.4
+
+
+def test_a_state_without_a_motion_is_an_error(own):
     # fails if a measurement that is no number gives an input without a word
-    export_casadi(damped("forced", torch.float64, inputs=2), tmp_path / "model.c", h=0.1, name="model")
-    library = tmp_path / "rti.so"
-    command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{tmp_path}", str(RTI), "-o", str(library), "-lm"]
-    subprocess.run(command, check=True)
-    own, it, first = ctypes.CDLL(str(library)), controller((1.0, 1.0)), (double * NU)()
+    it, first = controller((1.0, 1.0)), (double * NU)()
     assert own.rti_feedback(ctypes.byref(it), (double * NX)(float("nan"), 0.0, 0.0), first) == 1
     it.H = -1.0
     assert own.rti_feedback(ctypes.byref(it), (double * NX)(), first) == 1

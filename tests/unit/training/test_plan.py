@@ -129,6 +129,11 @@ def test_a_wrong_plan_is_refused_in_words():
         Plan.from_dict({"level": "linear"})
     with pytest.raises(InputError, match="the plan's start lacks stiffness, rate"):
         Plan.from_dict({**plan, "start": {"tilt": [0.0], "stiffness": []}})
+    with pytest.raises(InputError, match="plan must be a Plan, or a run that followed one, got dict"):
+        fit(pendulum(), QUICK, plan=plan)  # pyright: ignore[reportArgumentType]
+    two = {**plan, "start": {**plan["start"], "stiffness": [1.0, 1.0]}}
+    with pytest.raises(InputError, match="the plan is of 2 coordinates, the data have 1"):
+        fit(pendulum(), QUICK, plan=Plan.from_dict(two))
 
 
 def test_what_is_no_config_is_refused():  # fails if hz.fit(t, q) ends in numpy's words on truth values
