@@ -24,7 +24,7 @@ def trial(fits, taken, loss=0.0) -> Any:
     sizes = {name: size for name, size in (("a", 1.0), ("b", 0.1), ("c", 0.5)) if name in taken}
     return SimpleNamespace(
         fitter=fits, taken=frozenset(taken), values={}, length=5, sizes=sizes,
-        score=SimpleNamespace(losses=torch.tensor([loss])),
+        score=SimpleNamespace(losses=torch.tensor([loss]), count=7),  # ½ ln 7 < 1
         replaces=lambda other: "c" not in other.taken,
     )  # fmt: skip
 
@@ -37,6 +37,10 @@ def test_strengths_follow_the_fit_as_long_as_held_out_blocks_are_missed_by_less(
     assert fits.asked == [(set(), 7)] * 3
     first = trial(Fits([None]), "abc", 4.0)
     assert likeliest(first, 7) is first
+    # what gains less than a number costs is the last one
+    fits = Fits([3.5, 3.0])
+    assert likeliest(trial(fits, "abc", 4.0), 7).score.losses.tolist() == [3.5]
+    assert fits.losses == [3.0]
 
 
 def test_a_model_without_functions_is_not_fitted_again():
