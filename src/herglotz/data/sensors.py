@@ -13,9 +13,19 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 
 
+def calibrated(
+    data: Trajectories, zeros: Sequence[float] | None = (), scales: Sequence[float] | None = ()
+) -> Trajectories:
+    """`measured` by what a user says: zeros are in the units of the columns, degrees where the table has degrees."""
+    read = [] if zeros is None else np.atleast_1d(zeros).tolist()
+    rad = [math.pi / 180 if name in data.degrees and unit == "rad" else 1.0 for name, unit in
+           zip(data.names, data.units, strict=True)]  # fmt: skip
+    return measured(data, [float(zero) * rad[k % data.dof] for k, zero in enumerate(read)], scales)
+
+
 def measured(
-    data: Trajectories,  # readings, in the units of their columns
-    zeros: Sequence[float] | None = (),  # n numbers, in degrees where the table has degrees; empty or None: 0
+    data: Trajectories,  # readings, in the units of q
+    zeros: Sequence[float] | None = (),  # n numbers; empty or None: 0
     scales: Sequence[float] | None = (),  # what one unit of each reading is worth, n numbers; empty or None: 1
 ) -> Trajectories:
     """The positions q = scale · (y − zero) of readings y, and v = scale · ẏ; p and s stay as they are recorded.
@@ -29,8 +39,7 @@ def measured(
     zero, scale = (_of_each_sample(data, what, x) for what, x in (("zeros", read), ("scales", worth)))
     none = f"{data.source or 'data'}: a scale of 0 leaves no motion; give what one unit of the reading is worth"
     refuse({none: 0.0 in [float(x) for x in worth]})
-    turned = [name in data.degrees and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
-    q = data.q - zero * zero.new_tensor([math.pi / 180 if x else 1.0 for x in turned]) if read else data.q
+    q = data.q - zero if read else data.q
     v = scale * data.v if worth and data.v is not None else data.v
     return replace(data, q=scale * q if worth else q, v=v)
 

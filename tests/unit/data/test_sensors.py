@@ -79,3 +79,12 @@ def test_a_comment_that_is_no_number_is_refused_with_its_place(tmp_path):
     path.write_text(CSV.format(unit="rad", zero="ten -1"))
     with pytest.raises(InputError, match=r"a.csv, comment '# zero: ten -1': 'ten' is not a number"):
         load(path, show=False)
+
+
+def test_zeros_that_a_fit_has_found_are_in_rad(tmp_path):
+    # fails if they are taken for degrees where the table has degrees: 0.05 rad of a zero were 0.0009 rad, and three
+    # recordings of a pendulum that differ by them did not fit
+    path = tmp_path / "a.csv"
+    path.write_text("t[s],theta[deg]\n0,10\n1,20\n2,30\n")
+    data = load(path, show=False)
+    assert torch.equal(measured(data, (0.05,)).q, data.q - 0.05)
