@@ -1,4 +1,4 @@
-"""What sensors read: of each coordinate y = zero + q / scale, so that q = scale · (y − zero)."""
+"""What sensors read: of each coordinate y = zero + drift t + q / scale, so that q = scale · (y − zero − drift t)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,18 @@ def measured(
     data: Trajectories,  # readings, in the units of q
     zeros: Sequence[float] | None = (),  # n numbers; empty or None: 0
     scales: Sequence[float] | None = (),  # what one unit of each reading is worth, n numbers; empty or None: 1
+    drifts: Sequence[float] = (),  # what the zeros gain in a unit of time since each recording began, n; empty: 0
 ) -> Trajectories:
-    """The positions q = scale · (y − zero) of readings y, and v = scale · ẏ; p and s stay as they are recorded.
+    """The positions q = scale · (y − zero − drift t) of readings y, v likewise; p and s stay as they are recorded.
 
     B recordings that differ have B · n numbers, recording after recording. Raise InputError if there is another number
     of them, one is not finite, or a scale is 0.
     """
     read, worth = ([] if x is None else np.atleast_1d(x).tolist() for x in (zeros, scales))
+    if drifts:
+        rate = data.q.new_tensor(drifts)
+        v = None if data.v is None else data.v - rate
+        data = replace(data, q=data.q - since_start(data)[:, None] * rate, v=v)
     if not read and not worth:
         return data
     zero, scale = (_of_each_sample(data, what, x) for what, x in (("zeros", read), ("scales", worth)))
@@ -42,6 +47,11 @@ def measured(
     q = data.q - zero if read else data.q
     v = scale * data.v if worth and data.v is not None else data.v
     return replace(data, q=scale * q if worth else q, v=v)
+
+
+def since_start(data: Trajectories) -> Tensor:
+    """Time since the recording of each sample began, (N,)."""
+    return data.t - data.t[list(data.offsets)][data.trajectory]
 
 
 def _of_each_sample(data: Trajectories, what: str, numbers: Sequence[float]) -> Tensor:

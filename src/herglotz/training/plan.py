@@ -47,6 +47,7 @@ class Plan:
     dissipation: tuple[str, ...] = ()  # powers of s in L beside −γ s
     input_terms: tuple[str, ...] = ()  # of recorded inputs, which act beside them
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
+    drifts: tuple[float, ...] = ()  # of these zeros, n numbers, in units of q per time since a recording began
     reasons: dict[str, str] = field(default_factory=dict)
 
     def applied(self, settings: FitConfig) -> FitConfig:
@@ -119,6 +120,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "delay": "delay of the inputs",
     "lag": "lag of the actuator",
     "zeros": "what the sensors read at 0, recording after recording",
+    "drifts": "what these zeros gain in a unit of time",
     "turning": "angles turn",
     "drag": "friction beside the viscous one",
     "dissipation": "damping by s, beside −γ s in L",
@@ -133,7 +135,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "departures": "strengths of the prior that are compared",
 }
 DECISIONS = tuple(WORDS)
-IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drag", "absent", "dissipation",
+IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drifts", "drag", "absent", "dissipation",
           "continues_probe", "fitted_before")  # fmt: skip  # told if not 0
 MEANINGS = {
     "level": {

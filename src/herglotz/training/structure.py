@@ -20,6 +20,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, roughness
+from herglotz.data.sensors import measured
 from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
@@ -38,7 +39,7 @@ from herglotz.training.problems.zeros import reference_of
 from herglotz.training.pruning import prune
 from herglotz.training.questions import Questions
 from herglotz.training.search import Search
-from herglotz.training.sensor_zeros import in_words
+from herglotz.training.sensor_zeros import drifts, in_words, sure
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
@@ -67,6 +68,8 @@ class Structure(NamedTuple):
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
     zeros: tuple[float, ...] = ()  # (B · n) of the sensors, which differ between recordings; found terms are without
     why_zeros: str = ""  # them in words
+    drifts: tuple[float, ...] = ()  # (n,) rates at which these zeros drift; found terms are without
+    why_drifts: str = ""  # them in words
     turning: bool = True  # angles turn; False: these terms are those of positions on a line, as of a free spring
     compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`compared_models`)
     input_terms: tuple[str, ...] = ()  # of inputs, which these terms ask for beside the recorded ones
@@ -133,6 +136,10 @@ def search(
     data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
+    drift, rates = drifts(wanted.part), ()
+    if drift is not None:
+        rates = tuple(drift[0].tolist())
+        wanted = wanted.of(measured(data, drifts=rates))
     asked = Questions(wanted, holds)
     if asked.read.better_on_a_line(asked.best):  # whose search, with inputs and sizes of its own, finds the terms again
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
@@ -150,7 +157,10 @@ def search(
     if differ is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     words, terms = _told(found, data), asked.input_terms
-    return Structure(settings, base, words, found.rms, zeros, why, True, compared, terms, asked.hold)
+    return Structure(
+        settings, base, words, found.rms, zeros, why, rates, "" if drift is None else f"rates {sure(*drift)}", True,
+        compared, terms, asked.hold,
+    )  # fmt: skip
 
 
 def _told(found: Trial, data: Trajectories) -> str:

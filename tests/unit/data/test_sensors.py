@@ -1,6 +1,7 @@
 """Sensor maps: q = scale · (reading − zero), from arguments, flags and comments of a file."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -41,6 +42,17 @@ def test_one_zero_a_coordinate_is_that_of_all_recordings():
 def test_what_makes_no_sense_is_refused(zeros, scales, said):
     with pytest.raises(InputError, match=said.replace("(", r"\(")):
         measured(two_recordings(), zeros, scales)
+
+
+def test_a_zero_that_drifts_begins_with_its_recording():
+    # fails if a drift goes on from one recording to the next, or velocities keep it
+    data = two_recordings()
+    still = measured(replace(data, v=data.q), drifts=(0.1, -1.0))
+    t = torch.tensor([0.0, 1, 2, 3, 4, 0, 1, 2, 3], dtype=torch.float64)[:, None]
+    rate = torch.tensor([0.1, -1.0], dtype=torch.float64)
+    assert torch.equal(still.q, data.q - t * rate)
+    assert still.v is not None
+    assert torch.equal(still.v, data.q - rate)
 
 
 CSV = "# zero: {zero}\n# scale: 1, 0.5\nt[s],theta[{unit}],x[m]\n0,1,1\n1,2,2\n2,3,4\n"
