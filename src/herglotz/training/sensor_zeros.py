@@ -27,6 +27,7 @@ from herglotz.training.problems.zeros import WithZeros, reference_of
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.trajectory_fit import STAGE
 
+ROUNDS = 5  # of fitting a drift
 CLEARLY = 5.0  # standard deviations by which a zero differs from 0
 THINNED = (1, 2, 4, 8)  # parts of a recording that tell its zeros: all, or every m-th where some cannot be followed
 
@@ -102,25 +103,27 @@ def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor
 def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
     """Rates (n,) at which the zeros of the sensors drift, in units of q per time, and their deviations.
 
-    `search` is a `herglotz.training.search.Search`. None where its simplest model is at the noise, or the model of the
-    whole dictionary, which lacks no term that a drift could stand for, is not brought there by it.
+    `search` is a `herglotz.training.search.Search`. None where the model of the whole dictionary, which lacks no term
+    that a drift could stand for, is at the noise without it, or not with it.
     """
-    if search.config.find_zeros is False or (search.first is not None and search.first.at_the_noise):
+    if search.config.find_zeros is False:
         return None
-    trial, t = search.full, since_start(search.data)
-    if trial is None or not trial.whole or trial.at_the_noise:
+    without, t = search.full, since_start(search.data)
+    if without is None or not without.whole or without.at_the_noise:
         return None
-    names = trial.problem.parameters.numbers
-    problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
-    target = WithZeros(problem, shared=True, grow=t / t.max())
-    found = fitted(target, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
-    if found is None or not bool(clear(found.z, found.deviations).any()):
-        return None
-    rates = found.z / t.max()
-    other = search.of(measured(search.data, drifts=rates.tolist())).again(trial)
-    if other is None or not (other.at_the_noise and other.fits_better(trial, len(rates))):
-        return None
-    return rates, found.deviations / t.max()
+    trial, rates, deviations = without, t.new_zeros(search.data.dof), t.new_zeros(search.data.dof)
+    for _ in range(ROUNDS):  # terms that stood for a drift leave it step by step
+        problem = trial.problem.of(trial.problem.parameters.numbers, trial.problem.sigma, trial.prior)
+        target = WithZeros(problem, shared=True, grow=t / t.max())
+        found = fitted(target, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
+        if found is None or not bool(clear(found.z, found.deviations).any()):
+            break
+        rates, deviations = rates + found.z / t.max(), found.deviations / t.max()
+        trial = search.of(measured(search.data, drifts=rates.tolist())).again(trial)
+        if trial is None:
+            return None
+    better = trial is not without and trial.at_the_noise and trial.fits_better(without, len(rates))
+    return (rates, deviations) if better else None
 
 
 def in_words(z: Tensor, deviations: Tensor, reference: int) -> str:

@@ -136,11 +136,14 @@ def search(
     data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
-    drift, rates = drifts(wanted.part), ()
-    if drift is not None:
-        rates = tuple(drift[0].tolist())
-        wanted = wanted.of(measured(data, drifts=rates))
-    asked = Questions(wanted, holds)
+    asked, rates, why_drifts = Questions(wanted, holds), (), ""
+    best = asked.best
+    open_to_drifts = best is not None and (asked.differ is not None or not best.at_the_noise)
+    if best is not None and open_to_drifts and (drift := drifts(wanted.part)) is not None:
+        found = tuple(drift[0].tolist())
+        again = Questions(wanted.of(measured(data, drifts=found)), holds)
+        if again.best is not None and again.best.at_the_noise and again.best.fits_better(best, len(found)):
+            asked, rates, why_drifts = again, found, f"rates {sure(*drift)}"
     if asked.read.better_on_a_line(asked.best):  # whose search, with inputs and sizes of its own, finds the terms again
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if asked.best is None:
@@ -158,8 +161,7 @@ def search(
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     words, terms = _told(found, data), asked.input_terms
     return Structure(
-        settings, base, words, found.rms, zeros, why, rates, "" if drift is None else f"rates {sure(*drift)}", True,
-        compared, terms, asked.hold,
+        settings, base, words, found.rms, zeros, why, rates, why_drifts, True, compared, terms, asked.hold,
     )  # fmt: skip
 
 

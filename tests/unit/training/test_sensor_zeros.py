@@ -19,9 +19,11 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
 from herglotz.training.sensor_zeros import zeros_of_one
 from herglotz.training.stages import Stages
+from herglotz.training.structure import kept_structure
 from herglotz.training.task import build_model
 
 predict_module, sensor_zeros_module = (sys.modules[f.__module__] for f in (predict, zeros_of_one))
+structure_module = sys.modules[kept_structure.__module__]
 
 NOISE, PLANTED, SAMPLES = 0.003, 0.1, 150
 
@@ -108,7 +110,9 @@ def test_a_sensor_that_drifts_is_found_out():
     assert "rates 0.0" in plan["reasons"]["drifts"]
     assert found.metrics["verdict"].startswith("fits to the noise")
     assert torch.allclose(found.data.q, measured(drifting, drifts=plan["drifts"]).q)
-    assert "less t since its recording began times the drift of its sensor (theta 0.0" in " ".join(str(found.equation()).split())
+    assert "less t since its recording began times the drift of its sensor (theta 0.0" in " ".join(
+        str(found.equation()).split()
+    )
     again = fit(drifting, plan=Plan.from_dict(plan))
     assert torch.equal(again.data.q, found.data.q)
     other = replace(pendulums(0.0, seed=7, recordings=1), source="other")
@@ -117,8 +121,12 @@ def test_a_sensor_that_drifts_is_found_out():
     assert not fit(drifting, find_zeros=False).metrics["plan"]["drifts"]
 
 
-def test_readings_that_do_not_drift_are_left_alone():  # fails if every misfit of recordings is a drift
+def test_readings_that_do_not_drift_are_left_alone(monkeypatch):
+    # fails if every misfit of recordings is a drift, or drifts are asked for where the terms meet the noise: a cyclic
+    # coordinate with friction takes one (a Furuta pendulum, 2.2 times the reference error instead of 0.98)
     assert not run().metrics["plan"]["drifts"]
+    monkeypatch.setattr(structure_module, "drifts", lambda search: pytest.fail(f"asked of {search}"))
+    assert fit(pendulums(0.0)).metrics["verdict"].startswith("fits to the noise")
 
 
 def test_a_prediction_takes_off_the_zeros_that_suit_its_warm_up():
