@@ -8,7 +8,18 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from herglotz.data.column_roles import READING, ROLES, Guess, is_timed, is_usual, kind_of, role_of, words_of
+from herglotz.data.column_roles import (
+    READING,
+    ROLES,
+    Guess,
+    is_effort,
+    is_goal,
+    is_timed,
+    is_usual,
+    kind_of,
+    role_of,
+    words_of,
+)
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
@@ -194,7 +205,23 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
     plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
     if plain and len(own) > 1:  # one alone can be nothing else
         doubts["no unit and no usual name says so"] = plain
-    return tuple(_warning(found, columns, doubt) for doubt, columns in doubts.items())
+    guessed = [] if wanted.inputs is not None else [i for i in found.u if wanted.before(found.names[i]) is None]
+    return (*(_warning(found, columns, doubt) for doubt, columns in doubts.items()), *_of_control(found, guessed))
+
+
+def _of_control(found: Columns, inputs: Sequence[int]) -> list[str]:
+    """What is said where both what a controller wants, in the unit of a position, and what it does are inputs."""
+    words = {i: words_of(found.names[i]) for i in inputs}
+    wants = [i for i in inputs if is_goal(words[i]) and not is_effort(words[i], found.units[i])]
+    does = [i for i in inputs if not is_goal(words[i]) and is_effort(words[i], found.units[i])]
+    if not wants or not does:
+        return []
+    goals, efforts = (", ".join(found.names[i] for i in of[:FEW]) for of in (wants, does))
+    say, act = ("says" if len(wants) == 1 else "say"), ("does" if len(does) == 1 else "do")
+    return [
+        f"warning: {goals} {say} what a controller wants, and {efforts} {act} it: a model of both may have the "
+        f"controller's law in the place of the machine's; --drop {goals.replace(', ', ',')} leaves the machine's"
+    ]
 
 
 def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:

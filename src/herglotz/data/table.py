@@ -70,8 +70,7 @@ def _without_blank(columns: Columns, values: np.ndarray) -> tuple[Columns, np.nd
 
     All of them where no motion is left, or momenta are recorded; an input that has none is no remark.
     """
-    blank = np.isnan(values).all(0) if len(values) else np.zeros(values.shape[1], dtype=bool)
-    gone = {i for i, empty in zip(columns.numeric, blank.tolist(), strict=True) if empty and i in columns.q}
+    gone = {i for k, i in enumerate(columns.numeric) if len(values) and i in columns.q and np.isnan(values[:, k]).all()}
     if not gone or columns.p or not (q := tuple(i for i in columns.q if i not in gone)):
         return columns, values
     has, are = ("has", "is") if len(gone) == 1 else ("have", "are")

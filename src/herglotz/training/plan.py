@@ -11,6 +11,7 @@ from herglotz.errors import InputError
 from herglotz.schema import from_plain
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.trades import listed
 
 COLUMNS = 80  # of a table for people
 STARTS = ("stiffness", "tilt", "rate")  # of the baseline; `start` holds all other parameters
@@ -173,6 +174,8 @@ def in_words(name: str, value: Any, unit: str = "") -> str:
     if name in MEANINGS:
         meaning = MEANINGS[name].get(value)
         return f"{meaning} ({value})" if meaning else str(value) or "none"
+    if name == "absent":
+        return listed(value) or "none"
     if name == "forces":
         return ", ".join(FORCES[force] for force, on in value.items() if on) or "masses and viscous friction alone"
     if isinstance(value, tuple):

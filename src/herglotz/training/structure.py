@@ -43,6 +43,7 @@ from herglotz.training.sensor_zeros import drifts, in_words, sure
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
+from herglotz.training.trades import listed
 from herglotz.training.trials import Trial
 
 MOST = 3  # most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n²
@@ -168,7 +169,7 @@ def search(
 def _told(found: Trial, data: Trajectories) -> str:
     """The terms of a model, and by how much they miss the data."""
     noise = precision(data)
-    named = ", ".join(("mass", "damping", *found.names))
+    named = listed(("mass", "damping", *found.names))
     miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, noise))
     least = least if math.isfinite(noise) else "unknown"
     words = f"{named} miss the data by {miss}, whose precision is {least}"
