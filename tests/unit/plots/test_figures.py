@@ -323,7 +323,7 @@ def test_what_is_learned_is_the_models_own():  # fails if a panel shows another 
 def test_an_angle_that_goes_round_is_drawn_over_one_turn():
     # fails if 161 points are spread over a dozen turns: waves that come four times a turn were drawn as others
     run = fake_run(steps=40)
-    round_and_round = replace(run, states=replace(run.states, q=8 * math.pi * run.states.q))
+    round_and_round = replace(run, states=run.states._replace(q=8 * math.pi * run.states.q))
     potential, _, friction = plot_learned(round_and_round).axes
     assert potential.get_xlim() == pytest.approx((-math.pi, math.pi))
     assert friction.get_xlim()[1] > math.pi
