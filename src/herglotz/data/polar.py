@@ -266,7 +266,7 @@ def _variance(arm: Tensor) -> float:
 
 def with_hints(data: Trajectories) -> Trajectories:
     """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
-    notes = [f"warning: {one.told}; one body on an arm? {one.remedy}" for one in circles(data)]
+    notes = [f"warning: {one.told}; one body on an arm? {one.remedy} makes one angle of it" for one in circles(data)]
     return replace(data, notes=(*data.notes, *notes)) if notes else data
 
 
@@ -297,7 +297,7 @@ def circles(data: Trajectories) -> list[Circle]:
             r = f"{float(_radii(body - centre).mean()):.4g}{_unit(data, pair)}"
             told, remedy = f"{x}, {y} stay on a circle about {where}, at {r}", f"--polar {x},{y} (polar= in Python)"
             places = data.names.index(x), data.names.index(y)
-            found.append(Circle(told, f"{remedy} makes one angle of it", error, places))
+            found.append(Circle(told, remedy, error, places))
     return found
 
 

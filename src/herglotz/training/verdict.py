@@ -217,7 +217,8 @@ def bound(data: Trajectories) -> str:
     for one in circles(replace(data, notes=())):
         at = list(one.columns)
         if one.error <= AT_THE_NOISE * float(noise[at].maximum(EXACT_ENOUGH * size[at]).square().mean().sqrt()):
-            return f"{one.told}, and what holds them there was not recorded. Try {one.remedy}, or motions that leave it"
+            kept = f"The positions {one.told}, and what holds them there was not recorded"
+            return f"{kept}. Try {one.remedy}, which makes one angle of it, or motions that leave it"
     return ""
 
 
@@ -235,7 +236,7 @@ def in_words(
     """
     free, missed = errors.free or 0.0, not errors.windows <= AT_THE_NOISE * errors.limit
     if bound:
-        return f"{FAILS}: {errors}. {bound[0].upper()}{bound[1:]}"
+        return f"{FAILS}: {errors}. {bound}"
     follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"

@@ -155,7 +155,7 @@ def test_a_verdict_asks_for_circles(monkeypatch):  # fails if nobody asks, or th
     monkeypatch.setattr(verdict, "bound", found)
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
     run = fit(data, FitConfig(departures=(2e-3,), level="linear", objective="trajectory"), progress=False)
-    assert run.metrics["verdict"].endswith(". Theta is bound, 2")
+    assert run.metrics["verdict"].endswith(". theta is bound, 2")
 
 
 def test_a_model_worse_than_the_noise_says_what_is_seen_of_the_reason():
