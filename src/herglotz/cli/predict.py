@@ -135,7 +135,7 @@ def _report(found: Prediction, arguments: argparse.Namespace) -> None:
         steps += f"{'; ' if steps else ''}{100 * found.outside:.3g} % are outside of the steps of the training data"
     if found.zeros:
         zeros = zip(found.data.names, found.zeros, found.data.units, strict=True)
-        rows.append(("sensors at 0", ", ".join(f"{name} {size(zero, unit)}" for name, zero, unit in zeros)))
+        rows.append(("sensors at 0", ", ".join(f"{name} {size(x, unit, name in degrees)}" for name, x, unit in zeros)))
     print_table([*rows, *([("steps", steps)] if steps else [])])
 
 
