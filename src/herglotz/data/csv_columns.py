@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from herglotz.data.column_roles import (
+    ANGLES,
     READING,
     ROLES,
     Guess,
@@ -201,12 +203,27 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
     for i, guess in enumerate(guesses):
         if guess.doubt:
             doubts.setdefault(guess.doubt, []).append(i)
+    if others := _accelerations_of_others(found, guesses, wanted):
+        doubts["no coordinate has its kind of unit, and it may be an input"] = others
     own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
     plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
     if plain and len(own) > 1:  # one alone can be nothing else
         doubts["no unit and no usual name says so"] = plain
     guessed = [] if wanted.inputs is not None else [i for i in found.u if wanted.before(found.names[i]) is None]
     return (*(_warning(found, columns, doubt) for doubt, columns in doubts.items()), *_of_control(found, guessed))
+
+
+def _accelerations_of_others(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> list[int]:
+    """Accelerations that are left aside, and are none of a coordinate: of lengths beside angles alone, or of angles."""
+    units = [found.units[i] for i in found.q]
+    turning = {bool(ANGLES.fullmatch(unit)) for unit in units}
+    others = []
+    for i, (name, unit, guess) in enumerate(zip(found.names, found.units, guesses, strict=True)):
+        angular = bool(ANGLES.fullmatch(re.split(r"[/ ·*]", unit)[0]))
+        new = wanted.role(name) is None and wanted.before(name) is None
+        if new and guess == Guess("rate") and kind_of(unit) == "acceleration" and all(units) and angular not in turning:
+            others.append(i)
+    return others
 
 
 def _of_control(found: Columns, inputs: Sequence[int]) -> list[str]:
@@ -220,7 +237,7 @@ def _of_control(found: Columns, inputs: Sequence[int]) -> list[str]:
     say, act = ("says" if len(wants) == 1 else "say"), ("does" if len(does) == 1 else "do")
     return [
         f"warning: {goals} {say} what a controller wants, and {efforts} {act} it: a model of both may have the "
-        f"controller's law in the place of the machine's; --drop {goals.replace(', ', ',')} leaves the machine's"
+        f"controller's law in the place of the machine's; --drop {shlex.quote(goals.replace(', ', ','))} leaves the machine's"
     ]
 
 
@@ -231,10 +248,12 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
     one, some = len(names) == 1, ",".join(names[:FEW])
     few = ", ".join(names if len(names) <= FEW else [*names[:FEW], f"{len(names) - FEW} more"])
     role = ("a coordinate" if one else "coordinates") if is_q else ("an input" if one else "inputs") if is_u else ""
-    inputs, coordinates = ([*(found.names[i] for i in other), some] for other in (found.u, found.q))
-    ways = [] if is_u else [f"--inputs {','.join(inputs)}"]
-    ways += [] if is_q else [f"--coordinates {','.join(coordinates)}"]
-    ways += [f"--drop {some}"] if role else []
+    inputs, coordinates = (
+        shlex.quote(",".join([*(found.names[i] for i in other), some])) for other in (found.u, found.q)
+    )
+    ways = [] if is_u else [f"--inputs {inputs}"]
+    ways += [] if is_q else [f"--coordinates {coordinates}"]
+    ways += [f"--drop {shlex.quote(some)}"] if role else []
     if set(columns) == set(found.q):
         ways = ["--inputs or --drop with the names of those that are none"]
     verb = ("is" if one else "are") + (f" taken for {role}" if role else " left aside")

@@ -78,6 +78,27 @@ def test_a_position_and_its_goal(tmp_path):  # fails if both are coordinates, or
 @pytest.mark.parametrize(
     ("header", "said"),
     [
+        ("t[s],sway[deg],trolley acceleration[m/s^2]", True),
+        ("t[s],x[m],arm acceleration[rad/s²]", True),
+        ("t[s],x[mm],x acceleration[m/s^2]", False),
+        ("t[s],sway[deg],x[m],trolley acceleration[m/s^2]", False),
+        ("t[s],sway,trolley acceleration[m/s^2]", False),
+    ],
+)
+def test_an_acceleration_of_something_else_may_be_an_input(tmp_path, capsys, header, said):
+    # fails if the acceleration of a crane's trolley, which drives the sway of its load, is left aside without a word
+    name = header.split(",")[-1].split("[")[0]
+    data = read(tmp_path, table(header))
+    text = f"{name} is left aside, but no coordinate has its kind of unit, and it may be an input; else give --inputs '"
+    assert (text in capsys.readouterr().err) is said
+    read(tmp_path, table(header), like=data)
+    read(tmp_path, table(header), drop=name)
+    assert "kind of unit" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
         ("t[s],setpoint[mm],gap[mm],coil current[A]", True),
         ("t[s],q_ref[rad],q[rad],tau[Nm],i[A]", True),
         ("t[s],goal_angle[rad],angle[rad]", False),  # a servo of which no more was recorded
