@@ -234,10 +234,11 @@ def _of_control(found: Columns, inputs: Sequence[int]) -> list[str]:
     if not wants or not does:
         return []
     goals, efforts = (", ".join(found.names[i] for i in of[:FEW]) for of in (wants, does))
+    drop = shlex.quote(",".join(found.names[i] for i in wants[:FEW]))
     say, act = ("says" if len(wants) == 1 else "say"), ("does" if len(does) == 1 else "do")
     return [
         f"warning: {goals} {say} what a controller wants, and {efforts} {act} it: a model of both may have the "
-        f"controller's law in the place of the machine's; --drop {shlex.quote(goals.replace(', ', ','))} leaves the machine's"
+        f"controller's law in the place of the machine's; --drop {drop} leaves the machine's"
     ]
 
 
