@@ -26,13 +26,13 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.polar import circles
-from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, precision, precisions
+from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, coarse, precision, precisions
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.flow import motion
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.look import Look
-from herglotz.training.missed import MOST, reason_of
+from herglotz.training.missed import MOST, reason_of, reason_of_data
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
 from herglotz.training.problems.robust import FEW, FREEDOM, far_out, scale_of
@@ -85,13 +85,22 @@ def _with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: fl
 
 
 def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
-    """What the residual of the training part shows of the reason of a misfit; "" where it shows none."""
-    data = train.liveliest(MOST)
-    found = _with_own_starts(task, fitted, data, None)
-    if found is None:
-        return ""
-    grid = found.problem.grid
-    return reason_of(data, found.problem.misfit(found.path), grid.node // (grid.longest + 1))
+    """What the residual of the training part shows of the reason of a misfit; "" where it shows none.
+
+    In steps so short that noise hides its curvature every second, fourth … sample is asked.
+    """
+    reason, steps = reason_of_data(train.liveliest(MOST)) or None, 1
+    while reason is None:
+        data, base = train.liveliest(MOST), task.base.stepped(steps)
+        found = _with_own_starts(replace(task, base=base), fitted, data, None)
+        if found is None:
+            break
+        grid = found.problem.grid
+        reason = reason_of(data, found.problem.misfit(found.path), grid.node // (grid.longest + 1))
+        if min(train.lengths) < 2 * FIRST_SEGMENT or coarse(half := train.thinned(2)):
+            break
+        train, steps = half, 2 * steps
+    return reason or ""
 
 
 def _gross(windows: Tensor, data: Trajectories) -> Tensor:
