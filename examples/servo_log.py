@@ -41,8 +41,8 @@ for name, role, unit in data.columns:
     print(f"{name:12} {role:12} {unit}")
 
 # %% [markdown]
-# Two inputs are one too many: the set point moves the controller, not the arm. The torque alone acts, and the set point
-# is dropped. Positions in degrees are rad from here on, and reported in both.
+# Two inputs are one too many, as a warning says: the set point moves the controller, not the arm. The torque alone
+# acts, and the set point is dropped. Positions in degrees are rad from here on, and reported in both.
 
 # %%
 run = hz.fit("log.csv", inputs="ActTorque", drop=["TargetPosition"])

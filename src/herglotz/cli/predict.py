@@ -95,6 +95,10 @@ def run(arguments: argparse.Namespace) -> int:
         _report(found, arguments)
         if written:
             print(f"Written: {', '.join(map(str, written))}")
+    if drifts := (result.metrics.get("plan") or {}).get("drifts"):
+        names, time = zip(found.data.names, found.data.units, strict=True), found.data.time_unit
+        rates = ", ".join(f"{name} {x:.4g} {unit}/{time}" for (name, unit), x in zip(names, drifts, strict=True))
+        say(f"herglotz: note: its sensors are taken to drift as those of the fit did: {rates}", sys.stderr)
     if found.failed_steps > 0:
         share = f"{100 * found.failed_steps:.3g} % of the predicted samples were not reached: a step failed"
         say(f"herglotz: note: {share}; the RMS is over the others", sys.stderr)
@@ -135,7 +139,7 @@ def _report(found: Prediction, arguments: argparse.Namespace) -> None:
         steps += f"{'; ' if steps else ''}{100 * found.outside:.3g} % are outside of the steps of the training data"
     if found.zeros:
         zeros = zip(found.data.names, found.zeros, found.data.units, strict=True)
-        rows.append(("sensors at 0", ", ".join(f"{name} {size(zero, unit)}" for name, zero, unit in zeros)))
+        rows.append(("sensors at 0", ", ".join(f"{name} {size(x, unit, name in degrees)}" for name, x, unit in zeros)))
     print_table([*rows, *([("steps", steps)] if steps else [])])
 
 

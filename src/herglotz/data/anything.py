@@ -18,7 +18,7 @@ from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import parted, with_missing
 from herglotz.data.polar import named_by
 from herglotz.data.readers import angles_like, as_told, load, with_angles
-from herglotz.data.sensors import measured
+from herglotz.data.sensors import calibrated
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame, plain, seconds
 from herglotz.data.trajectories import Trajectories
@@ -110,14 +110,14 @@ def as_trajectories(
         wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
         found = as_told(_table(data, wanted), wanted, **meant)
         found = found if like is None else angles_like(found, like)
-        return _shown(_marked(measured(found, sensor_zeros, sensor_scales), angles))
+        return _shown(_marked(calibrated(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
-        return measured(_of_each(data, {"h": h, "time": time, **names, **meant}), sensor_zeros)
+        return calibrated(_of_each(data, {"h": h, "time": time, **names, **meant}), sensor_zeros)
     else:
         found = as_told(_array(data, h, time, names), AS_THEY_ARE, **meant)
-    return _noted(_marked(measured(found, sensor_zeros, sensor_scales), angles), data)
+    return _noted(_marked(calibrated(found, sensor_zeros, sensor_scales), angles), data)
 
 
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

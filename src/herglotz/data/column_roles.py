@@ -90,7 +90,7 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
         return Guess(whole, _letter(key) if kind == "position" else "")
     if words & WORDS["side"]:
         return Guess("dropped")
-    if words & WORDS["goal"] or ("set" in words and len(words) > 1) or any(word.startswith("soll") for word in words):
+    if is_goal(words):
         return Guess("input")
     if DESIRED.fullmatch(key) and kind in ("", "position"):
         role = "input" if kind else "dropped"
@@ -113,6 +113,17 @@ def is_angular(name: str) -> bool:
 def is_time(name: str, unit: str) -> bool:
     """Whether a column is called as times are, or is in a unit of time."""
     return kind_of(unit) == "time" or bool(ROLES["time"].fullmatch(name.casefold() if len(name) > 1 else name))
+
+
+def is_goal(words: frozenset[str]) -> bool:
+    """Whether words of a name say what a controller wants of a motion."""
+    several = "set" in words and len(words) > 1
+    return several or bool(words & WORDS["goal"]) or any(word.startswith("soll") for word in words)
+
+
+def is_effort(words: frozenset[str], unit: str) -> bool:
+    """Whether an input of these words is a force, or what makes one."""
+    return kind_of(unit) in ("effort", "electric") or bool(words & WORDS["effort"])
 
 
 def is_timed(words: frozenset[str]) -> bool:

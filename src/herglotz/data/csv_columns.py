@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from herglotz.data.column_roles import READING, ROLES, Guess, is_timed, is_usual, kind_of, role_of, words_of
+from herglotz.data.column_roles import (
+    ANGLES,
+    READING,
+    ROLES,
+    Guess,
+    is_effort,
+    is_goal,
+    is_timed,
+    is_usual,
+    kind_of,
+    role_of,
+    words_of,
+)
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
@@ -199,11 +212,43 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
     for i, guess in enumerate(guesses):
         if guess.doubt:
             doubts.setdefault(guess.doubt, []).append(i)
+    if others := _accelerations_of_others(found, guesses, wanted):
+        doubts["no coordinate has its kind of unit, and it may be an input"] = others
     own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
     plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
     if plain and len(own) > 1:  # a single column without a role can only be the coordinate
         doubts["no unit and no usual name says so"] = plain
-    return tuple(_warning(found, columns, doubt) for doubt, columns in doubts.items())
+    guessed = [] if wanted.inputs is not None else [i for i in found.u if wanted.before(found.names[i]) is None]
+    return (*(_warning(found, columns, doubt) for doubt, columns in doubts.items()), *_of_control(found, guessed))
+
+
+def _accelerations_of_others(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> list[int]:
+    """Accelerations that are left aside, and are none of a coordinate: of lengths beside angles alone, or of angles."""
+    units = [found.units[i] for i in found.q]
+    turning = {bool(ANGLES.fullmatch(unit)) for unit in units}
+    others = []
+    for i, (name, unit, guess) in enumerate(zip(found.names, found.units, guesses, strict=True)):
+        angular = bool(ANGLES.fullmatch(re.split(r"[/ ·*]", unit)[0]))
+        new = wanted.role(name) is None and wanted.before(name) is None
+        if new and guess == Guess("rate") and kind_of(unit) == "acceleration" and all(units) and angular not in turning:
+            others.append(i)
+    return others
+
+
+def _of_control(found: Columns, inputs: Sequence[int]) -> list[str]:
+    """What is said where both what a controller wants, in the unit of a position, and what it does are inputs."""
+    words = {i: words_of(found.names[i]) for i in inputs}
+    wants = [i for i in inputs if is_goal(words[i]) and not is_effort(words[i], found.units[i])]
+    does = [i for i in inputs if not is_goal(words[i]) and is_effort(words[i], found.units[i])]
+    if not wants or not does:
+        return []
+    goals, efforts = (", ".join(found.names[i] for i in of[:FEW]) for of in (wants, does))
+    drop = shlex.quote(",".join(found.names[i] for i in wants[:FEW]))
+    say, act = ("says" if len(wants) == 1 else "say"), ("does" if len(does) == 1 else "do")
+    return [
+        f"warning: {goals} {say} what a controller wants, and {efforts} {act} it: a model of both may have the "
+        f"controller's law in the place of the machine's; --drop {drop} leaves the machine's"
+    ]
 
 
 def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
@@ -213,10 +258,12 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
     one, some = len(names) == 1, ",".join(names[:FEW])
     few = ", ".join(names if len(names) <= FEW else [*names[:FEW], f"{len(names) - FEW} more"])
     role = ("a coordinate" if one else "coordinates") if is_q else ("an input" if one else "inputs") if is_u else ""
-    inputs, coordinates = ([*(found.names[i] for i in other), some] for other in (found.u, found.q))
-    ways = [] if is_u else [f"--inputs {','.join(inputs)}"]
-    ways += [] if is_q else [f"--coordinates {','.join(coordinates)}"]
-    ways += [f"--drop {some}"] if role else []
+    inputs, coordinates = (
+        shlex.quote(",".join([*(found.names[i] for i in other), some])) for other in (found.u, found.q)
+    )
+    ways = [] if is_u else [f"--inputs {inputs}"]
+    ways += [] if is_q else [f"--coordinates {coordinates}"]
+    ways += [f"--drop {shlex.quote(some)}"] if role else []
     if set(columns) == set(found.q):
         ways = ["--inputs or --drop with the names of those that are none"]
     verb = ("is" if one else "are") + (f" taken for {role}" if role else " left aside")

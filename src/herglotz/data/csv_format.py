@@ -18,7 +18,7 @@ from herglotz.data.csv_dialect import Rows, cells_of, in_commas
 from herglotz.data.csv_numbers import NumberLines
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.rows import MISSING, number, number_or_none, quote
-from herglotz.data.sensors import measured
+from herglotz.data.sensors import calibrated
 from herglotz.data.table import from_table, in_dates, moment
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.unit_row import refuse_unknown, with_units
@@ -137,7 +137,7 @@ def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
             said.setdefault(name, text if name == "hold" else number(text, where))
     if found.hold:  # the user's hold overrules the file's
         said.pop("hold", None)
-    return replace(measured(found, sensors.get("zero", ()), sensors.get("scale", ())), **said)  # type: ignore[arg-type]
+    return replace(calibrated(found, sensors.get("zero", ()), sensors.get("scale", ())), **said)  # type: ignore[arg-type]
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:

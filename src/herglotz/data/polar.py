@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -268,8 +269,23 @@ def _variance(arm: Tensor) -> float:
 
 
 def with_hints(data: Trajectories) -> Trajectories:
-    """The set with a warning of each pair of positions x, y that stays on a circle, as a body on an arm does."""
-    notes, earlier, read = [], [], complete(data)
+    """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
+    notes = [f"warning: {one.told}; one body on an arm? {one.remedy} makes one angle of it" for one in circles(data)]
+    return replace(data, notes=(*data.notes, *notes)) if notes else data
+
+
+class Circle(NamedTuple):
+    """A pair of coordinates that stays on a circle."""
+
+    told: str  # which, and where it is, in words
+    remedy: str
+    error: float  # standard deviation of the distances from the centre
+    columns: tuple[int, int]  # their places among the coordinates
+
+
+def circles(data: Trajectories) -> list[Circle]:
+    """The pairs of positions x, y that stay on a circle, about a fixed centre or about another such pair."""
+    found, earlier, read = [], [], complete(data)
     for x, y in _pairs_by_name(data):
         pair = Pair(x, y)
         body = _positions(read, pair, (x, y))[:: -(-read.samples // MOST)]
@@ -277,12 +293,14 @@ def with_hints(data: Trajectories) -> Trajectories:
         centres = [(fixed, _words(data, pair, fixed)[1]), *((other, f"{one.x}, {one.y}") for one, other in earlier)]
         earlier.append((pair, body))
         centre, where = min(centres, key=lambda one: _variance(body - one[0]))
+        error = _variance(body - centre) ** 0.5
         line = float(torch.linalg.svdvals(body - body.mean(0))[-1]) / math.sqrt(len(body))
-        if _variance(body - centre) ** 0.5 < ON_A_CIRCLE * line:
+        if error < ON_A_CIRCLE * line:
             r = f"{float(_radii(body - centre).mean()):.4g}{_unit(data, pair)}"
-            remedy = f"--polar {x},{y} (polar= in Python) makes one angle of it"
-            notes.append(f"warning: {x}, {y} stay on a circle about {where}, at {r}; one body on an arm? {remedy}")
-    return replace(data, notes=(*data.notes, *notes)) if notes else data
+            told, remedy = f"{x}, {y} stay on a circle about {where}, at {r}", f"--polar {x},{y} (polar= in Python)"
+            places = data.names.index(x), data.names.index(y)
+            found.append(Circle(told, remedy, error, places))
+    return found
 
 
 def _pairs_by_name(data: Trajectories) -> list[tuple[str, str]]:

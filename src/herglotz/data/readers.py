@@ -23,7 +23,7 @@ from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
 from herglotz.data.rows import Unusable
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
-from herglotz.data.sensors import measured
+from herglotz.data.sensors import calibrated
 from herglotz.data.table import left_out
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
@@ -130,7 +130,7 @@ def load(
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
     found = as_told(found, wanted, polar, degrees, angles, like, input_terms)
-    found = parted(measured(found, sensor_zeros, sensor_scales))
+    found = parted(calibrated(found, sensor_zeros, sensor_scales))
     if angles is not None:
         found = with_angles(found, angles)
     elif like is not None:

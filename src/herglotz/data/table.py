@@ -42,6 +42,7 @@ def from_table(
     warning. Raise InputError if most trajectories are unusable.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
+    columns, values = _without_blank(columns, values)
     recordings = _recordings(path, labels, np.asarray(at), values)
     blank = bool(np.isnan(values).any())
     recordings, notes = _with_clocks(recordings, blank, columns.units[columns.time] or "s")
@@ -61,6 +62,21 @@ def from_table(
     place = lambda k: f"row {rows[k]}, column '{columns.names[columns.numeric[missing[k].argmax()]]}'"  # noqa: E731
     lacking = torch.from_numpy(np.delete(missing, q, 1).any(1))
     return with_missing(found, torch.from_numpy(~missing[:, q]), place, lacking)
+
+
+def _without_blank(columns: Columns, values: np.ndarray) -> tuple[Columns, np.ndarray]:
+    """The columns without coordinates that have no value in any row, as remarks do, and theirs; a warning names them.
+
+    All of them where no motion is left, or momenta are recorded; an input that has none is no remark.
+    """
+    gone = {i for k, i in enumerate(columns.numeric) if len(values) and i in columns.q and np.isnan(values[:, k]).all()}
+    if not gone or columns.p or not (q := tuple(i for i in columns.q if i not in gone)):
+        return columns, values
+    has, are = ("has", "is") if len(gone) == 1 else ("have", "are")
+    names = ", ".join(columns.names[i] for i in sorted(gone))
+    note = f"warning: {names} {has} no value in any row, and {are} left aside"
+    kept = [i not in gone for i in columns.numeric]
+    return replace(columns, q=q, notes=(*columns.notes, note)), values[:, kept]
 
 
 def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:

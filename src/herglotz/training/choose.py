@@ -117,7 +117,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures, dissipation=c.dissipation,
-        input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros,
+        input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros, drifts=seen.drifts,
         reasons=_reasons(seen, user_settings, named=named, one_step=one_step) | {
             "objective": why,
             "network": why_network,
@@ -139,6 +139,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
         "substeps": (HALVED if seen.settings.substeps > 1 else KEPT_STEPS) if named else AS_SET,
         **seen.why_arrival,
         "input_terms": seen.why_input_terms or AS_SET,
+        "drifts": seen.why_drifts or "no sensor was found to drift",
         "zeros": seen.why_zeros or "no recording was found to differ from the others",
         "forces": seen.structure or AS_SET,
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",

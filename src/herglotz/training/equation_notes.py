@@ -65,9 +65,13 @@ def _inputs(run: FittedRun) -> str:
 def _sensors(run: FittedRun) -> str:
     """What makes a coordinate of the equation of the reading of its sensor."""
     told, names, found = run.reading, run.data.names, []
-    zeros = (run.metrics.get("plan") or {}).get("zeros") or ()
-    for of, numbers in (("times the scale", told.get("sensor_scales")), ("less the zero", told.get("sensor_zeros")),
-                        ("less the zero", zeros)):  # fmt: skip
+    zeros, drifts = ((run.metrics.get("plan") or {}).get(name) or () for name in ("zeros", "drifts"))
+    for of, numbers in (
+        ("times the scale", told.get("sensor_scales")),
+        ("less the zero", told.get("sensor_zeros")),
+        ("less the zero", zeros),
+        ("less t since its recording began times the drift", drifts),
+    ):
         values = [plain(float(x), DIGITS) for x in numbers or ()]
         each = [f"{name} {', '.join(values[i :: len(names)])}" for i, name in enumerate(names)] if values else []
         several = ", recording after recording" if len(values) > len(names) else ""

@@ -49,7 +49,8 @@ class Numbers:
             self.told[words] = slopes
         at, g = torch.tensor(list(slopes)), joint.covariance.new_tensor(list(slopes.values()))
         deviation = math.sqrt(max(0.0, float(g @ joint.covariance[at][:, at] @ g)))
-        alone = float((g.abs() * joint.alone[at]).min())
+        by = g.abs() * joint.alone[at]
+        alone = float(by[by >= DEPENDENT * by.max()].min())  # a mass that cancels leaves rounding
         finite = math.isfinite(deviation)
         return float(value.detach()), deviation if finite else None, alone if math.isfinite(alone) else None
 

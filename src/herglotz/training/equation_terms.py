@@ -6,7 +6,8 @@ a text, such as the width of a tanh or the zero of an input, are rounded by the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
@@ -48,6 +49,11 @@ class Line:
     of: str = ""  # the coordinate whose line it is; empty: it stands in L
 
 
+def _mentions(text: str, names: Iterable[str]) -> bool:
+    """Whether a text has one of these names in it."""
+    return any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for name in names)
+
+
 def is_formula(model: ContactLagrangian) -> bool:
     """Whether the lines are the whole model: no network, and no term by name, which may be anything."""
     in_s = model.action if isinstance(model.action, ActionFlow) else None
@@ -70,22 +76,33 @@ class Reader:
         self.model, self.data, self.shown = run.model, run.data, numbers.shown
         self.config, self.names, self.time = run.model.config, run.data.names, run.data.time_unit
         self.newton, self.distance = newtonian(run.model), distance(run.data.names)
-        if self.newton:
-            of_each = zip(self._masses().diagonal(), self.names, strict=True)
-            masses = [(self.shown(m, f"the mass of {name}", True), name) for m, name in of_each]
-            self.lefts = self.own = [f"{'' if m == '1' else m + ' '}{name}″" for m, name in masses]
-        else:
-            self.own = [f"force on {name}" for name in self.names]
-            self.lefts = ["L", *self.own]
+        self.own = [f"{name}″" if self.newton else f"force on {name}" for name in self.names]
+        self.lefts = self.own if self.newton else ["L", *self.own]  # with their masses once the lines are known
         self.line_of = dict(zip(self.own, self.names, strict=True))
 
-    def lines(self) -> Iterator[Line]:
+    def lines(self) -> list[Line]:
         """Those of every term whose number is not 0."""
         friction = (*self._friction(), *self._drag())
-        for part in (self._kinetic(), self._damping(), friction, self._inputs(), self._springs(), self._features()):
-            yield from (
-                replace(line, of=self.line_of.get(line.left, "")) for line in part if float(line.value.detach()) != 0.0
-            )
+        parts = (self._kinetic(), self._damping(), friction, self._inputs(), self._springs(), self._features())
+        found = [replace(line, of=self.line_of.get(line.left, "")) for part in parts for line in part]
+        found = [line for line in found if float(line.value.detach()) != 0.0]
+        return self._over_masses(found) if self.newton else found
+
+    def _over_masses(self, lines: Sequence[Line]) -> list[Line]:
+        """The lines of M q̈ = forces, that of a coordinate which moves by itself over its mass: motion says no more.
+
+        Other lines share forces, and have their masses on the left.
+        """
+        found = list(lines)
+        for k, (m, own, name) in enumerate(zip(self._masses().diagonal(), self.own, self.names, strict=True)):
+            others = {*self.names, self.distance} - {name}
+            if any(_mentions(line.what, others if line.left == own else {name}) for line in lines):
+                mass = self.shown(m, f"the mass of {name}", True)
+                self.lefts = [*self.lefts[:k], f"{'' if mass == '1' else mass + ' '}{own}", *self.lefts[k + 1 :]]
+                found = [replace(line, left=self.lefts[k]) if line.left == own else line for line in found]
+            else:
+                found = [replace(line, value=line.value / m) if line.left == own else line for line in found]
+        return found
 
     def _masses(self) -> Tensor:
         kinetic = getattr(self.model.kinetic, "base", self.model.kinetic)

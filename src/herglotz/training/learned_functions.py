@@ -11,6 +11,7 @@ A band is that of the function in this gauge, std² = ∇f · Σ ∇f, with the 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -46,7 +47,7 @@ class LearnedFunction:
     of
         (i,) the coordinate, from 0; of a mass (j, k, i), its entry and the coordinate that it is a function of.
     x
-        (K,) positions or speeds, in the data's units.
+        (K,) positions or speeds, in the data's units; −π to π of an angle that went further round.
     value
         (K,) of the model, in units where the first coordinate's mass is 1.
     low, high
@@ -138,8 +139,8 @@ class _Lines:
         self.middle, self.speed = q.median(0).values, v.square().mean(0).sqrt()
         self.parts = [
             part
-            for i in range(run.data.dof)
-            for part in self._of(run.model, i, _range(q[:, i], points, beyond), _range(v[:, i], points, beyond))
+            for i, turns in enumerate(run.data.angles)
+            for part in self._of(run.model, i, _range(q[:, i], points, beyond, turns), _range(v[:, i], points, beyond))
         ]
 
     def _of(self, model: ContactLagrangian, i: int, at: Line, speeds: Line) -> list[Part]:
@@ -205,9 +206,14 @@ class _Lines:
         return force + (parts[0] / c + parts[1]) / h[:, None]
 
 
-def _range(values: Tensor, points: int, beyond: float) -> Line:
-    """Points over the range of values and beyond, and the range."""
+def _range(values: Tensor, points: int, beyond: float, turns: bool = False) -> Line:
+    """Points over the range of values and beyond, and the range; of an angle that `turns` further, one turn.
+
+    Functions of an angle come again after a turn, and few points to each of many would draw others.
+    """
     low, high = float(values.min()), float(values.max())
+    if turns and high - low > 2 * math.pi:
+        return torch.linspace(-math.pi, math.pi, points, dtype=torch.float64), -math.pi, math.pi
     room = beyond * ((high - low) or 1.0)
     return torch.linspace(low - room, high + room, points, dtype=torch.float64), low, high
 

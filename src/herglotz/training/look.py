@@ -71,9 +71,11 @@ class Look:
     why_arrival: dict[str, str]  # the reason of each of its fields
     zeros: tuple[float, ...]  # (B · n) what the sensors read at 0, recording after recording; empty: 0; `data` has q
     why_zeros: str  # why they are what they are; empty: no recording was found to differ
+    drifts: tuple[float, ...]  # (n) rates at which these zeros drift; empty: 0; `data` is without
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
+    why_drifts: str = ""  # why they drift so; empty: they were not found to
     why_input_terms: str = ""  # why inputs have terms; empty: as told
     turning: bool = True  # angles turn; False: they were found to be positions on a line
     structure: str | None = None  # what was found about the terms, in words; None: it was not asked
@@ -98,10 +100,13 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
 
     Raise InputError if the data cannot be used, or do not suit the settings.
     """
-    seen, zeros = _seen(data, user_settings, stages, plan, ()), ()
+    seen, zeros, drifts = _seen(data, user_settings, stages, plan, (), ()), (), ()
     changed: dict[str, Any] = {}  # what a look again does not say
-    while (found := seen.found) is not None and (found.hold or found.input_terms or found.zeros or not found.turning):
-        known = found._replace(hold="", input_terms=(), zeros=(), why_zeros="") if found.turning else None
+    while (found := seen.found) is not None and (
+        found.hold or found.input_terms or found.zeros or found.drifts or not found.turning
+    ):
+        kept = found._replace(hold="", input_terms=(), zeros=(), why_zeros="", drifts=(), why_drifts="")
+        known = kept if found.turning else None
         label = stages.label
         if found.hold:
             told = f"the terms that were found with hold {seen.arrival.hold} miss the data by less with {found.hold}"
@@ -113,10 +118,12 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
             changed["why_input_terms"] = "held-out blocks of time are missed by less with them"
         if found.zeros:
             zeros, label, changed["why_zeros"] = found.zeros, label + f", zeros {found.zeros}", found.why_zeros
+        if found.drifts:
+            drifts, label, changed["why_drifts"] = found.drifts, label + f", drifts {found.drifts}", found.why_drifts
         if not found.turning:
             data, label, changed["turning"] = on_a_line(data), label + ", on a line", False
         stages = stages.labelled(label)
-        seen = _seen(data, user_settings, stages, plan, zeros, known)
+        seen = _seen(data, user_settings, stages, plan, zeros, drifts, known)
     return replace(seen, **changed)
 
 
@@ -127,12 +134,12 @@ def on_a_line(data: Trajectories) -> Trajectories:
 
 def _seen(
     data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None, zeros: tuple[float, ...],
-    known: Structure | None = None,
+    drifts: tuple[float, ...], known: Structure | None = None,
 ) -> Look:  # fmt: skip
-    """What `look` gives of sensors with these zeros (`herglotz.training.sensor_zeros`), or of terms that are known."""
+    """What `look` gives of sensors with these zeros (`herglotz.training.sensor_zeros`), or of known terms."""
     settings = user_settings.resolved(data)
-    zeros = zeros if plan is None else plan.zeros
-    said, (data, arrival, why_arrival) = data, _read(measured(data, zeros), settings)
+    zeros, drifts = (zeros, drifts) if plan is None else (plan.zeros, plan.drifts)
+    said, (data, arrival, why_arrival) = data, _read(measured(data, zeros, drifts=drifts), settings)
     train, unseen = split(data, settings)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
@@ -144,7 +151,7 @@ def _seen(
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
     base = across_translations(base, kept, settings.translations, outliers=outliers)
     seen = Look(
-        data, train, unseen, kept, dropped, outliers, arrival, why_arrival, zeros, why_zeros="",
+        data, train, unseen, kept, dropped, outliers, arrival, why_arrival, zeros, "", drifts,
         noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
     if plan is None:

@@ -32,12 +32,8 @@ OTHER = 0.15
 CLEAR = 2.0  # times the noise: curvatures of neighbouring windows share samples, and differ by 1.5 times it by chance
 
 
-def reason_of(
-    data: Trajectories,
-    miss: Tensor,  # (N, n) residual at the samples, in units of q
-    owner: Tensor,  # (N,) which free run each sample is of
-) -> str:
-    """What was missed, and what to try, in sentences; "" where the residual shows no reason."""
+def reason_of_data(data: Trajectories) -> str:
+    """What data that are missed show of the reason, without a residual, and what to try; "" where they show none."""
     if hints := with_hints(replace(data, notes=())).notes:
         return hints[0].removeprefix("warning: ")
     if names := filled_inputs(data):
@@ -47,6 +43,15 @@ def reason_of(
             "act at times between rows. Try the records of both before they were merged, or blank cells where nothing "
             "was recorded"
         )
+    return ""
+
+
+def reason_of(
+    data: Trajectories,
+    miss: Tensor,  # (N, n) residual at the samples, in units of q
+    owner: Tensor,  # (N,) which free run each sample is of
+) -> str | None:
+    """What was missed, and what to try, in sentences; "" where no reason is shown, None where noise hides it."""
     first = torch.arange(max(0, data.samples - SAMPLES + 1), device=data.t.device)
     first = first[owner[first] == owner[first + SAMPLES - 1]]
     if len(first) < FEW:
@@ -64,8 +69,9 @@ def reason_of(
     state += [] if data.u is None else [at(value, data.u)]
     x = torch.cat(state, 1)
     middle = rows[:, SAMPLES // 2]
-    if not _is_other(lacking, float(noise.square().mean()), x / x.std(0).clamp_min(1e-300), middle):
-        return ""
+    hidden = float(noise.square().mean())
+    if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle):
+        return None if hidden > OTHER else ""
     if (kick := _kick(lacking)) is not None:
         row, unit = int(middle[kick]), "" if data.time_unit == "1" else data.time_unit
         when = f"t = {size(float(data.t[row]), unit)} of trajectory {int(data.trajectory[row])}"

@@ -11,6 +11,7 @@ from herglotz.errors import InputError
 from herglotz.schema import from_plain
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.trades import listed
 
 COLUMNS = 80  # of a table for people
 STARTS = ("stiffness", "tilt", "rate")  # of the baseline; `start` holds all other parameters
@@ -47,6 +48,7 @@ class Plan:
     dissipation: tuple[str, ...] = ()  # powers of s in L beside −γ s
     input_terms: tuple[str, ...] = ()  # of recorded inputs, which act beside them
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
+    drifts: tuple[float, ...] = ()  # of these zeros, n numbers, in units of q per time since a recording began
     reasons: dict[str, str] = field(default_factory=dict)
 
     def applied(self, settings: FitConfig) -> FitConfig:
@@ -116,9 +118,10 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "features": "terms of the model",
     "hold": "inputs between samples",
     "input_terms": "terms of the inputs",
-    "delay": "delay of the inputs",
-    "lag": "lag of the actuator",
+    "delay": "delay of the inputs, in the unit of time",
+    "lag": "lag of the actuator, in the unit of time",
     "zeros": "what the sensors read at 0, recording after recording",
+    "drifts": "what the zeros of the sensors gain in a unit of time",
     "turning": "angles turn",
     "drag": "friction beside the viscous one",
     "dissipation": "damping by s, beside −γ s in L",
@@ -133,7 +136,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "departures": "strengths of the prior that are compared",
 }
 DECISIONS = tuple(WORDS)
-IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drag", "absent", "dissipation",
+IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drifts", "drag", "absent", "dissipation",
           "continues_probe", "fitted_before")  # fmt: skip  # told if not 0
 MEANINGS = {
     "level": {
@@ -171,6 +174,8 @@ def in_words(name: str, value: Any, unit: str = "") -> str:
     if name in MEANINGS:
         meaning = MEANINGS[name].get(value)
         return f"{meaning} ({value})" if meaning else str(value) or "none"
+    if name == "absent":
+        return listed(value) or "none"
     if name == "forces":
         return ", ".join(FORCES[force] for force, on in value.items() if on) or "masses and viscous friction alone"
     if isinstance(value, tuple):

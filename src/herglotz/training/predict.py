@@ -162,6 +162,7 @@ def predict(
     if isinstance(warmup, bool) or not isinstance(warmup, int) or warmup < 3:
         raise InputError(f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}")
     data = of_the_run(run, data).unwrapped().to(dtype=next(run.model.parameters()).dtype, device="cpu")
+    data = measured(data, drifts=(run.metrics.get("plan") or {}).get("drifts") or ())
     low, high = run.h_range
     every = max(1, int(high / data.typical_step + 1e-6)) if data.typical_step < low else 1
     if every > 1:

@@ -3,17 +3,20 @@
 A model cannot follow such recordings together, though each of them alone. Parameters, states and zeros are fitted
 together from 0 (`problems.zeros`), and are taken where the fit with them is worth so many numbers more
 (`score.fitted_score`). A model that is held says what a new recording reads at 0 (`zeros_of_one`).
+
+Zeros that drift, y = q + d t, are fitted with the whole dictionary in the same way, one rate d a coordinate (`drifts`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.sensors import measured, since_start
 from herglotz.models import ContactLagrangian
 from herglotz.training.arrowhead import dense
 from herglotz.training.first_states import first_states, states_of_pairs
@@ -24,6 +27,7 @@ from herglotz.training.problems.zeros import WithZeros, reference_of
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.trajectory_fit import STAGE
 
+ROUNDS = 5  # of fitting a drift
 CLEARLY = 5.0  # standard deviations by which a zero differs from 0
 THINNED = (1, 2, 4, 8)  # parts of a recording that tell its zeros: all, or every m-th where some cannot be followed
 
@@ -96,10 +100,41 @@ def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor
     return z, deviations
 
 
+def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
+    """Rates (n,) at which the zeros of the sensors drift, in units of q per time, and their deviations.
+
+    `search` is a `herglotz.training.search.Search`. None where the model of the whole dictionary, which lacks no term
+    that a drift could stand for, is at the noise without it, or not with it.
+    """
+    if search.config.find_zeros is False:
+        return None
+    without, t = search.full, since_start(search.data)
+    if without is None or not without.whole or without.at_the_noise:
+        return None
+    trial, rates, deviations = without, t.new_zeros(search.data.dof), t.new_zeros(search.data.dof)
+    for _ in range(ROUNDS):  # terms that stood for a drift leave it step by step
+        problem = trial.problem.of(trial.problem.parameters.numbers, trial.problem.sigma, trial.prior)
+        target = WithZeros(problem, shared=True, grow=t / t.max())
+        found = fitted(target, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
+        if found is None or not bool(clear(found.z, found.deviations).any()):
+            break
+        rates, deviations = rates + found.z / t.max(), found.deviations / t.max()
+        trial = search.of(measured(search.data, drifts=rates.tolist())).again(trial)
+        if trial is None:
+            return None
+    better = trial is not without and trial.at_the_noise and trial.fits_better(without, len(rates))
+    return (rates, deviations) if better else None
+
+
 def in_words(z: Tensor, deviations: Tensor, reference: int) -> str:
     """Zeros with what they are known to."""
-    sure = (f"{x:.4g} ± {d:.2g}" for x, d in zip(z.flatten().tolist(), deviations.flatten().tolist(), strict=True) if d)
-    return f"zeros that differ from those of recording {reference}: {', '.join(sure)}"
+    return f"zeros that differ from those of recording {reference}: {sure(z, deviations)}"
+
+
+def sure(z: Tensor, deviations: Tensor) -> str:
+    """Numbers that were fitted with their deviations."""
+    each = zip(z.flatten().tolist(), deviations.flatten().tolist(), strict=True)
+    return ", ".join(f"{x:.4g} ± {d:.2g}" for x, d in each if d)
 
 
 def _rms(x: Tensor) -> float:

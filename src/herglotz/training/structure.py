@@ -20,6 +20,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, roughness
+from herglotz.data.sensors import measured
 from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
@@ -38,10 +39,11 @@ from herglotz.training.problems.zeros import reference_of
 from herglotz.training.pruning import prune
 from herglotz.training.questions import Questions
 from herglotz.training.search import Search
-from herglotz.training.sensor_zeros import in_words
+from herglotz.training.sensor_zeros import drifts, in_words, sure
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
+from herglotz.training.trades import listed
 from herglotz.training.trials import Trial
 
 MOST = 3  # most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n²
@@ -67,6 +69,8 @@ class Structure(NamedTuple):
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
     zeros: tuple[float, ...] = ()  # (B · n) of the sensors, which differ between recordings; found terms are without
     why_zeros: str = ""  # them in words
+    drifts: tuple[float, ...] = ()  # (n,) rates at which these zeros drift; found terms are without
+    why_drifts: str = ""  # them in words
     turning: bool = True  # angles turn; False: these terms are those of positions on a line, as of a free spring
     compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`compared_models`)
     input_terms: tuple[str, ...] = ()  # of inputs, which these terms ask for beside the recorded ones
@@ -133,7 +137,14 @@ def search(
     data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
-    asked = Questions(wanted, holds)
+    asked, rates, why_drifts = Questions(wanted, holds), (), ""
+    best = asked.best
+    open_to_drifts = best is not None and (asked.differ is not None or not best.at_the_noise)
+    if best is not None and open_to_drifts and (drift := drifts(wanted.part)) is not None:
+        found = tuple(drift[0].tolist())
+        again = Questions(wanted.of(measured(data, drifts=found)), holds)
+        if again.best is not None and again.best.at_the_noise and again.best.fits_better(best, len(found)):
+            asked, rates, why_drifts = again, found, f"rates {sure(*drift)}"
     if asked.read.better_on_a_line(asked.best):  # whose search, with inputs and sizes of its own, finds the terms again
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if asked.best is None:
@@ -150,13 +161,15 @@ def search(
     if differ is not None:
         zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     words, terms = _told(found, data), asked.input_terms
-    return Structure(settings, base, words, found.rms, zeros, why, True, compared, terms, asked.hold)
+    return Structure(
+        settings, base, words, found.rms, zeros, why, rates, why_drifts, True, compared, terms, asked.hold,
+    )  # fmt: skip
 
 
 def _told(found: Trial, data: Trajectories) -> str:
     """The terms of a model, and by how much they miss the data."""
     noise = precision(data)
-    named = ", ".join(("mass", "damping", *found.names))
+    named = listed(("mass", "damping", *found.names))
     miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, noise))
     least = least if math.isfinite(noise) else "unknown"
     words = f"{named} miss the data by {miss}, whose precision is {least}"

@@ -72,10 +72,15 @@ def joined(trades: Sequence[Trade]) -> list[Trade]:
     return found
 
 
-def in_words(name: str) -> str:
+def in_words(name: str, which: str = ", entry {}") -> str:
     """A parameter's name, `friction.viscous[1]`, as a newcomer may read it."""
     stem, _, entry = name.partition("[")
-    return WORDS.get(stem, stem) + (f", entry {int(entry[:-1]) + 1}" if entry else "")
+    return WORDS.get(stem, stem) + (which.format(int(entry[:-1]) + 1) if entry else "")
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names of parameters and of terms in words, one after the other."""
+    return ", ".join(in_words(name, " ({})") for name in names)
 
 
 def combinations(M: Tensor, alone: Tensor, names: Sequence[str]) -> list[Trade]:

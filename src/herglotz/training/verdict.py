@@ -25,13 +25,14 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, precision
+from herglotz.data.polar import circles
+from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, coarse, precision, precisions
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.flow import motion
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.look import Look
-from herglotz.training.missed import MOST, reason_of
+from herglotz.training.missed import MOST, reason_of, reason_of_data
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
 from herglotz.training.problems.robust import FEW, FREEDOM, far_out, scale_of
@@ -84,13 +85,22 @@ def _with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: fl
 
 
 def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
-    """What the residual of the training part shows of the reason of a misfit; "" where it shows none."""
-    data = train.liveliest(MOST)
-    found = _with_own_starts(task, fitted, data, None)
-    if found is None:
-        return ""
-    grid = found.problem.grid
-    return reason_of(data, found.problem.misfit(found.path), grid.node // (grid.longest + 1))
+    """What the residual of the training part shows of the reason of a misfit; "" where it shows none.
+
+    In steps so short that noise hides its curvature every second, fourth … sample is asked.
+    """
+    reason, steps = reason_of_data(train.liveliest(MOST)) or None, 1
+    while reason is None:
+        data, base = train.liveliest(MOST), task.base.stepped(steps)
+        found = _with_own_starts(replace(task, base=base), fitted, data, None)
+        if found is None:
+            break
+        grid = found.problem.grid
+        reason = reason_of(data, found.problem.misfit(found.path), grid.node // (grid.longest + 1))
+        if min(train.lengths) < 2 * FIRST_SEGMENT or coarse(half := train.thinned(2)):
+            break
+        train, steps = half, 2 * steps
+    return reason or ""
 
 
 def _gross(windows: Tensor, data: Trajectories) -> Tensor:
@@ -204,17 +214,38 @@ def judged(
     numbers["precision"] = precision(kept)
     kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
     shown = lambda: _shown_reason(task, fitted, seen.train)  # noqa: E731
-    return {"verdict": in_words(errors, ahead, metrics, shown)} | kept_numbers
+    return {"verdict": in_words(errors, ahead, metrics, shown, bound(kept))} | kept_numbers
+
+
+def bound(data: Trajectories) -> str:
+    """Which two positions stay on a circle as well as they are known, with what to try; "" where none do.
+
+    Their motion has one freedom. What pulls them back to the circle is not recorded, and a free run leaves it.
+    """
+    noise, size = precisions(data).to(data.q) * data.balance, data.q.std(0, correction=0)
+    for one in circles(replace(data, notes=())):
+        at = list(one.columns)
+        if one.error <= AT_THE_NOISE * float(noise[at].maximum(EXACT_ENOUGH * size[at]).square().mean().sqrt()):
+            kept = f"The positions {one.told}, and what holds them there was not recorded"
+            return f"{kept}. Try {one.remedy}, which makes one angle of it, or motions that leave it"
+    return ""
 
 
 def in_words(
-    errors: Errors, ahead: Foresight | None, metrics: dict[str, Any], shown: Callable[[], str] = lambda: ""
+    errors: Errors,
+    ahead: Foresight | None,
+    metrics: dict[str, Any],
+    shown: Callable[[], str] = lambda: "",
+    bound: str = "",
 ) -> str:
     """One of the three verdicts, with numbers and, where the model does not fit, what to try.
 
-    `shown` gives what the residual shows of the reason, with what to try (`herglotz.training.missed`).
+    `shown` gives what the residual shows of the reason, with what to try (`herglotz.training.missed`); `bound` says
+    which positions have one freedom.
     """
     free, missed = errors.free or 0.0, not errors.windows <= AT_THE_NOISE * errors.limit
+    if bound:
+        return f"{FAILS}: {errors}. {bound}"
     follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"
@@ -225,7 +256,9 @@ def in_words(
         return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    return f"{FITS}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors)
+    if errors.worst <= AT_THE_NOISE * errors.limit:
+        return f"{FITS}: {errors}"
+    return ". ".join(filter(None, (_worse(errors), shown() if missed else "")))
 
 
 def _worse(errors: Errors) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from herglotz.data.roughness import precision, precisions
 from herglotz.data.spikes import spikes
-from herglotz.data.splits import leading
+from herglotz.data.splits import leading, leading_rows
 from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.stepping import State, solve
@@ -37,8 +37,9 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
     noise, estimated from the data alone, is subtracted from both; the check is left out where the null model's error is
     mostly noise.
 
-    Follow: the RMS of free runs over windows of 20 recorded steps from the run's states, over the spread; a step that
-    fails counts as infinite. A collapsed model has small residuals and fails here.
+    Follow: the RMS of free runs over windows of 20 recorded steps of the training part, from the fitted states, over
+    the spread; a step that fails counts as infinite. A collapsed model has small residuals and fails here. (Beyond it
+    the run's states are those of one free run, which the last check judges.)
 
     Dissipation: the same windows with γ → −γ, 0, γ/2 and 2γ; a model that follows the data no better fails. A model of
     rate 0 fails where a rate divides its error by 5. Left out where it has no rate, or the data do not show it.
@@ -62,8 +63,9 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
         checks.append(Check.at_most("one_step", "predicts a step: |J⁻¹R| over uniform motion", ratio, ONE_STEP, note))
     else:
         extra = f"; one step is not judged: uniform motion's error ({null:.2g}) is mostly noise ({floor:.2g})"
-    own = _follow(run, q, spread)
-    nulls, more = dissipation(run, lambda other: _follow(other, q, spread), own)
+    trained = _trained(run)
+    own = _follow(trained, spread)
+    nulls, more = dissipation(trained, lambda other: _follow(other, spread), own)
     exact = precision(run.data.unwrapped()) / float(spread.mean())
     numbers |= {"follow": own, "precision": exact}
     times = f", {own / exact:.2g} times the data's precision" if 0 < exact < math.inf else ""
@@ -89,8 +91,16 @@ def _without_spikes(run: Run) -> Run:
     return replace(run, data=run.data.keep(~bad), states=State(*(x[~bad] for x in run.states)), train_lengths=trained)
 
 
-def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
+def _trained(run: Run) -> Run:
+    """The run on its training part alone."""
+    rows = leading_rows(run.data.lengths, run.train_lengths)
+    states = State(*(x[rows] for x in run.states))
+    return replace(run, data=run.data.unwrapped().rows(rows, run.train_lengths), states=states)
+
+
+def _follow(run: Run, spread: Tensor) -> float:
     """Return RMS over spread of free runs that start again from the run's state every `WINDOW` recorded steps."""
+    q = run.data.q
     grid = segment_grid(run.data, WINDOW, GAP * run.h)
     states = [x[grid.start_sample] for x in run.states]
     if not all(bool(torch.isfinite(x).all()) for x in states):

@@ -1,12 +1,13 @@
 """`herglotz predict` reads a run and a recording, prints, writes and draws."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from herglotz.cli import main
 from herglotz.cli.predict import WARMUP
-from herglotz.training import predict
+from herglotz.training import load_run, predict, save_run
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +82,18 @@ def test_mistakes_are_one_line(tiny_run, other_csv, tmp_path, capsys):
         assert len([line for line in err.splitlines() if line.startswith("herglotz:")]) == 1
     assert main(["predict", str(tmp_path), str(other_csv)]) == 2
     assert "no model.pt in this folder" in capsys.readouterr().err
+
+
+def test_a_drift_that_is_taken_off_is_said(tiny_run, other_csv, tmp_path, capsys):
+    # fails if positions are changed without a word, or the drift of the fit is forgotten
+    run = load_run(tiny_run)
+    plan = {**run.metrics["plan"], "drifts": (0.01,)}
+    save_run(replace(run, metrics={**run.metrics, "plan": plan}), tmp_path / "drifting")
+    found = {}
+    for name, folder in (("still", tiny_run), ("drifts", tmp_path / "drifting")):
+        assert main(["predict", str(folder), str(other_csv), "--json"]) == 0
+        told = capsys.readouterr()
+        found[name] = json.loads(told.out)["rms"]
+        said = "its sensors are taken to drift as those of the fit did: theta 0.01 rad/s"
+        assert (said in " ".join(told.err.split())) is (name == "drifts"), told.err
+    assert found["drifts"] != found["still"]

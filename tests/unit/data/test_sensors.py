@@ -1,6 +1,7 @@
 """Sensor maps: q = scale · (reading − zero), from arguments, flags and comments of a file."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -43,6 +44,17 @@ def test_what_makes_no_sense_is_refused(zeros, scales, said):
         measured(two_recordings(), zeros, scales)
 
 
+def test_a_zero_that_drifts_begins_with_its_recording():
+    # fails if a drift goes on from one recording to the next, or velocities keep it
+    data = two_recordings()
+    still = measured(replace(data, v=data.q), drifts=(0.1, -1.0))
+    t = torch.tensor([0.0, 1, 2, 3, 4, 0, 1, 2, 3], dtype=torch.float64)[:, None]
+    rate = torch.tensor([0.1, -1.0], dtype=torch.float64)
+    assert torch.equal(still.q, data.q - t * rate)
+    assert still.v is not None
+    assert torch.equal(still.v, data.q - rate)
+
+
 CSV = "# zero: {zero}\n# scale: 1, 0.5\nt[s],theta[{unit}],x[m]\n0,1,1\n1,2,2\n2,3,4\n"
 
 
@@ -79,3 +91,12 @@ def test_a_comment_that_is_no_number_is_refused_with_its_place(tmp_path):
     path.write_text(CSV.format(unit="rad", zero="ten -1"))
     with pytest.raises(InputError, match=r"a.csv, comment '# zero: ten -1': 'ten' is not a number"):
         load(path, show=False)
+
+
+def test_zeros_that_a_fit_has_found_are_in_rad(tmp_path):
+    # fails if they are taken for degrees where the table has degrees: 0.05 rad of a zero were 0.0009 rad, and three
+    # recordings of a pendulum that differ by them did not fit
+    path = tmp_path / "a.csv"
+    path.write_text("t[s],theta[deg]\n0,10\n1,20\n2,30\n")
+    data = load(path, show=False)
+    assert torch.equal(measured(data, (0.05,)).q, data.q - 0.05)

@@ -43,6 +43,16 @@ def test_units_in_a_row_of_their_own(tmp_path, header, units, rate):
     assert "  units stand in row 2" in data.table().splitlines()
 
 
+def test_columns_without_a_value_are_left_aside(tmp_path, capsys):
+    # fails if an empty column of remarks refuses the table, as of all rows none is complete, or is left out in silence
+    data = load(written(tmp_path, f"t[s];x[cm];remarks;by\n{rows(';', '', '')}"))
+    assert (data.names, data.u) == (("x",), None)
+    assert [role for _, role, _ in data.columns] == ["time", "coordinate", "left aside", "left aside"]
+    assert "warning: a.csv: remarks, by have no value in any row, and are left aside" in capsys.readouterr().err
+    with pytest.raises(InputError, match="of the 6 rows from here, 0 have a value in every column"):
+        load(written(tmp_path, f"t[s];x[cm]\n{''.join(f'{t};' + chr(10) for t in T)}"))
+
+
 def test_units_below_are_converted(tmp_path):  # fails if ms and degrees of such a row stay, or of another separator
     data = load(written(tmp_path, f"t;phi;F\n[ms];[°];[N]\n{rows(';', 2)}"), unwrap=False)
     assert data.t.tolist() == (T / 1000).tolist()

@@ -320,6 +320,17 @@ def test_what_is_learned_is_the_models_own():  # fails if a panel shows another 
     assert x[0] < float(seen.min()) < float(seen.max()) < x[-1]
 
 
+def test_an_angle_that_goes_round_is_drawn_over_one_turn():
+    # fails if 161 points are spread over a dozen turns: waves that come four times a turn were drawn as others
+    run = fake_run(steps=40)
+    round_and_round = replace(run, states=run.states._replace(q=8 * math.pi * run.states.q))
+    potential, _, friction = plot_learned(round_and_round).axes
+    assert potential.get_xlim() == pytest.approx((-math.pi, math.pi))
+    assert friction.get_xlim()[1] > math.pi
+    on_a_line = replace(round_and_round, data=replace(run.data, angles=(False,)))
+    assert plot_learned(on_a_line).axes[0].get_xlim()[1] > 2 * math.pi
+
+
 def test_what_was_recorded_in_degrees_is_drawn_in_degrees():
     # fails if a figure shows radians to a reader whose file has degrees, or a unit that its numbers are not in
     run = fake_run()

@@ -71,9 +71,18 @@ def test_the_equation_gives_each_number_its_own_deviation():
     joint = Joint(deviations.square().diag(), deviations, deviations.square().reciprocal().diag())
     terms = equation_of(SimpleNamespace(model=model, data=data), joint).terms  # pyright: ignore
     found = {(term.left.split()[-1], term.what): term.deviation for term in terms}
-    assert found[("b″", "b")] == pytest.approx(float(deviations[numbers.index("potential.stiffness[1]")]))
-    assert found[("b″", "")] == pytest.approx(float(deviations[numbers.index("potential.tilt[1]")]))
+    of = dict(zip(numbers, deviations.tolist(), strict=True))
+    mass = 2 * of["kinetic.log_diagonal"]  # of ln m, which both are over
+    assert found[("b″", "b")] == pytest.approx(math.hypot(of["potential.stiffness[1]"], 5 * mass))
+    assert found[("b″", "")] == pytest.approx(math.hypot(of["potential.tilt[1]"], mass))
     assert ("a″", "a") not in found
+    # fails if a mass that cancels in the rate of b, over which it is, asks for twenty digits: its slope is rounding
+    with torch.no_grad():
+        model.get_parameter("kinetic.log_diagonal").fill_(0.37)
+        model.get_parameter("damping.rate").fill_(0.0799)
+    terms = equation_of(SimpleNamespace(model=model, data=data), joint).terms  # pyright: ignore
+    (own,) = [term for term in terms if (term.left, term.what) == ("b″", "b′")]
+    assert own.alone == pytest.approx(of["damping.rate"])
 
 
 def test_the_message_on_a_misspelt_number_names_no_weights():

@@ -144,9 +144,11 @@ def test_what_is_no_config_is_refused():  # fails if hz.fit(t, q) ends in numpy'
 
 def test_the_plan_in_words():  # fails if a newcomer reads names of fields, or of decisions that have no effect
     plan = replace(choose(*seen(0.01)), network="none", sigma=0.0123, fitted_before=True, substeps=1)
+    plan = replace(plan, absent=("friction.viscous[1]", "friction.input_map"))
     words = dict(taken.split(": ", 1) for decisions, _ in plan.by_reason("rad") for taken in decisions)
     assert words["fitted to"] == "whole trajectories (trajectory)"
     assert words["noise assumed"] == "0.0123 rad"
     assert words["masses and friction"] == "one mass, and a potential of the named terms alone"
+    assert words["numbers that are 0"] == "viscous friction (2), the map from inputs to forces"
     idle = ("hold", "delay", "lag", "drag", "substeps", "restarts", "departures", "continues_probe")
     assert not {WORDS[name] for name in idle} & set(words)

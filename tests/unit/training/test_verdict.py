@@ -137,6 +137,36 @@ def test_too_little_says_how_much_would_do(open_to, longer):
     assert f"Try a recording {longer} times as long" in text
 
 
+@pytest.mark.parametrize(("stretched", "said"), [(0.0, True), (0.01, False)])
+def test_what_one_circle_does_not_tell(stretched, said):
+    # fails if two freedoms are praised where only one was recorded, or an arm whose stretching is seen has one
+    t = torch.arange(300, dtype=torch.float64) / 30
+    angle, r = 1.1 * (-0.06 * t).exp() * (3.5 * t).cos(), 0.8 + stretched * (9 * t).sin()
+    q = torch.stack([r * angle.sin(), -r * angle.cos()], 1)
+    q = q + 1e-3 * torch.randn(300, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    text = verdict.bound(replace(Trajectories.of(t, q), names=("x", "y"), units=("m", "m")))
+    assert ("Try --polar x,y " in text) is said
+    judged = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), KNOWN, GOOD, bound=text)
+    assert judged.startswith("does not fit: " if said else "fits to the noise: ")
+
+
+def test_a_verdict_asks_for_circles(monkeypatch):  # fails if nobody asks, or the data of the fit are not what is asked
+    found = lambda data: f"{data.names[0]} is bound, {len(data)}"  # noqa: E731
+    monkeypatch.setattr(verdict, "bound", found)
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
+    run = fit(data, FitConfig(departures=(2e-3,), level="linear", objective="trajectory"), progress=False)
+    assert run.metrics["verdict"].endswith(". theta is bound, 2")
+
+
+def test_a_model_worse_than_the_noise_says_what_is_seen_of_the_reason():
+    # fails if a reason is told of models that do not fit alone: an input that was filled in, a factor of 20, exit 0
+    missed = Errors(0.03, 0.03, 0.03, noise=0.01, spread=1.0)
+    assert in_words(missed, KNOWN, GOOD, lambda: "What is missed comes in kicks").endswith(
+        ". What is missed comes in kicks"
+    )
+    assert "kicks" not in in_words(replace(missed, windows=0.01), KNOWN, GOOD, lambda: "kicks")
+
+
 def test_a_free_run_that_leaves_the_world_is_a_failed_one(monkeypatch):
     # fails if 2.8e40 rad is an error like others, or the start, which nobody knows so far, excuses it
     measured = evaluate_module._errors

@@ -23,7 +23,8 @@ class WithZeros:
     """A shooting problem with zeros of sensors as further unknowns: (unknowns of the problem, then (B − 1) · n).
 
     Each recording but the reference has zeros of its own, (B · n) with the reference's where parameters are `held`.
-    Where zeros are `shared` there are n, those of all recordings.
+    Where zeros are `shared` there are n, those of all recordings; where they `grow`, (N,), each sample has so many
+    times its zero.
     """
 
     def __init__(
@@ -32,6 +33,7 @@ class WithZeros:
         held: Tensor | None = None,  # places of the parameters of odd terms, which stay as they are
         *,
         shared: bool = False,
+        grow: Tensor | None = None,
     ):
         data, reference = problem.data, reference_of(problem.data)
         own = torch.arange(len(data), device=data.t.device)
@@ -40,7 +42,7 @@ class WithZeros:
         elif held is None:
             own = torch.where(own < reference, own, own - 1).where(own != reference, -1)
         self.problem, self.which, self.held = problem, own[data.trajectory], held
-        self.count = (int(own.max()) + 1) * problem.n
+        self.count, self.grow = (int(own.max()) + 1) * problem.n, torch.ones_like(data.t) if grow is None else grow
 
     def cost(self, x: Tensor) -> Tensor:
         """½|r|² with q + z − y as the residuals of the data."""
@@ -52,7 +54,7 @@ class WithZeros:
         if not bool(torch.isfinite(cost)):
             return cost, x.new_zeros(len(x), len(x)), torch.zeros_like(x)
         A = dense(A)
-        columns, diagonal, slope = by_zeros(self.problem, self.which)
+        columns, diagonal, slope = by_zeros(self.problem, self.which, self.grow)
         C = columns.flatten(1)
         A = torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)])
         b = torch.cat([b, slope.flatten()])
@@ -64,21 +66,23 @@ class WithZeros:
     def _set(self, x: Tensor) -> Tensor:
         """The problem's own unknowns, its zeros being those of x."""
         z = torch.cat([x[-self.count :].reshape(-1, self.problem.n), x.new_zeros(1, self.problem.n)])
-        self.problem.zeros = z[self.which]
+        self.problem.zeros = self.grow[:, None] * z[self.which]
         return x[: -self.count]
 
 
-def by_zeros(problem: ShootingProblem, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def by_zeros(problem: ShootingProblem, which: Tensor, grow: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """What (JᵀJ, Jᵀr) have of zeros z of sensors, where the normal equations of all unknowns were made last.
 
-    `which` zero, from 0, each sample has, (N,); −1: none. Columns (unknowns, Z, n), diagonal and gradient (Z, n).
+    `which` zero, from 0, each sample has, (N,), and how many times it, `grow` (N,); −1: none. Columns (unknowns, Z, n),
+    diagonal and gradient (Z, n).
     """
     assert problem.path is not None
     assert problem._at is not None
     count = int(which.max()) + 1
     fit = problem._missed_by(problem.path.x)
     by = problem.weight * problem.root_weights(fit) / problem.deviations  # ∂r/∂z
-    rows = problem.slopes_at_samples(problem._at[: problem.P], problem.path) * by.square()[..., None]  # (N, n, P + d)
+    slopes = problem.slopes_at_samples(problem._at[: problem.P], problem.path)
+    rows = slopes * (by.square() * grow[:, None])[..., None]  # (N, n, P + d)
     segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
     # Of every segment, whose samples have one zero: (S, P + d, n).
     S, of = problem.grid.segments, torch.full((problem.grid.segments,), -1, device=which.device)
@@ -90,5 +94,6 @@ def by_zeros(problem: ShootingProblem, which: Tensor) -> tuple[Tensor, Tensor, T
         columns[problem.P :, z] = torch.where((of == z)[:, None, None], own[:, problem.P :], 0.0).flatten(0, 1)
     kept = which >= 0
     zero = rows.new_zeros(count, problem.n)
-    diagonal = zero.index_add(0, which[kept], by[kept].square())
-    return columns, diagonal, zero.index_add(0, which[kept], (by * problem.root_weights(fit) * fit)[kept])
+    diagonal = zero.index_add(0, which[kept], (by * grow[:, None])[kept].square())
+    slope = by * problem.root_weights(fit) * fit * grow[:, None]
+    return columns, diagonal, zero.index_add(0, which[kept], slope[kept])
