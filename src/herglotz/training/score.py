@@ -38,15 +38,15 @@ class Score:
     rms: float  # of held-out residuals, in units of q over the balance
     zeros: int = 0  # further numbers, which are one choice for all: zeros of sensors
 
-    def replaces(self, simple: Score, offered: int) -> bool:
-        """Whether this richer model replaces a simpler one, where there are so many offers."""
-        return self.gain(simple, offered) > 0
+    def replaces(self, simple: Score, offered: int, errors: float = 1.0) -> bool:
+        """Whether this richer model replaces a simpler one, where there are so many offers, by so many errors."""
+        return self.gain(simple, offered, errors) > 0
 
-    def gain(self, simple: Score, offered: int) -> float:
-        """The left side of the inequality less the right one."""
+    def gain(self, simple: Score, offered: int, errors: float = 1.0) -> float:
+        """The left side of the inequality less the right one, with so many times the standard error."""
         by_block = simple.losses - self.losses
         error = float(by_block.std()) * len(by_block) ** 0.5
-        return float(by_block.sum()) - self.price(offered) + simple.price(offered) - error
+        return float(by_block.sum()) - self.price(offered) + simple.price(offered) - errors * error
 
     def price(self, offered: int) -> float:
         """½ k log N + log (C over c)."""

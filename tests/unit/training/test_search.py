@@ -190,6 +190,22 @@ def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, repla
     assert rich.replaces(simple, 80) is replaces
 
 
+@pytest.mark.parametrize(("gains", "wins"), [((6.0,) * 10, True), ((30.0, 30.0, *[0.0] * 8), False)])
+def test_a_free_run_decides_by_twice_its_standard_error(gains, wins):
+    # fails if the blocks of a free run count as independent: two of ten gain 60 together, with an error of 40
+    def end(name, losses, numbers) -> Any:
+        score = Score(torch.tensor(losses), 400, numbers, 1, 1.0)
+        fitter = SimpleNamespace(offered=8, simple={"a"}, foretold=lambda _: score, variant=Variant(2))
+        return SimpleNamespace(
+            fitter=fitter, taken=frozenset(name), whole=True, length=9, at_the_noise=False, values={}
+        )  # fmt: skip
+
+    simple, rich = end("a", gains, 2.0), end("b", (0.0,) * 10, 4.0)
+    rich.fitter.fit = lambda *_: simple
+    assert (Search.finalist(cast(Any, None), rich, (rich,)) is rich) is wins
+    assert rich.fitter.foretold(rich).replaces(simple.fitter.foretold(simple), 8)
+
+
 def test_numbers_that_come_together_are_one_choice():
     # fails if a function of many waves is as unlikely a choice as so many terms, or its numbers are free
     one, band = Score(torch.zeros(10), 400, 4.0, 4, 1.0), Score(torch.zeros(10), 400, 11.0, 4, 1.0)
