@@ -28,7 +28,7 @@ def test_the_plan_says_why(settings, expected):
     plan = choose(seen, config)
     assert plan.forces["sticking"] is expected
     assert plan.objective == "trajectory"
-    assert "coulomb" in settings or "friction.coulomb" in plan.reasons["forces"]
+    assert "coulomb" in settings or "dry friction" in plan.reasons["forces"]
     assert plan.hold == "zero"
     assert plan.reasons["hold"] == "the data or the settings say so"
     assert torch.isfinite(torch.tensor(plan.start["stiffness"])).all()

@@ -529,19 +529,20 @@ def test_a_line_and_zeros_are_found_one_after_the_other(monkeypatch):
     data, seen, zeros = replace(data, p=None, s=None), [], (0.0, 0.3)
     first = look(data, FitConfig(find_zeros=False), Stages())
     found = there(first.found)
-    answers = [found._replace(turning=False), found._replace(zeros=zeros, why_zeros="so", hold="first"), found]
+    more = {"zeros": zeros, "why_zeros": "so", "hold": "first", "drifts": (0.1,), "why_drifts": "since"}
+    answers = [found._replace(turning=False), found._replace(**more), found]
 
-    def asked(data, _settings, stages, _plan, zeros, known=None):
-        seen.append((stages.label, data.angles, data.hold, zeros, known))
+    def asked(data, _settings, stages, _plan, zeros, drifts, known=None):
+        seen.append((stages.label, data.angles, data.hold, zeros, drifts, known))
         return replace(first, found=answers.pop(0))
 
     monkeypatch.setattr(sys.modules["herglotz.training.look"], "_seen", asked)
     last = look(data, FitConfig(), Stages())
     assert [(angles, *rest) for _, angles, *rest in seen] == [
-        ((True,), "", (), None), ((False,), "", (), None), ((False,), "first", zeros, found)
+        ((True,), "", (), (), None), ((False,), "", (), (), None), ((False,), "first", zeros, (0.1,), found)
     ]  # fmt: skip
     assert len({label for label, *_ in seen}) == 3  # a checkpoint remembers each by its own name
-    assert (last.turning, last.why_zeros) == (False, "so")
+    assert (last.turning, last.why_zeros, last.why_drifts) == (False, "so", "since")
 
 
 def test_an_angle_with_a_spring_is_a_position_on_a_line():

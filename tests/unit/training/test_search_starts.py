@@ -189,6 +189,7 @@ def asked(monkeypatch):
     base, config = estimate_baseline(data), FitConfig().resolved(data)
     monkeypatch.setattr(module, "compared_models", lambda *_: ())
     monkeypatch.setattr(module, "settings_of_trial", lambda _, config: (config, base))
+    monkeypatch.setattr(module, "drifts", lambda _: None)
 
     def ask(**told):
         seen = []
