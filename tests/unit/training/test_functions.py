@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -334,7 +335,7 @@ def test_functions_join_a_model_that_is_near_the_data(monkeypatch):
     assert "q1^3" not in {offer.name for offer in kept.offers}
 
 
-def test_no_functions_where_named_terms_are_at_the_noise():
+def test_no_functions_where_named_terms_are_at_the_noise(monkeypatch):
     # fails if functions are tried for every recording: they would take the place of the law
     data = recorded(lambda q, v: -np.sin(q) - 0.1 * v, [(2.0, 0.0), (0.5, 1.0)], angle=True)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
@@ -344,6 +345,14 @@ def test_no_functions_where_named_terms_are_at_the_noise():
     assert with_functions(search, found) is found
     assert not any(variant.functions for variant in search.fitters)
     assert search.fitter(Variant(2)).functions == {}
+    # nor does one join that has nothing to say: the model stays itself, without the numbers that functions bring
+    monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
+    assert found.near
+    same = SimpleNamespace(taken=found.taken, fitter=SimpleNamespace(functions={"V(q1) 1": []}))
+    monkeypatch.setattr("herglotz.training.function_search._joined", lambda *_: same)
+    monkeypatch.setattr(search, "finalist", lambda *_: same)
+    monkeypatch.setattr(search, "better", lambda *_: same)
+    assert with_functions(search, found) is found
 
 
 def test_joints_whose_masses_have_second_waves_have_these_offers():

@@ -129,7 +129,8 @@ class Asked:
 
     def model(self, name, rms, noise=False):
         replaces = lambda _: not self.told.get("worse")  # noqa: E731
-        return SimpleNamespace(names=[name], rms=rms, whole=True, at=self.name, at_the_noise=noise, replaces=replaces)
+        return SimpleNamespace(names=[name], rms=rms, whole=True, at=self.name, at_the_noise=noise, replaces=replaces,
+                               fits_better=lambda *_: not self.told.get("worse"))  # fmt: skip
 
     def of(self, data, name=None):
         assert self.data.source != DRIVEN or data.source == DRIVEN  # columns of inputs are not lost on the way
@@ -142,7 +143,7 @@ class Asked:
     def run(self):
         rms = self.told.get("rms", (0.1, 0.1))[sum(question == "run" for _, question in self.seen)]
         self.seen.append((self.name, "run"))
-        return self.model("cos(q1)", rms, noise=True)
+        return self.model("cos(q1)", rms, noise=not self.told.get("rough"))
 
     def again(self, found):
         return None if self.told.get("lost") else found
@@ -189,12 +190,13 @@ def asked(monkeypatch):
     base, config = estimate_baseline(data), FitConfig().resolved(data)
     monkeypatch.setattr(module, "compared_models", lambda *_: ())
     monkeypatch.setattr(module, "settings_of_trial", lambda _, config: (config, base))
-    monkeypatch.setattr(module, "drifts", lambda _: None)
 
     def ask(**told):
         seen = []
         monkeypatch.setattr(module, "Search", partial(Asked, told=told, seen=seen))
         monkeypatch.setattr(questions, "with_functions", lambda search, best: search.with_functions(best))
+        monkeypatch.setattr(questions, "with_dissipation", lambda _, found: found)
+        monkeypatch.setattr(module, "drifts", lambda search: search.answer("drifts"))
         return search(data, base, config, outliers=False, holds=["first", "smooth"]), seen
 
     return ask
@@ -207,12 +209,25 @@ def test_the_zeros_of_a_part_are_those_of_all(asked):
     found, seen = asked(long=True, zeros=zeros)
     assert found.zeros == pytest.approx((0.0, 0.1))
     assert seen == [
-        ("part", "zeros"), ("part'", "hold of full"), ("part'", "run"), ("part'", "line"),
+        ("part", "zeros"), ("part'", "hold of full"), ("part'", "run"), ("part", "drifts"), ("part'", "line"),
         ("part'", "terms"), ("part'", "functions"), ("whole", "of_part, True"),
     ]  # fmt: skip
     on_a_line, seen = asked(zeros=zeros, line=True)
     assert not on_a_line.turning
     assert on_a_line.zeros == ()
+
+
+def test_drifts_stay_where_the_terms_that_are_found_without_them_meet_the_noise(asked):
+    # fails if drifts are not asked for where recordings differ, or stay where terms miss the data with them, too
+    zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
+    drift = torch.tensor([0.2]), torch.tensor([0.01])
+    found, _ = asked(zeros=zeros, drifts=drift)
+    assert found.drifts == (pytest.approx(0.2),)
+    assert found.why_drifts == "rates 0.2 ± 0.01"
+    rough, seen = asked(zeros=zeros, drifts=drift, rough=True)
+    assert rough.drifts == ()
+    assert ("whole", "drifts") in seen
+    assert ("whole", "drifts") not in asked()[1]  # at the noise, with no zeros
 
 
 def test_a_model_that_is_lost_on_the_way_is_not_the_end(asked):

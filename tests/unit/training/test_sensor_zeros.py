@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from herglotz.training.predict import predict
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import zeros_of_one
+from herglotz.training.sensor_zeros import FoundZeros, drifts, zeros_of_one
 from herglotz.training.stages import Stages
 from herglotz.training.structure import kept_structure
 from herglotz.training.task import build_model
@@ -119,6 +120,30 @@ def test_a_sensor_that_drifts_is_found_out():
     other = replace(other, q=other.q + slow * since_start(other)[:, None])
     assert (found.predict(other).rms or np.inf) < 1.5 * NOISE
     assert not fit(drifting, find_zeros=False).metrics["plan"]["drifts"]
+
+
+@pytest.mark.parametrize(("noise", "better"), [(True, True), (False, True), (True, False)])
+def test_what_is_left_of_a_drift_is_added_to_it(monkeypatch, noise, better):
+    # fails if a second fit replaces the rate of the first, or a drift is believed that leaves a misfit or is no better
+    zeros = [FoundZeros(torch.tensor([x]), torch.tensor([0.01]), 0.1) for x in (0.6, 0.3, 0.0)]
+    monkeypatch.setattr(sensor_zeros_module, "fitted", lambda *_: zeros.pop(0))
+    monkeypatch.setattr(sensor_zeros_module, "WithZeros", lambda *_, **__: None)
+    problem = SimpleNamespace(of=lambda *_: problem, parameters=SimpleNamespace(numbers=()), sigma=1.0, d=2)
+    problem.pack = lambda *_: None
+    path = SimpleNamespace(x=torch.zeros(1, 1, 2))
+
+    def model(at_the_noise, fits_better=True):
+        return SimpleNamespace(problem=problem, prior=None, theta=None, path=path, whole=True,
+                               at_the_noise=at_the_noise, fits_better=lambda *_: fits_better)  # fmt: skip
+
+    data = Trajectories.of(torch.linspace(0, 3, 7, dtype=torch.float64), torch.zeros(7, dtype=torch.float64))
+    again = model(noise, better)
+    read = SimpleNamespace(again=lambda _: again)
+    search = SimpleNamespace(data=data, config=FitConfig(), full=model(at_the_noise=False), of=lambda _: read)
+    found = drifts(search)
+    assert (found is not None) is (noise and better)
+    if found is not None:
+        assert found[0].tolist() == [pytest.approx(0.3)]  # (0.6 + 0.3) in three units of time
 
 
 def test_readings_that_do_not_drift_are_left_alone(monkeypatch):
