@@ -1,5 +1,6 @@
 """The search for inputs that act by their square, their size or their rate."""
 
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,17 +48,17 @@ def sway(s):
 CASES = {"u'": lambda u, rate: 2 * u + 1.5 * rate, "u^2": lambda u, _: 3 * u * u, "|u|": lambda u, _: 3 * abs(u)}
 
 
-@pytest.fixture(scope="module")
-def runs():
-    return {}
+@cache
+def run_of(term):
+    """The run of a recording whose input acts by this term."""
+    return hz.fit(driven(CASES[term], sway), train_fraction=1, progress=False)
 
 
 # That |u| is a column like u^2 is shown by test_input_terms.py.
 @pytest.mark.parametrize("term", ["u'", "u^2", pytest.param("|u|", marks=pytest.mark.slow)])
-def test_what_an_input_acts_by_is_found(term, runs):
+def test_what_an_input_acts_by_is_found(term):
     # fails if a term is not offered, or columns that nothing asks for stay
-    data = driven(CASES[term], sway)
-    runs[term] = run = hz.fit(data, train_fraction=1, progress=False)
+    run = run_of(term)
     assert run.metrics["plan"]["input_terms"] == (term,) or run.metrics["plan"]["input_terms"] == [term]
     assert run.metrics["verdict"].startswith("fits to the noise")
     assert term in str(run.equation())
@@ -81,16 +82,16 @@ def test_the_level_at_which_an_input_saturates_is_found():
     assert found[1] == pytest.approx(0.6, rel=0.01)
 
 
-def test_a_run_predicts_recordings_without_the_term(runs):
+def test_a_run_predicts_recordings_without_the_term():
     # fails if a new recording is not given the columns that the model is driven by
-    run = runs["u^2"]
+    run = run_of("u^2")
     new = driven(CASES["u^2"], lambda s: sway(s + 2), seed=3)
     assert run.predict(new).rms < 3 * 2e-4
 
 
-def test_a_plan_repeats_the_terms(runs):
+def test_a_plan_repeats_the_terms():
     # fails if a plan is followed with the recorded inputs alone
-    run = runs["u^2"]
+    run = run_of("u^2")
     again = hz.fit(
         driven(CASES["u^2"], sway), train_fraction=1, progress=False, plan=Plan.from_dict(run.metrics["plan"])
     )
