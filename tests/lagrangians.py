@@ -57,13 +57,13 @@ def wavy(q):
     return torch.sin(q[..., 0]) + 0.4 * q[..., 1] ** 3 + q[..., 0] * q[..., 1]
 
 
-def random_model(config: ModelConfig, dtype: torch.dtype = torch.float64) -> ContactLagrangian:
-    """A model whose parameters are all off their defaults."""
+def random_model(config: ModelConfig, dtype: torch.dtype = torch.float64, spread: float = 0.3) -> ContactLagrangian:
+    """A model whose parameters are all off their defaults, by normal numbers times `spread`."""
     model = ContactLagrangian(config)
     make = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for parameter in model.parameters():
-            parameter += 0.3 * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
+            parameter += spread * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
     return model.to(dtype)
 
 

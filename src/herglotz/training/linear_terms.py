@@ -98,7 +98,7 @@ class LinearTerms:
     def _regular(self, x: Tensor) -> Tensor:
         """With masses that turn with angles made smaller until no mass matrix of the data is nearly singular.
 
-        Smoothing may leave them too large, and no step is solved from there. Where it is not they, x stays.
+        Smoothing may leave these too large, and no step is solved from there. x stays where other masses are the cause.
         """
         less, moving = x.clone(), torch.tensor([name == MOVING for name in self.fit.names])
         for _ in range(SMALLER if bool(moving.any()) else 0):

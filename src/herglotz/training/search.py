@@ -37,7 +37,7 @@ from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Va
 PART = 2000  # samples that a search is made of, where there are more than twice as many
 FEW = 5  # iterations of a trial's fit, in the place of `ITERATIONS`, on more samples than a search is made of
 TRIED = 3  # changes of a kind whose fits are compared, of those that the linear motion puts first
-IN_A_ROW = 2.0  # standard errors of a free run's loss: its blocks are no independent ones, an early miss goes on
+IN_A_ROW = 2.0  # standard errors by which a free run decides: its blocks are not independent, an early miss goes on
 EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
 FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
 

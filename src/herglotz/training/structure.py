@@ -139,8 +139,8 @@ def search(
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
     asked, rates, why_drifts = Questions(wanted, holds), (), ""
     best = asked.best
-    open_to_drifts = best is not None and (asked.differ is not None or not best.at_the_noise)
-    if best is not None and open_to_drifts and (drift := drifts(wanted.part)) is not None:
+    drift = None if best is None or (asked.differ is None and best.at_the_noise) else drifts(wanted.part)
+    if best is not None and drift is not None:
         found = tuple(drift[0].tolist())
         again = Questions(wanted.of(measured(data, drifts=found)), holds)
         if again.best is not None and again.best.at_the_noise and again.best.fits_better(best, len(found)):

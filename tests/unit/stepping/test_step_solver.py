@@ -1,5 +1,7 @@
 """A single step: one answer by every path, samples apart, small steps in float32."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Solution, State, Status, Stepper, solve, solve_step
 from herglotz.stepping.newton import find_root, status_of
 from herglotz.stepping.partials_equation import End, PartialsEquation
+from tests import lagrangians
 from tests.lagrangians import states_in_turn
 
 LEVELS = {
@@ -23,16 +26,8 @@ SHARP = {  # of a measured arm with two motors
     "kinetic.log_diagonal": [-0.7], "kinetic.off_diagonal": [0.5], "friction.coulomb": [1.0, 2.0],
     "friction.breakaway": [1.2, -1.0], "friction.log_smooth": [-0.3, -6.8], "friction.log_stribeck": [0.2, 1.7],
 }  # fmt: skip
+random_model = partial(lagrangians.random_model, spread=0.2)
 TOL = 64 * torch.finfo(torch.float64).eps
-
-
-def random_model(config, dtype=torch.float64):
-    model = ContactLagrangian(config)
-    make = torch.Generator().manual_seed(3)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
-    return model.to(dtype)
 
 
 def solved(L_d, state, h, guess, limit=30, order=2):
