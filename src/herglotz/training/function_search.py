@@ -36,11 +36,17 @@ def _fitter(search: Search, variant: Variant) -> Fitter | None:
 
 
 def _joined(search: Search, best: Trial) -> Trial | None:
-    """A model with the functions that join it; None where it cannot be fitted together with what all functions have."""
+    """A model with the functions that join it; None where it cannot be fitted together with what all functions have.
+
+    Terms that are waves of a function bring that function with them.
+    """
     if (fitter := _fitter(search, replace(best.fitter.variant, kept=best.taken))) is None:
         return None
     taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
-    same = fitter.fit(taken, best.values, best.length, best)
+    taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
+    value = {best.fitter.keys[name]: x for name, x in best.values.items()}
+    values = {name: value[key] for name, key in fitter.keys.items() if key in value}
+    same = fitter.fit(taken, values, best.length, best)
     return same and search.settled(search.finer(same), swapped=True)
 
 

@@ -111,6 +111,6 @@ class Moves:
             way.append(now)
             if (gain := best.gain(scores[now], self.offered)) <= 0:
                 best, most = scores[now], len(way)
-            elif gain > scores[now].price(self.offered):  # more than all that may still leave are worth
+            elif gain > best.price(scores[now], self.offered):  # more than all that may still leave are worth
                 break
         return [way[(most >> k) - 1] for k in range(most.bit_length())]  # all of the way, half, a quarter …

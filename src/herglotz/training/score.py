@@ -1,12 +1,14 @@
 """The one comparison of a fit: what a model misses held-out blocks of time by, and whether a richer one is worth it.
 
-A richer model of k_r numbers, which come in c_r of C offers, replaces a simpler one where
+A richer model of k_r numbers, which come in c_r of C offers, replaces a simpler one of k_s where
 
-    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > ½ (k_r − k_s) log N + log C(C, c_r) − log C(C, c_s) + the standard error,
+    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)]
 
-ℓ_b being the log-loss of block b by Student's t, had its samples been left out of the fit. Of white residuals this is
-the extended Bayesian information criterion (Chen & Chen 2008). Where residuals are no noise, blocks differ, the
-standard error grows, and it decides. Lost blocks and outliers weigh little: the loss of Student's t grows as log |r|.
+and more than the standard error of this sum, ℓ_b being the log-loss of block b by Student's t, had its samples been
+left out of the fit. τ is how many samples in a row tell as much as one (`correlation_time`), so that N numbers are
+worth N/τ independent ones. Where a model lacks nothing its residuals are white, τ is 1, and this is the extended
+Bayesian information criterion (Chen & Chen 2008). Residuals that are no noise go on from sample to sample, τ is large,
+and every further number is dear. Lost blocks and outliers weigh little: the loss of Student's t grows as log |r|.
 """
 
 from __future__ import annotations
@@ -36,22 +38,28 @@ class Score:
     numbers: float  # k of the model: of those with a prior what the data tell
     choices: int  # c, how many offers it has taken
     rms: float  # of held-out residuals, in units of q over the balance
+    correlation_time: float = 1.0  # τ, in samples
     zeros: int = 0  # further numbers, which are one choice for all: zeros of sensors
 
-    def replaces(self, simple: Score, offered: int, errors: float = 1.0) -> bool:
-        """Whether this richer model replaces a simpler one, where there are so many offers, by so many errors."""
-        return self.gain(simple, offered, errors) > 0
+    def replaces(self, simple: Score, offered: int) -> bool:
+        """Whether this richer model replaces a simpler one, where there are so many offers."""
+        return self.gain(simple, offered) > 0
 
-    def gain(self, simple: Score, offered: int, errors: float = 1.0) -> float:
-        """The left side of the inequality less the right one, with so many times the standard error."""
+    def gain(self, simple: Score, offered: int) -> float:
+        """The left side of the inequality less the larger right one, τ being that of the richer model."""
         by_block = simple.losses - self.losses
         error = float(by_block.std()) * len(by_block) ** 0.5
-        return float(by_block.sum()) - self.price(offered) + simple.price(offered) - errors * error
+        return float(by_block.sum()) - max(self.price(self, offered) - self.price(simple, offered), error)
 
-    def price(self, offered: int) -> float:
-        """½ k log N + log (C over c)."""
-        chosen = math.log(math.comb(offered, self.choices))
-        return (self.numbers + self.zeros) * math.log(self.count) / 2 + chosen
+    def price(self, model: Score, offered: int) -> float:
+        """What the numbers and the choices of a model cost at the τ of this one, where there are so many offers."""
+        chosen = math.log(math.comb(offered, model.choices))
+        return (model.numbers + model.zeros) * self.of_a_number + self.correlation_time * chosen
+
+    @property
+    def of_a_number(self) -> float:
+        """½ τ log (N/τ), what a number costs."""
+        return self.correlation_time * math.log(self.count / self.correlation_time) / 2
 
 
 def scores(
@@ -62,9 +70,9 @@ def scores(
     Misfits below `floor`, in units of q over the balance, are rounding.
     """
     block = torch.where(model.complete, model.block, -1)
-    losses, rms = _losses(model.residuals(sets), block, floor)
-    rest = zip(losses, model.told(sets).sum(1).tolist(), choices, rms.tolist(), strict=True)
-    return [Score(own, count, numbers, chosen, error) for own, numbers, chosen, error in rest]
+    of_misfits = _of_misfits(model.residuals(sets), block, floor)
+    rest = zip(of_misfits, model.told(sets).sum(1).tolist(), choices, strict=True)
+    return [Score(losses, count, numbers, chosen, error, time) for (losses, error, time), numbers, chosen in rest]
 
 
 def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int = 0) -> Score:
@@ -73,28 +81,51 @@ def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int 
     What leaving out a block does to a model of many numbers, to first order, says more of these than of the few.
     """
     block = torch.where(problem.data.complete, blocks(problem.data), -1)
-    (losses,), (rms,) = _losses(problem.misfit(path)[None], block, floor)
-    return Score(losses, int((problem.weight > 0).sum()), problem.P, 0, float(rms), zeros)
+    ((losses, rms, time),) = _of_misfits(problem.misfit(path)[None], block, floor)
+    return Score(losses, int((problem.weight > 0).sum()), problem.P, 0, rms, time, zeros)
 
 
-def free_run_score(problem: ShootingProblem, path: Path, numbers: float, choices: int, floor: float) -> Score:
-    """The score over the samples that a fit has not used, which a free run over whole trajectories foretells."""
+def free_run_score(problem: ShootingProblem, path: Path, numbers: float, floor: float) -> Score:
+    """The score over the samples that a fit has not used, which a free run over whole trajectories foretells.
+
+    The few models that are compared so have paid for their choices.
+    """
     unseen = ~problem.used & problem.data.complete
     block = torch.where(unseen, torch.cumsum(unseen, 0) - 1, 0) * BLOCKS // max(1, int(unseen.sum()))
-    block = torch.where(unseen, block, -1)
-    (losses,), (rms,) = _losses(problem.misfit(path)[None], block, floor)
-    return Score(losses, int(unseen.sum()) * problem.n, numbers, choices, float(rms))
+    ((losses, rms, time),) = _of_misfits(problem.misfit(path)[None], torch.where(unseen, block, -1), floor)
+    return Score(losses, int(unseen.sum()) * problem.n, numbers, 0, rms, time)
 
 
-def _losses(r: Tensor, block: Tensor, floor: float) -> tuple[Tensor, Tensor]:
-    """Log-losses (C, B) and RMS (C,) of residuals (C, N, n) over the balance in blocks (N,); −1: in none."""
+def _of_misfits(r: Tensor, block: Tensor, floor: float) -> list[tuple[Tensor, float, float]]:
+    """Log-losses (B,), RMS and τ of each of C sets of residuals (C, N, n) over the balance, alike below `floor`.
+
+    Of samples in blocks (N,); those in block −1 are in none.
+    """
     inside = block >= 0
     r, block = r[:, inside], block[inside]
     scale = _scale(r).clamp_min(floor)
-    loss = scale.log() + (FREEDOM + 1) / 2 * torch.log1p((r / scale).square() / FREEDOM)
+    x = r.abs().clamp_min(floor) / scale
+    loss = scale.log() + (FREEDOM + 1) / 2 * torch.log1p(x.square() / FREEDOM)
     loss = loss.nan_to_num(nan=WORST, posinf=WORST).sum(2)
     losses = torch.zeros(len(r), int(block.max()) + 1, dtype=r.dtype, device=r.device).index_add_(1, block, loss)
-    return losses, r.square().mean((1, 2)).sqrt()
+    rms, time = r.square().mean((1, 2)).sqrt().tolist(), correlation_time(r / scale).tolist()
+    return list(zip(losses, rms, time, strict=True))
+
+
+def correlation_time(x: Tensor) -> Tensor:
+    """Samples in a row that tell as much as one, of residuals (C, N, n) over their scale, (C,): 1 of white ones.
+
+    τ = 1 + 2 Σ ρ_k, ρ_k being the autocorrelation at lag k of what a residual pulls with, the slope of its loss by
+    Student's t. Lags are added up in pairs as long as the pairs are positive (Geyer 1992).
+    """
+    pull = (x / (FREEDOM + x.square())).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    N = x.shape[1]
+    power = torch.fft.rfft(pull, 2 * N, dim=1).abs().square().sum(2)
+    covariance = torch.fft.irfft(power, 2 * N)[:, : N // 2 * 2]
+    rho = covariance / covariance[:, :1].clamp_min(torch.finfo(x.dtype).tiny)
+    pairs = rho.unflatten(1, (-1, 2)).sum(2)
+    positive = (pairs > 0).cumprod(1)
+    return (2 * (pairs * positive).sum(1) - 1).clamp_min(1.0)
 
 
 def _scale(r: Tensor) -> Tensor:

@@ -37,7 +37,6 @@ from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Va
 PART = 2000  # samples that a search is made of, where there are more than twice as many
 FEW = 5  # iterations of a trial's fit, in the place of `ITERATIONS`, on more samples than a search is made of
 TRIED = 3  # changes of a kind whose fits are compared, of those that the linear motion puts first
-IN_A_ROW = 2.0  # standard errors by which a free run decides: its blocks are not independent, an early miss goes on
 EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
 FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
 
@@ -150,7 +149,7 @@ class Search:
         scored = sorted(((end, x) for end, x in scored if x is not None), key=lambda pair: pair[1].numbers)
         winner, least, offered = best, None, max(end.fitter.offered for end in others.values())
         for end, found in scored:
-            if least is None or found.replaces(least, offered, IN_A_ROW):
+            if least is None or found.replaces(least, offered):
                 winner, least = end, found
         return winner
 
@@ -272,6 +271,15 @@ class Search:
         if other is None or not (sure or other.fits_better(best, more)):
             return self, best, None
         return read, other, differ
+
+    def zeros_again(self, read: Search, best: Trial, differ: tuple[Tensor, Tensor]) -> Zeroed:
+        """The same with the zeros that this model asks for, which has been found with those of another one."""
+        if (more := read.zeros(best)) is not None:
+            zeros = differ[0] + more[0]
+            other = self.of(measured(self.data, zeros.flatten().tolist()))
+            if (found := other.again(best)) is not None:
+                return other, found, (zeros, more[1])
+        return read, best, differ
 
     def held(self, trial: Trial, holds: Sequence[str], *, alike: bool = False) -> str:
         """The hold that the same model asks for; "" for none. `alike`: by the residuals of the fits themselves."""

@@ -14,7 +14,7 @@ def likeliest(trial: Trial, most: int) -> Trial:
     strengths, and stays.
     """
     gain = math.inf
-    while trial.sizes and gain > math.log(trial.score.count) / 2:
+    while trial.sizes and gain > trial.score.of_a_number:
         other = trial.fitter.fit(trial.taken, trial.values, trial.length, trial, most)
         if other is None or not (gain := float((trial.score.losses - other.score.losses).sum())) > 0:
             break

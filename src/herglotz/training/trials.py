@@ -299,8 +299,7 @@ class Fitter:
         x = problem.pack(trial.theta, trial.path.x[:, 0, : problem.d])
         result = levenberg_marquardt(problem, x, max_iterations=2 * ITERATIONS, rtol=1e-3, patience=2, damping=NEAR)
         path = problem.solve(result.x) if math.isfinite(result.cost) else None
-        of = trial.score
-        return None if path is None else free_run_score(problem, path, of.numbers, of.choices, self.floor)
+        return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
         """Over segments of the next length; None where there is none, or the model does not follow the data so long."""

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
+from herglotz.data.sensors import measured
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, fit, flow
 from herglotz.training.baseline import estimate_baseline
@@ -20,7 +21,7 @@ from herglotz.training.held_out import HeldOut, blocks
 from herglotz.training.look import look
 from herglotz.training.moves import BLOCKS, MEMORY, Moves
 from herglotz.training.offers import Offer
-from herglotz.training.score import Score, fitted_score
+from herglotz.training.score import Score, correlation_time, fitted_score
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
@@ -180,43 +181,60 @@ def test_a_start_without_a_path_is_none():
 
 
 @pytest.mark.parametrize(
-    ("gains", "more", "replaces"),
-    [((20.0,) * 10, 1, True), ((20.0,) * 10, 60, False), ((200.0, *[0.0] * 9), 1, False), ((0.3,) * 10, 1, False)],
+    ("gains", "more", "time", "replaces"),
+    [
+        ((20.0,) * 10, 1, 1.0, True),
+        ((20.0,) * 10, 60, 1.0, False),
+        ((20.0,) * 10, 1, 80.0, False),
+        ((200.0, *[-15.0] * 9), 1, 1.0, False),
+        ((0.3,) * 10, 1, 1.0, False),
+    ],
 )
-def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, replaces):
-    # fails if a price is left out, or if one block alone decides
+def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, time, replaces):
+    # fails if a price is left out, if one block alone decides, or if samples that repeat one another count as so many
     simple = Score(torch.tensor(gains), 400, 3.0, 3, 1.0)
-    rich = Score(torch.zeros(10), 400, 3.0 + more, 3 + more, 1.0)
+    rich = Score(torch.zeros(10), 400, 3.0 + more, 3 + more, 1.0, time)
     assert rich.replaces(simple, 80) is replaces
 
 
-@pytest.mark.parametrize(("gains", "wins"), [((6.0,) * 10, True), ((30.0, 30.0, *[0.0] * 8), False)])
-def test_a_free_run_decides_by_twice_its_standard_error(gains, wins):
-    # fails if the blocks of a free run count as independent: two of ten gain 60 together, with an error of 40
-    def end(name, losses, numbers) -> Any:
-        score = Score(torch.tensor(losses), 400, numbers, 1, 1.0)
+def test_samples_that_repeat_one_another_tell_as_much_as_one():
+    # fails if τ is not that of an autoregressive process, (1 + φ)/(1 − φ), or a residual that is no number makes it one
+    torch.manual_seed(0)
+    noise = torch.randn(3, 20_000, 2, dtype=torch.float64)
+    for k in range(1, noise.shape[1]):
+        noise[1, k] += 0.9 * noise[1, k - 1]
+    noise[2, 7] = torch.nan
+    white, repeated, broken = correlation_time(noise).tolist()
+    assert white == pytest.approx(1, abs=0.1)
+    assert broken == pytest.approx(1, abs=0.1)
+    assert repeated == pytest.approx(19, rel=0.2)
+
+
+@pytest.mark.parametrize(("time", "wins"), [(1.0, True), (20.0, False)])
+def test_a_free_run_of_few_independent_samples_decides_less(time, wins):
+    # fails if what a free run misses early, and later too, counts anew with every sample
+    def end(name, loss, numbers) -> Any:
+        score = Score(torch.full((10,), loss), 400, numbers, 1, 1.0, time)
         fitter = SimpleNamespace(offered=8, simple={"a"}, foretold=lambda _: score, variant=Variant(2))
         return SimpleNamespace(
             fitter=fitter, taken=frozenset(name), whole=True, length=9, at_the_noise=False, values={}
         )  # fmt: skip
 
-    simple, rich = end("a", gains, 2.0), end("b", (0.0,) * 10, 4.0)
+    simple, rich = end("a", 5.0, 2.0), end("b", 0.0, 4.0)
     rich.fitter.fit = lambda *_: simple
     assert (Search.finalist(cast(Any, None), rich, (rich,)) is rich) is wins
-    assert rich.fitter.foretold(rich).replaces(simple.fitter.foretold(simple), 8)
 
 
 def test_numbers_that_come_together_are_one_choice():
     # fails if a function of many waves is as unlikely a choice as so many terms, or its numbers are free
     one, band = Score(torch.zeros(10), 400, 4.0, 4, 1.0), Score(torch.zeros(10), 400, 11.0, 4, 1.0)
-    assert band.price(53) - one.price(53) == pytest.approx(3.5 * math.log(400))
+    assert one.price(band, 53) - one.price(one, 53) == pytest.approx(3.5 * math.log(400))
 
 
 def test_zeros_are_numbers_that_come_together():
     # fails if many recordings have more zeros than there are offers, or zeros are free
     plain = Score(torch.zeros(10), 400, 9.0, 9, 1.0)
-    with_zeros = replace(plain, zeros=100)
-    assert with_zeros.price(53) - plain.price(53) == pytest.approx(50 * math.log(400))
+    assert plain.price(replace(plain, zeros=100), 53) - plain.price(plain, 53) == pytest.approx(50 * math.log(400))
 
 
 def test_held_out_residuals_are_those_of_fits_without_the_blocks():
@@ -449,6 +467,20 @@ def test_zeros_are_clearly_there_and_make_the_fit_better(zero, deviation, better
     if better is not None:
         monkeypatch.setattr(type(best), "fits_better", lambda *_: better)
     assert search.with_zeros(best) == (search, best, None)
+
+
+def test_zeros_are_those_of_the_model_that_is_found():
+    # fails if zeros stay what another model, which had terms that made up for them, asked for
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
+    second = (data.trajectory == 1).double()[:, None]
+    search = searched(replace(data, q=data.q + 0.1 * second, p=None, s=None), find_zeros=True)
+    wrong = torch.tensor([[0.0], [0.07]], dtype=torch.float64)
+    read = search.of(measured(search.data, wrong.flatten().tolist()))
+    fitter = read.fitter(Variant(2))
+    best = there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
+    _, found, zeros = search.zeros_again(read, best, (wrong, torch.zeros_like(wrong)))
+    assert there(found).rms < 0.9 * best.rms
+    assert there(zeros)[0].flatten().tolist() == pytest.approx([0.0, 0.1], abs=0.01)
 
 
 def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
