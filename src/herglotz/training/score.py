@@ -2,13 +2,14 @@
 
 A richer model of k_r numbers, which come in c_r of C offers, replaces a simpler one of k_s where
 
-    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)]
+    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)] + e/√τ,
 
-and more than the standard error of this sum, ℓ_b being the log-loss of block b by Student's t, had its samples been
-left out of the fit. τ is how many samples in a row tell as much as one (`correlation_time`), so that N numbers are
-worth N/τ independent ones. Where a model lacks nothing its residuals are white, τ is 1, and this is the extended
-Bayesian information criterion (Chen & Chen 2008). Residuals that are no noise go on from sample to sample, τ is large,
-and every further number is dear. Lost blocks and outliers weigh little: the loss of Student's t grows as log |r|.
+and more than e, the standard error of this sum over blocks; ℓ_b is the log-loss of block b by Student's t, had its
+samples been left out of the fit. τ is how many samples in a row tell as much as one (`correlation_time`), so that N
+numbers are worth N/τ independent ones; e/√τ is what e would be if they all were. Where a model lacks nothing its
+residuals are white, τ is 1, and without e this is the extended Bayesian information criterion (Chen & Chen 2008).
+Residuals that are no noise go on from sample to sample, τ is large, and every further number is dear. Lost blocks and
+outliers weigh little: the loss of Student's t grows as log |r|.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class Score:
         """The left side of the inequality less the larger right one, τ being that of the richer model."""
         by_block = simple.losses - self.losses
         error = float(by_block.std()) * len(by_block) ** 0.5
-        return float(by_block.sum()) - max(self.price(self, offered) - self.price(simple, offered), error)
+        dearer = self.price(self, offered) - self.price(simple, offered)
+        return float(by_block.sum()) - max(dearer + error / self.correlation_time**0.5, error)
 
     def price(self, model: Score, offered: int) -> float:
         """What the numbers and the choices of a model cost at the τ of this one, where there are so many offers."""
