@@ -187,11 +187,13 @@ def test_a_start_without_a_path_is_none():
         ((20.0,) * 10, 60, 1.0, False),
         ((20.0,) * 10, 1, 80.0, False),
         ((200.0, *[-15.0] * 9), 1, 1.0, False),
+        ((3.1, -1.1) * 5, 1, 1.0, False),
         ((0.3,) * 10, 1, 1.0, False),
     ],
 )
 def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, time, replaces):
-    # fails if a price is left out, if one block alone decides, or if samples that repeat one another count as so many
+    # fails if a price is left out, if one block alone decides, if samples that repeat one another count as so many, or
+    # if what blocks differ by is not added to the price
     simple = Score(torch.tensor(gains), 400, 3.0, 3, 1.0)
     rich = Score(torch.zeros(10), 400, 3.0 + more, 3 + more, 1.0, time)
     assert rich.replaces(simple, 80) is replaces
