@@ -227,6 +227,16 @@ def test_a_free_run_of_few_independent_samples_decides_less(time, wins):
     assert (Search.finalist(cast(Any, None), rich, (rich,)) is rich) is wins
 
 
+def test_misfits_below_the_floor_are_alike(duffing):
+    # fails if residuals of rounding size, of steps or of sums, make one of two exact models better
+    search, found = duffing
+    problem, path = found.problem, found.path
+    assert fitted_score(problem, path, 10.0).losses.tolist() == pytest.approx(
+        fitted_score(problem, replace(path, x=path.x + 0.5), 10.0).losses.tolist(), rel=1e-12
+    )
+    assert there(search.fitter(Variant(2)).foretold(found)).choices == 0  # a free run has paid for these before
+
+
 def test_numbers_that_come_together_are_one_choice():
     # fails if a function of many waves is as unlikely a choice as so many terms, or its numbers are free
     one, band = Score(torch.zeros(10), 400, 4.0, 4, 1.0), Score(torch.zeros(10), 400, 11.0, 4, 1.0)

@@ -282,6 +282,13 @@ def test_terms_anew_that_are_worse_are_not_taken(asked):
         assert [asked(worse=worse, rms=(0.1, 0.2), **told)[0].sigma for worse in (False, True)] == [0.2, 0.1]
 
 
+def test_zeros_are_asked_once_more_of_the_model_that_is_found(asked):
+    # fails if zeros stay those of the whole dictionary
+    zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
+    assert ("whole", "zeros again") in asked(zeros=zeros)[1]
+    assert ("whole", "zeros again") not in asked()[1]
+
+
 def test_terms_of_inputs_that_run_free_no_better_are_not_taken(asked):
     # fails if blocks of the recordings, which free runs go on from, decide alone
     assert asked(terms=("u^2",), behind=True)[0].input_terms == ()
