@@ -44,9 +44,7 @@ def _joined(search: Search, best: Trial) -> Trial | None:
         return None
     taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
     taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
-    value = {best.fitter.keys[name]: x for name, x in best.values.items()}
-    values = {name: value[key] for name, key in fitter.keys.items() if key in value}
-    same = fitter.fit(taken, values, best.length, best)
+    same = fitter.fit(taken, fitter.values_of(best), best.length, best)
     return same and search.settled(search.finer(same), swapped=True)
 
 

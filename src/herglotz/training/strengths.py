@@ -37,4 +37,4 @@ def needed(trial: Trial, most: int) -> Trial:
 def of_terms(trial: Trial, plain: Fitter, most: int) -> Trial | None:
     """The model of a trial that has taken no function, fitted by the fitter of its terms alone."""
     powers = plain.simple - trial.fitter.simple  # no offers where functions are: every model has them there
-    return plain.fit(trial.taken | powers, trial.values, trial.length, trial, most)
+    return plain.fit(trial.taken | powers, plain.values_of(trial), trial.length, trial, most)

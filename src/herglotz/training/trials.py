@@ -258,6 +258,11 @@ class Fitter:
         every = (*self.offers, *self.loads)
         return [*self.always, *(name for offer in every if offer.name in taken for name in offer.numbers)]
 
+    def values_of(self, trial: Trial) -> dict[str, float]:
+        """The values of a trial by the names that its numbers have here, where other terms stand beside them."""
+        value = {trial.fitter.keys[name]: x for name, x in trial.values.items()}
+        return {name: value[key] for name, key in self.keys.items() if key in value}
+
     def fit(
         self, taken: Iterable[str], values: dict[str, float], length: int, before: Trial | None, most: int = ITERATIONS,
         states: Tensor | None = None,
