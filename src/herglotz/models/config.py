@@ -115,6 +115,9 @@ class ModelConfig:
     absent: tuple[str, ...] = ()
 
     def __post_init__(self):
+        for name, value in vars(self).items():
+            if isinstance(value, list):
+                object.__setattr__(self, name, tuple(value))  # so that a configuration can be a key
         self._check_sizes()
         self._check_forces()
         self._check_structure()

@@ -18,6 +18,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from herglotz.errors import InputError
 
@@ -52,6 +53,12 @@ def parse(text: str, angles: Sequence[bool]) -> Feature:
 
     InputError names the feature and the part of it that cannot be read.
     """
+    return _parsed(text, tuple(angles))
+
+
+@cache
+def _parsed(text: str, angles: tuple[bool, ...]) -> Feature:
+    """`parse` with a memory: a search builds hundreds of models from the same terms."""
     feature = _Reader(text, angles).feature()
     if len({bool(p.velocities) for p in feature}) > 1:
         raise InputError(f"feature '{text}': some products hold velocities and some do not; make two features of it")

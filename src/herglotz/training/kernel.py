@@ -70,12 +70,11 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
     like = next(model.parameters())
     if not plain or like.device.type != "cpu" or like.dtype != torch.float64:
         return None
-    whole = dictionary(config) or structure(config)
     try:
         compiler()
     except InputError:
         return None
-    kernel = _kernel(json.dumps(whole.to_dict(), sort_keys=True))
+    kernel = _kernel(_whole(config))
     if kernel is None:
         return None
     every = ParameterVector(model)
@@ -107,9 +106,15 @@ def structure(config: ModelConfig) -> ModelConfig:
 
 
 @cache
-def _kernel(config: str) -> Kernel | None:
+def _whole(config: ModelConfig) -> ModelConfig:
+    """The dictionary that holds a model, or the structure of the model where no dictionary does."""
+    return dictionary(config) or structure(config)
+
+
+@cache
+def _kernel(config: ModelConfig) -> Kernel | None:
     """The kernel of this structure; None where it is too large, or has an operation without a form in C."""
-    model = ContactLagrangian(ModelConfig.from_dict(json.loads(config)))
+    model = ContactLagrangian(config)
     if len(numbers_of(model)) > MAX_PARAMETERS:
         return None
     with suppress(InputError):
