@@ -13,7 +13,8 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian
-from herglotz.mechanics.newton import find_root, solve
+from herglotz.mechanics.linear import solve
+from herglotz.mechanics.newton import find_root
 from herglotz.scenes.special import as_step
 from herglotz.theory.continuous import Lagrangian
 
