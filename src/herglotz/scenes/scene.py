@@ -40,8 +40,8 @@ class Scene:
         Right and left discrete Hamiltonians of `L_d`, H⁺(q0, p1, s0, h) and H⁻(p0, q1, s1, h) with the conventions of
         errata E5 and E9; None where no closed form is known.
     q_range, v_range, h
-        Ranges of initial positions and velocities, and the step, of examples and generated data. A range (low, high) has
-        two numbers, or two tuples of `dof` numbers.
+        Ranges of initial positions and velocities, and the step, of examples and generated data. A range (low, high)
+        has two numbers, or two tuples of `dof` numbers.
     numerical
         The exact L_d by collocation (`herglotz.scenes.exact`), of a scene without a closed form.
     examples
