@@ -31,8 +31,8 @@ class ModelConfig:
     scale, speed
         (n,) typical sizes of q and v, in the units of the data.
     stiffness, tilt, rate
-        Starting values of the baseline: kᵢ (n,) [1/time²] and bᵢ (n,) [coordinate/time²] of V, where the first mass is
-        1, and the damping rate γ [1/time] (`docs/trajectory.md`, section 4).
+        Starting values of the baseline: kᵢ and bᵢ of V (n,), in units of 1/time² and of the coordinate over time² at a
+        first mass of 1, and the damping rate γ, in units of 1/time (`docs/trajectory.md`, section 4).
     potential_width, potential_depth
         Units and layers of the network in V; a width of 0 leaves a network out.
     damping_width
@@ -53,8 +53,8 @@ class ModelConfig:
     coulomb, sticking
         Dry friction of each joint beside viscous friction (forced); set-valued: a joint can stand still.
     inputs, input_map, input_zero
-        Number m of inputs; the map to forces, n · m numbers row by row [force/input, mass 1], learned if left out;
-        whether each input has a learned zero.
+        Number m of inputs; the map to forces, n · m numbers row by row in units of force (mass 1) over input, learned
+        if left out; whether each input has a learned zero.
     features, known
         Terms of L with learned coefficients, and known terms, as text (`herglotz.models.features`).
     alike, diagonal

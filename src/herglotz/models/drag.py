@@ -17,6 +17,7 @@ that changes with the position, or with the load that a position puts on a beari
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,15 +30,20 @@ from herglotz.models.term import with_force
 
 # Highest power of a speed or a position.
 MAX_POWER = 9
-_APART = r"v\d+ - v\d+"
-_NUMBER = r"\d+(?:\.\d*)?(?:e[-+]?\d+)?"
-_AT = rf"(?:(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
-_TEXT = re.compile(
-    rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
-    r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)|\|v(?P<even>\d+)\|"
-)
-_OF_SPEED = re.compile(rf"(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))\)")
-_DRY = re.compile(rf"{_AT} sgn\(v(?P<v>\d+)\)")
+_PAIR = r"v\d+ - v\d+"
+_SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
+_WAVE = r"(?P<wave>cos|sin)\((?:(?P<rate>\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?)?"
+_AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
+_TEXTS = [
+    re.compile(text)
+    for text in (
+        rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_PAIR})\| )?{_SPEED}(?:\^(?P<c>\d+))?",
+        rf"(?P<of_speed>){_WAVE}{_SPEED}\)",
+        rf"{_AT} sgn\((?P<dry>v\d+)\)",
+        r"load (?P<load>\d+)",
+        r"\|(?P<even>v\d+)\|",
+    )
+]
 AIR = "|v| v"
 
 
@@ -95,74 +101,36 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
 
     Raise InputError if the text is no friction force, or names a coordinate that the model does not have.
     """
-    plain = " ".join(text.split())
+    plain, n = " ".join(text.split()), len(angles)
     if plain == AIR:
         refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
         return DragFeature(0, 0, 0, 1, 1, air=True)
-    if (dry := _DRY.fullmatch(plain)) is not None:
-        return _parse_dry(text, dry.groupdict(), angles)
-    if (of_speed := _OF_SPEED.fullmatch(plain)) is not None:
-        return _parse_wave(text, of_speed.groupdict(), len(angles))
-    return _parse_power(text, plain, angles)
-
-
-def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
-    """A product of powers, or a constant force."""
-    match, n = _TEXT.fullmatch(plain), len(angles)
+    match = next(filter(None, (pattern.fullmatch(plain) for pattern in _TEXTS)), None)
     if match is None:
         raise InputError(
             f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1' or "
             "'cos(q1) sgn(v1)'"
         )
-    found = match.groupdict()
-    speed = found["v"] or found["apart"]
-    on, *of = (int(digits) for digits in re.findall(r"\d+", speed or found["load"] or found["even"]))
-    at, a, wave, rate = _position(text, found, on, angles)
-    c = 0 if speed is None else int(found["c"] or 1)
-    refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
-        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
-        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in (None, speed),
-        f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": speed and not (a <= MAX_POWER >= c >= 1),
-    })  # fmt: skip
-    b = int(found["size"] is not None or found["even"] is not None)
-    return DragFeature(on - 1, at - 1, a, b, c, of[0] - 1 if of else None, wave=wave, rate=rate)
-
-
-def _parse_wave(text: str, found: dict[str, str | None], n: int) -> DragFeature:
-    """A wave of a speed."""
-    on, *of = (int(digits) for digits in re.findall(r"\d+", found["v"] or found["apart"] or ""))
-    refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, *of)),
-        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
-    })  # fmt: skip
-    rate = float(found["rate"] or 1)
-    return DragFeature(
-        on - 1, on - 1, 0, 0, 0, of[0] - 1 if of else None, wave=found["wave"] or "", rate=rate, of_speed=True
-    )
-
-
-def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) -> DragFeature:
-    """Dry friction of a joint by the position of a coordinate."""
-    on, n = int(found["v"] or 1), len(angles)
-    at, a, wave, rate = _position(text, found, on, angles)
-    refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at)),
-        f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not wave and not 1 <= a <= MAX_POWER,
-    })  # fmt: skip
-    return DragFeature(on - 1, at - 1, a, 0, 0, dry=True, wave=wave, rate=rate)
-
-
-def _position(text: str, found: dict[str, str | None], on: int, angles: Sequence[bool]) -> tuple[int, int, str, float]:
-    """Number of the coordinate whose position the force depends on (`on` by default), the power, wave and rate."""
-    at, wave, rate = int(found["angle"] or found["q"] or on), found["wave"] or "", float(found["rate"] or 1)
-    a = int(found["a"] or 1) if found["q"] else 0
+    found = defaultdict(str, {name: part for name, part in match.groupdict().items() if part is not None})
+    of_speed, dry = "of_speed" in found, "dry" in found
+    speed = found["v"] or found["pair"]
+    on, *of = map(int, re.findall(r"\d+", speed or found["dry"] or found["load"] or found["even"]))
+    at = int(found["angle"] or found["q"] or on)
+    wave, rate = found["wave"], float(found["rate"] or 1)
+    a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
+    powers_fit = a <= MAX_POWER and (a >= 1 or bool(wave) if dry else 1 <= c <= MAX_POWER or not speed or of_speed)
     angle = any(angles[at - 1 : at])
     refuse({
         f"drag '{text}': a power of an angle is not periodic; write 'cos(q{at})' instead": a and angle,
-        f"drag '{text}': a wave of an angle is periodic; write a whole number before q{at}": angle and rate % 1,
+        f"drag '{text}': a wave of an angle is periodic; write a whole number before q{at}":
+            angle and rate % 1 and not of_speed,
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
+        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
+        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in ("", speed),
+        f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not powers_fit,
     })  # fmt: skip
-    return at, a, wave, rate
+    b, second = int(bool(found["size"] or found["even"])), of[0] - 1 if of else None
+    return DragFeature(on - 1, at - 1, a, b, c, second, dry=dry, wave=wave, rate=rate, of_speed=of_speed)
 
 
 class Drag(nn.Module):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from herglotz.errors import InputError
 from herglotz.mechanics import Forces
 from herglotz.models.config import ModelConfig
-from herglotz.models.jet import Jet, pairs
+from herglotz.models.jet import pairs
 from herglotz.models.term import Term
 
 # Starting widths v_s and v_st of dry friction, in typical speeds.
@@ -75,20 +75,10 @@ class Friction(nn.Module):
         """Return whether f is linear in v."""
         return not self.dry
 
-    def force(self, v: Tensor, u: Tensor | None) -> Jet:
-        """Return f (..., n) with ∂f_i/∂v_i as its only tangent; without u no input acts."""
-        x = Jet(torch.stack([v, torch.ones_like(v)]), 1, 1)
-        f = x * -self.viscous
-        if self.dry and not self.sticking:
-            smooth, stribeck = self.widths
-            slow = x * (1 / stribeck)
-            f = f - ((-(slow * slow)).exp() * self.breakaway + self.coulomb) * (x * (1 / smooth)).tanh()
-        return f if u is None else f + self.applied(u)
-
     def value_and_slope(self, v: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return f and ∂f_i/∂v_i, each (..., n), without a jet, for the iterations of a step."""
-        f, slope = -self.viscous * v, -self.viscous
-        if self.dry:
+        """Return f without set-valued friction, and ∂f_i/∂v_i, each (..., n); without u no input acts."""
+        f, slope = -self.viscous * v, (-self.viscous).expand_as(v)
+        if self.dry and not self.sticking:
             smooth, stribeck = self.widths
             x, rate = v / stribeck, 1 / smooth
             t, excess = (v * rate).tanh(), (-(x * x)).exp() * self.breakaway
@@ -105,9 +95,9 @@ class Friction(nn.Module):
 
         `more` is the position-dependent part of set-valued friction at q0, (..., n), and its slope, (..., n, n).
         """
-        f = self.force(v, u)
+        f, slope = self.value_and_slope(v, u)
         before, after = (c * h / 2)[..., None], (h / 2)[..., None]
-        minus, plus = before * f.value, after * f.value
+        minus, plus = before * f, after * f
         held, grip, grip_slope = None, None, torch.zeros_like(v)
         if self.dry and self.sticking:
             grip, grip_slope = self.grip(v, 0.0 if more is None else more[0])
@@ -117,7 +107,6 @@ class Friction(nn.Module):
         if order == 1:
             return Forces(minus, plus, held=held, grip=grip)
         # ∂f/∂q1 = slope / h
-        slope = f.gradient[0]
         minus_2 = torch.diag_embed((c / 2)[..., None] * slope - c[..., None] * grip_slope)
         minus_1 = -minus_2
         if more is not None and grip is not None:
