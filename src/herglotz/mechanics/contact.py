@@ -6,7 +6,6 @@ Tangent vectors of (q, p, s) are ordered q₁…q_n, p₁…p_n, s, so a map's d
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ def join(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
 
 
 def split(x: Tensor) -> Triple:
-    """Inverse of `join`."""
+    """(q, p, s) from one tensor (..., 2n+1), the inverse of `join`."""
     n = x.shape[-1] // 2
     return x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
 
@@ -37,12 +36,12 @@ def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[Triple
 
 
 def flow_derivatives(
-    flows: Iterable[Flow],  # Φ_1, Φ_2, …
+    flows: Iterable[Flow],  # (Φ_1, Φ_2, …)
     q: Tensor,
     p: Tensor,
     s: Tensor,
 ) -> list[tuple[Triple, Tensor]]:
-    """Values and derivatives of Φ_1, Φ_2∘Φ_1, …, as `flow_derivative` has them, with every map evaluated once."""
+    """Value and derivative of Φ_1, Φ_2∘Φ_1, … as `flow_derivative` returns them; every map is evaluated once."""
     found = []
     with torch.enable_grad():
         x = join(q, p, s).detach().requires_grad_()
@@ -54,15 +53,16 @@ def flow_derivatives(
 
 
 def jacobian(
-    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart
+    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), sample by sample
     x: Tensor,  # (..., m)
 ) -> tuple[Tensor, Tensor]:
-    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph where x or something inside f wants a gradient."""
+    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph if x or a parameter of f requires a gradient."""
     keep_graph = torch.is_grad_enabled() and (x.requires_grad or f(x).requires_grad)
     with torch.enable_grad():
         x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
         y = f(x)
-        if not y.requires_grad:  # a constant map
+        # Only a constant map has no graph here.
+        if not y.requires_grad:
             return y, y.new_zeros(*y.shape, x.shape[-1])
         J = _rows(y, x, keep_graph)
     return (y, J) if keep_graph else (y.detach(), J)
@@ -70,9 +70,11 @@ def jacobian(
 
 def _rows(y: Tensor, x: Tensor, create_graph: bool) -> Tensor:
     """∂y/∂x row by row, (..., k, m)."""
-    options: dict[str, Any] = {"retain_graph": True, "materialize_grads": True, "allow_unused": True}
-    options["create_graph"] = create_graph
-    return torch.stack([torch.autograd.grad(one.sum(), x, **options)[0] for one in y.unbind(-1)], -2)
+    rows = [
+        torch.autograd.grad(y_i.sum(), x, retain_graph=True, create_graph=create_graph, materialize_grads=True)[0]
+        for y_i in y.unbind(-1)
+    ]
+    return torch.stack(rows, -2)
 
 
 def contact_defect(

@@ -1,4 +1,4 @@
-"""The derivatives of `herglotz.mechanics.partials` by `torch.func`: for `vmap`, Jacobians by parameters, and traces."""
+"""The derivatives of L_d by `torch.func`, where autograd cannot go: inside `vmap`, Jacobians by parameters, traces."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def functional_partials(
     h: Tensor,  # () or (...)
     order: int = 1,
 ) -> Partials:
-    """Return what `autograd_partials` does, by function transforms, which nest: (...) may be a sample inside `vmap`.
+    """Return the result of `autograd_partials` by function transforms, which nest: (...) may be a sample in `vmap`.
 
-    Samples do not interact, so that one product with the Jacobian of the batch is the batch of gradients; second
-    derivatives are 2n + 1 products with the Jacobian of these. L_d must be a pure function of tensors.
+    Samples do not interact, so one product with the Jacobian of the batch is the batch of gradients. The second
+    derivatives are 2n + 1 products with the Jacobian of the gradients. L_d must be a pure function of tensors.
     """
     q0, q1, s, steps = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
     xs, h = (q0, q1, s[..., 0]), steps[..., 0]
@@ -47,7 +47,7 @@ def functional_partials(
 
 
 def _rows(function: Callable[..., tuple[Tensor, Any]], xs: tuple[Tensor, ...]) -> tuple[Tensor, list[Tensor], Any]:
-    """The value y (..., m), ∂y/∂x of every x (..., m, *), and what else the function gives."""
+    """The value y (..., m), ∂y/∂x of every x (..., m, *), and the function's second result."""
     y, pull, rest = cast(Any, vjp(function, *xs, has_aux=True))
     units = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
     rows = [pull(unit.expand(y.shape)) for unit in units.unbind()]
@@ -60,7 +60,8 @@ def _forces(L_d: Forced, xs: tuple[Tensor, Tensor, Tensor], h: Tensor, order: in
     if found is None or order == 1:
         return None if found is None else Forces(*found)
 
-    def both(*x: Tensor) -> tuple[Tensor, tuple[()]]:  # torch.func takes no None beside a result
+    # The second result is an empty tuple: torch.func accepts no None there.
+    def both(*x: Tensor) -> tuple[Tensor, tuple[()]]:
         return torch.cat(cast(Any, L_d).forces(*x, h), -1), ()
 
     n = xs[0].shape[-1]

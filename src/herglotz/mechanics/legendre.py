@@ -48,12 +48,12 @@ def herglotz_residual(
     q1: Tensor,  # (..., n) q_k
     q2: Tensor,  # (..., n) q_{k+1}
     s0: Tensor,  # (...) s_{k−1}
-    h0: Tensor | float,  # t_k − t_{k−1}
-    h1: Tensor | float,  # t_{k+1} − t_k
+    h0: Tensor | float,  # () or (...) t_k − t_{k−1}
+    h1: Tensor | float,  # () or (...) t_{k+1} − t_k
 ) -> Tensor:
     """R_k = D1 L_d(q_k, q_{k+1}, s_k) + c_k D2 L_d(q_{k−1}, q_k, s_{k−1}), with s_k = s_{k−1} + L_d; (..., n).
 
-    In units of momentum, and zero along discrete trajectories.
+    R_k has the unit of momentum and is zero along discrete trajectories.
 
     Source: discrete Herglotz equations; indices by erratum E3.
     """
@@ -65,7 +65,7 @@ def herglotz_residual(
 def momentum_residual(P: Partials, p0: Tensor) -> Tensor:
     """F = D1 + c p0 (+ F⁻), the equation that a step solves for q1; shape (..., n).
 
-    Where dry friction holds a coordinate, F⁻ is a set, and F is the distance from it: 0 where friction suffices.
+    Where dry friction holds a coordinate, F⁻ is a set and F is the distance from this set: 0 if friction suffices.
     """
     F = unheld_residual(P, p0)
     held = None if P.force is None else P.force.held
@@ -73,7 +73,7 @@ def momentum_residual(P: Partials, p0: Tensor) -> Tensor:
 
 
 def soft_threshold(x: Tensor, bound: Tensor) -> Tensor:
-    """Soft thresholding x − clamp(x, −bound, bound), what x has beyond ±bound: 0 between, with derivative 0."""
+    """Soft thresholding x − clamp(x, −bound, bound): the part of x beyond ±bound. Value and slope are 0 between."""
     below = torch.where(x > bound, bound, x)
     return x - torch.where(-bound > below, -bound, below)
 
@@ -81,7 +81,7 @@ def soft_threshold(x: Tensor, bound: Tensor) -> Tensor:
 def momentum_jacobian(P: Partials, p0: Tensor) -> Tensor:
     """J = ∂F/∂q1 = D1D2 + p0 ⊗ D2D3 (+ ∂F⁻/∂q1), shape (..., n, n). Equal to M where F = 0. Needs order 2.
 
-    A coordinate that dry friction holds keeps to Δ = q1 − q0 = 0; its row is that equation's, times J's diagonal.
+    A coordinate that dry friction holds obeys Δ = q1 − q0 = 0 instead; its row is e_i, scaled by J's diagonal.
     """
     J = unheld_jacobian(P, p0)
     held = None if P.force is None else P.force.held
@@ -89,13 +89,13 @@ def momentum_jacobian(P: Partials, p0: Tensor) -> Tensor:
 
 
 def unheld_residual(P: Partials, p0: Tensor) -> Tensor:
-    """F with no impulse of what dry friction holds; shape (..., n)."""
+    """F without the impulse of dry friction on coordinates at rest; shape (..., n)."""
     F = P.D1 + P.c[..., None] * p0
     return F if P.force is None else F + P.force.minus
 
 
 def unheld_jacobian(P: Partials, p0: Tensor) -> Tensor:
-    """∂F/∂q1 of the same, (..., n, n)."""
+    """∂F/∂q1 of `unheld_residual`, (..., n, n)."""
     J = P.D12 + p0[..., :, None] * P.D23[..., None, :]
     return J if P.force is None else J + P.force.minus_2
 

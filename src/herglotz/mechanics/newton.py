@@ -1,7 +1,7 @@
-"""Newton's iteration with backtracking, batched: the only such loop, for every equation of this package.
+"""Newton's iteration with backtracking, batched: the package's only Newton loop.
 
 Samples do not influence each other: every sample has its own Jacobian, its own fraction of a step and its own end. A
-single sample may take the same loop with Python's floats in place of tensors (...): small tensors cost the most there.
+single sample may take the same loop with Python floats in place of tensors (...), which are slow for one number.
 """
 
 from __future__ import annotations
@@ -14,16 +14,22 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-Jacobian = Any  # a matrix (..., m, m), or a tuple of tensors (..., *) for the solver of the rules
+from herglotz.mechanics.linear import solve
+
+# A matrix (..., m, m), or a tuple of tensors (..., *) that `Rules.solver` understands.
+Jacobian = Any
 Solver = Callable[[Jacobian, Tensor], Tensor]  # (J, F) → J⁻¹F, not finite where J is singular
 
 
 class Point(NamedTuple):
-    """An equation at a trial."""
+    """An equation F(x) = 0 evaluated at a trial x.
+
+    J is ∂F/∂x, or None if the iteration did not ask for it; `rest` is returned with the solution.
+    """
 
     F: Tensor  # (..., m)
-    J: Jacobian  # ∂F/∂x; None if the iteration did not ask for ∂F/∂x
-    rest: Any = None  # further results of the equation, returned at the solution
+    J: Jacobian
+    rest: Any = None
 
 
 class Equation(Protocol):
@@ -34,58 +40,20 @@ class Equation(Protocol):
         ...
 
 
-# Batches of larger matrices are solved one by one: torch 2.13 hands each to a thread of its own, where the LU
-# decomposition of oneMKL, from 190 rows on, never ends or says that a parameter of its own was wrong.
-AT_ONCE = 128
-Number = Any  # (...) a number for each sample; a float for a sample that is `alone`
-# The size of the unknown and the size below which a move is rounding, from x, the first point and |J⁻¹F|.
+Number = Any  # (...) or a float for a sample that is iterated `alone`
+# (x, first point, |J⁻¹F|) → the size of the unknown and the size below which a move is rounding.
 Sizes = Callable[[Tensor, Point, Number], tuple[Number, Number]]
 
 
 def largest(x: Tensor) -> Tensor:
-    """The largest component, (..., m) → (...)."""
+    """The largest absolute component, (..., m) → (...); 0 for m = 0."""
     if x.shape[-1] == 1:
         return x[..., 0].abs()
     return x.abs().amax(-1) if x.shape[-1] else x.sum(-1)
 
 
-def solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """matrix⁻¹ vector without an exception: inf or nan where the matrix is singular; written out for n ≤ 2."""
-    n = matrix.shape[-1]
-    if n == 1:
-        return vector / matrix[..., 0]
-    if n == 2:
-        return _eliminate(matrix, vector)
-    return solve_columns(matrix, vector[..., None])[..., 0]
-
-
-def solve_columns(matrix: Tensor, columns: Tensor) -> Tensor:
-    """matrix⁻¹ columns, (..., n, k), likewise."""
-    n = matrix.shape[-1]
-    if n == 1:
-        return columns / matrix
-    if n <= AT_ONCE or matrix.ndim == 2 or matrix.device.type != "cpu" or torch.get_num_threads() == 1:
-        return torch.linalg.solve_ex(matrix, columns)[0]
-    every = torch.broadcast_shapes(matrix.shape[:-2], columns.shape[:-2])
-    pairs = zip(*(x.expand(*every, *x.shape[-2:]).flatten(0, -3) for x in (matrix, columns)), strict=True)
-    return torch.stack([torch.linalg.solve_ex(a, b)[0] for a, b in pairs]).unflatten(0, every)
-
-
-def _eliminate(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Gauss with a row exchange, for n = 2."""
-    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
-    x, y = vector.unbind(-1)
-    swap = c.abs() > a.abs()
-    a, c = torch.where(swap, c, a), torch.where(swap, a, c)
-    b, d = torch.where(swap, d, b), torch.where(swap, b, d)
-    x, y = torch.where(swap, y, x), torch.where(swap, x, y)
-    factor = c / a
-    y = (y - factor * x) / (d - factor * b)
-    return torch.stack([(x - b * y) / a, y], -1)
-
-
 def attached(x: Tensor, J: Tensor, F: Tensor) -> Tensor:
-    """A solved x with its derivative: a Newton step of value 0 and slope dx = −J⁻¹ dF; F has the graph."""
+    """The solved x with its derivative: a Newton step of value 0 and slope dx = −J⁻¹ dF; F carries the graph."""
     return x - solve(J, F - F.detach())
 
 
@@ -93,56 +61,69 @@ def attached(x: Tensor, J: Tensor, F: Tensor) -> Tensor:
 class Rules:
     """The rules of an iteration.
 
-    A move is accepted if |F| falls or, with `natural`, if the simplified Newton step J(x)⁻¹F(x + λδ) is shorter than δ,
-    a test that does not depend on the units of F. Any other move is halved.
+    A move is accepted if |F| falls or, with `natural`, if the simplified Newton step J(x)⁻¹F(x + λδ) is shorter than δ:
+    the natural test does not depend on the units of F. Any other move is halved.
+
+    A sample has converged when its next move is shorter than `tol` times its size, and is given up when its fraction of
+    a step falls below `shortest`. With `keep` a Jacobian of an earlier iteration serves near the solution, where trials
+    then need first derivatives only. `solver` replaces `solve`, and `length` measures moves.
     """
 
-    tol: float  # a sample has converged when its next move is below this times its size
+    tol: float
     max_iterations: int
-    keep: bool = False  # near the solution an old Jacobian serves, and costs first derivatives only
+    keep: bool = False
     natural: bool = False
-    shortest: float = 0.0  # a direction of which no larger fraction helps is none, and its sample is given up
-    solver: Solver | None = None  # default `solve`
-    length: Callable[[Tensor], Tensor] = largest  # of a move
+    shortest: float = 0.0
+    solver: Solver | None = None
+    length: Callable[[Tensor], Tensor] = largest
 
 
-# Share of the size of x: a move below this converges fast enough with the Jacobian of the last iteration.
-NEAR = 1e-3
-CONTRACTION = 0.05  # an old Jacobian that gains less than this per iteration is replaced
-ARMIJO = 1e-4  # |F| must fall by this share of what a linear equation would lose
-NATURAL = 0.25  # the simplified Newton step by this share
+# Moves below this share of the size of x converge fast enough with the Jacobian of an earlier iteration.
+MAX_MOVE_FOR_OLD_JACOBIAN = 1e-3
+# An old Jacobian is replaced if a move leaves more than this share of the last move's length.
+MAX_CONTRACTION_OF_OLD_JACOBIAN = 0.05
+# Armijo's test: |F| must fall by this share of the decrease of a linear equation.
+ARMIJO = 1e-4
+# The natural test: the simplified Newton step must be shorter than δ by this share of the fraction λ.
+NATURAL = 0.25
 
 
 class Found(NamedTuple):
-    """Where an iteration ended."""
+    """The end of an iteration.
+
+    `point` is the equation at x, unless the samples accepted different trials (`mixed`). `healthy` is True for a single
+    sample that is done with finite numbers, and False where nothing is known. J is the Jacobian at x, or an earlier
+    one that still converges.
+    """
 
     x: Tensor  # (..., m)
-    point: Point  # the equation at x, unless `mixed`
+    point: Point
     merit: Tensor  # (...) |F|
     residual: Tensor  # (...) |J⁻¹F|
-    done: Tensor  # (...) converged, stalled at rounding or given up; without, the iterations ran out
+    done: Tensor  # (...) converged, stalled at rounding or given up; False: the iterations ran out
     iterations: int
-    healthy: bool  # True for a single sample that is done with finite numbers; False if that is not known
-    floor: Tensor | float = 0.0  # (...) see `Sizes`
-    J: Jacobian = None  # at x, or an older Jacobian that still serves
-    move: Tensor | None = None  # (..., m) −J⁻¹F, which was not taken any more
-    mixed: bool = False  # the samples' last trials differ, so that `point` belongs to no trial
+    healthy: bool
+    floor: Tensor | float = 0.0  # (...) the second of `Sizes`
+    J: Jacobian = None
+    move: Tensor | None = None  # (..., m) −J⁻¹F, the move that was not made
+    mixed: bool = False
 
 
 class _Here(NamedTuple):
-    """Where the samples are, and Newton's step from there."""
+    """The samples' places and Newton's step from there."""
 
     x: Tensor  # (..., m)
     point: Point
     J: Jacobian
     delta: Tensor | float  # (..., m) −J⁻¹F
-    merit: Number  # |F|
-    residual: Number  # |J⁻¹F|
+    merit: Number  # (...) |F|
+    residual: Number  # (...) |J⁻¹F|
 
 
 def _moved(here: _Here, trial: _Here, accept: Number, refused: bool, alone: bool) -> tuple[_Here, bool]:
     """The accepted trial of each sample, and whether samples accepted different trials."""
-    if not refused:  # a done sample's trial is its own x: nothing to select
+    # The trial of a sample that is done is its own x, so nothing is selected where no trial is refused.
+    if not refused:
         return trial, False
     if alone:
         return here, False
@@ -157,33 +138,39 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
     """
     here = _evaluate(equation, x, rules, alone)
     scale, floor = sizes(x, here.point, here.residual)
-    tiny, near = rules.tol * scale, NEAR * scale
-    # A direction that is not finite can never be followed: the sample ends, and costs its neighbours nothing.
+    tiny, near = rules.tol * scale, MAX_MOVE_FOR_OLD_JACOBIAN * scale
+    # A sample whose direction is not finite ends at once, and costs its neighbours nothing.
     going = (here.residual > tiny) & (here.residual < inf)
-    fraction: Number = None  # every sample takes full steps
-    slow: Number = False  # samples whose old Jacobian no longer serves
-    stale: Number = False  # samples whose last move used an old Jacobian
-    back: Number = False  # samples that a stale move misled: these take no step, but a new Jacobian at x
+    # While `fraction` is None every sample takes full steps.
+    fraction: Number = None
+    # Samples whose old Jacobian converges too slowly, samples whose last move used an old Jacobian, and samples that
+    # such a move misled: the last make no move, but get a new Jacobian at x.
+    slow: Number = False
+    stale: Number = False
+    back: Number = False
     mixed, iterations = False, 0
     while iterations < rules.max_iterations and _any(going):
-        if not rules.natural or _any(here.residual > floor):  # the last digits are not counted
+        # With the natural test, iterations that only settle the last digits are not counted.
+        if not rules.natural or _any(here.residual > floor):
             iterations += 1
         move = here.delta if fraction is None else (fraction if alone else fraction[..., None]) * here.delta
-        # At a trial that may be far off, the Jacobian is wanted as well.
+        # A trial that may be far from the solution needs a Jacobian of its own.
         fresh = going & (here.residual > near) | slow | back if rules.keep else True
         move = move if alone else torch.where(going[..., None], move, 0.0)
         trial = _evaluate(equation, here.x + move, rules, alone, here.J, fresh)
         settled = trial.residual <= tiny
         better = _falls(rules, here, trial, 1.0 if fraction is None else fraction) | settled
-        stalled = _not(better) & (here.residual <= floor)  # rounding, not a wrong direction
+        # Below the floor a refused move means rounding, not a wrong direction.
+        stalled = _not(better) & (here.residual <= floor)
         if rules.keep:
             still = _not(fresh | settled) & going & (trial.residual < inf)
-            slow = still & (trial.residual > CONTRACTION * here.residual)
+            slow = still & (trial.residual > MAX_CONTRACTION_OF_OLD_JACOBIAN * here.residual)
             better = better | (slow & _not(stalled) & (trial.merit <= here.merit))
         accept = better & going
         refused = going & _not(better)
         going = going & _not(settled | stalled)
-        if rules.natural:  # this test may accept a trial where J is singular
+        # The natural test may accept a trial where J is singular.
+        if rules.natural:
             going = going & _not(accept & _not(trial.residual < inf))
         here, mixed = _moved(here, trial, accept, _any(refused), alone)
         if fraction is not None or _any(refused):
@@ -204,7 +191,7 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
 def _evaluate(
     equation: Equation, x: Tensor, rules: Rules, alone: bool, J: Jacobian = None, fresh: Number = True
 ) -> _Here:
-    """The equation at x; if the rules keep Jacobians, samples that are not `fresh` have J."""
+    """The equation at x; if the rules keep Jacobians, samples that are not `fresh` keep J."""
     second = not rules.keep or _any(fresh)
     point = equation(x, second)
     if second:
@@ -216,7 +203,7 @@ def _evaluate(
 
 
 def _next(fraction: Number, accept: Number, natural: bool, like: Number) -> Number:
-    """The fractions of the next move: half after a refused trial, 1 or twice the fraction after an accepted trial."""
+    """The fractions of the next move: half after a refused trial, else 1 or, with `natural`, twice the fraction."""
     if isinstance(accept, bool):
         return 1.0 if accept else (fraction or 1.0) / 2
     fraction = torch.ones_like(like) if fraction is None else fraction
@@ -224,7 +211,7 @@ def _next(fraction: Number, accept: Number, natural: bool, like: Number) -> Numb
 
 
 def _falls(rules: Rules, here: _Here, trial: _Here, fraction: Number) -> Number:
-    """In which samples a trial passes the test of descent."""
+    """(...) bool: the samples in which a trial passes the test of descent."""
     if rules.natural:
         solver = rules.solver or solve
         return rules.length(solver(here.J, trial.point.F)) <= (1 - NATURAL * fraction) * here.residual
@@ -240,7 +227,7 @@ def _not(mask: Number) -> Number:
 
 
 def _found_alone(here: _Here, done: bool, iterations: int) -> Found:
-    """The end of a sample that was iterated alone, its floats as tensors."""
+    """The end of a sample that was iterated alone, with tensors in place of floats."""
     shape, healthy = here.x.shape[:-1], done and isfinite(here.merit + here.residual)
     merit, residual = here.x.new_full(shape, here.merit), here.x.new_full(shape, here.residual)
     flag = torch.full(shape, done, device=here.x.device)
@@ -263,7 +250,7 @@ def newton_step(J: Tensor, F: Tensor) -> tuple[Tensor | float, float, float]:
 
 
 def _eliminate_numbers(a: float, b: float, c: float, d: float, x: float, y: float) -> list[float]:
-    """−(a b; c d)⁻¹ (x, y), Gauss with a row exchange."""
+    """−(a b; c d)⁻¹ (x, y), Gaussian elimination with a row exchange."""
     if abs(c) > abs(a):
         a, b, c, d, x, y = c, d, a, b, y, x
     if not a:
@@ -277,12 +264,12 @@ def _eliminate_numbers(a: float, b: float, c: float, d: float, x: float, y: floa
 
 
 def norm(values: list[float]) -> float:
-    """The largest absolute value, NaN if any entry is NaN."""
+    """The largest absolute value; NaN if an entry is NaN."""
     return nan if any(v != v for v in values) else max(map(abs, values), default=0.0)
 
 
 def select(mask: Tensor, a: Any, b: Any) -> Any:
-    """The tensor a, or each of a tuple, in the samples of the mask (...), b in the others."""
+    """The tensor a, or every tensor of a tuple a, in the samples of the mask (...), and b in the others."""
     if isinstance(a, tuple):
         return tuple(select(mask, *pair) for pair in zip(a, b, strict=True))
     return torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
@@ -290,7 +277,8 @@ def select(mask: Tensor, a: Any, b: Any) -> Any:
 
 # Ends an iteration that neither converges nor fails.
 MAX_ITERATIONS = 50
-SHORTEST = 1e-6  # twenty halvings: no direction of descent
+# Twenty halvings of a step without success: the direction is no direction of descent.
+SHORTEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -301,28 +289,28 @@ class Root:
     converged: Tensor  # (...) bool
     error: Tensor  # (...) last |J⁻¹F| in units of the scale; inf or nan where J is singular
     iterations: int
-    J: Jacobian  # at x
+    J: Jacobian  # (..., m, m) at x
     move: Tensor  # (..., m) the next move, −J⁻¹F: x + move is exact to the square of the error
 
     @property
     def solved(self) -> Tensor:
-        """(..., m) x, NaN in the samples that did not converge."""
+        """(..., m) x, with NaN in the samples that did not converge."""
         return torch.where(self.converged[..., None], self.x, torch.nan)
 
     def with_slope(self, F: Callable[[Tensor], Tensor]) -> Tensor:
-        """(..., m) x with its derivative where gradients are on; F(x), 0 at the solution, has the graph."""
+        """(..., m) x with its derivative where gradients are on; F(x), 0 at the solution, carries the graph."""
         return attached(self.x, self.J, F(self.x)) if torch.is_grad_enabled() else self.x
 
 
 def find_root(
-    equations: Callable[[Tensor], tuple[Tensor, Jacobian]],  # x (..., m) → F (..., m) and its Jacobian
+    equations: Callable[[Tensor], tuple[Tensor, Jacobian]],  # (..., m) x → F (..., m) and its Jacobian
     guess: Tensor,  # (..., m)
-    scale: Tensor | None = None,  # (..., m) size of every unknown; default that of the largest at the start
+    scale: Tensor | None = None,  # (..., m) size of every unknown; by default that of the largest at the start
     solver: Solver | None = None,
     iterations: int = MAX_ITERATIONS,
-    tol: float | None = None,  # default rounding
+    tol: float | None = None,
 ) -> Root:
-    """Solve F(x) = 0 from `guess`, without a graph, to rounding; the test of a move is the natural one.
+    """Solve F(x) = 0 from `guess` by the natural test, without a graph, to `tol` (by default to rounding).
 
     A sample has converged when its residual is rounding, or when a move below eps^(2/3) of `scale` lowers the residual
     no further. A sample that is singular, not finite or makes no progress is given up.
@@ -333,7 +321,8 @@ def find_root(
     unit = None if scale is None else torch.where(scale > 0, scale, 1.0)
 
     def sizes(x: Tensor, _: Point, left: Tensor) -> tuple[Tensor, Tensor]:
-        size = torch.ones_like(left)  # moves are measured in the scale
+        # With a scale, moves are measured in its units.
+        size = torch.ones_like(left)
         if unit is None:
             size = torch.maximum(largest(x), torch.nan_to_num(left, nan=0.0, posinf=0.0))
             size = torch.where(size > 0, size, 1.0)

@@ -1,8 +1,8 @@
 """Derivatives of a discrete contact Lagrangian, through one door.
 
-A discrete Lagrangian is any callable `L_d(q0, q1, s0, h) -> (...)`. One that also has a method
-`partials(q0, q1, s0, h, order)` (every learnable model has) supplies closed forms; for the others `partials`
-differentiates with autograd. No other module calls autograd on a Lagrangian.
+A discrete Lagrangian is any callable `L_d(q0, q1, s0, h) -> (...)`. If L_d has a method
+`partials(q0, q1, s0, h, order)`, as every learnable model has, the method supplies the derivatives; otherwise autograd
+does. No other module calls autograd on a Lagrangian.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Forced(Protocol):
 
 @runtime_checkable
 class Driven(Protocol):
-    """A family of discrete Lagrangians L_d^k: time-dependent, or with an input u_k (a motor's torque) at each step."""
+    """A family of discrete Lagrangians L_d^k, one for each input u_k, such as a motor's torque in step k."""
 
     def at(self, u: Tensor, /) -> DiscreteLagrangian:
         """The discrete Lagrangian of a step whose input is u, (..., m)."""
@@ -53,7 +53,7 @@ class ClosedForm(Protocol):
         ...
 
 
-# Stands for a derivative that was not asked for: None, which fails at first use.
+# A derivative that was not asked for is None, which fails at first use.
 ABSENT: Tensor = cast(Tensor, None)
 
 
@@ -61,7 +61,8 @@ ABSENT: Tensor = cast(Tensor, None)
 class Forces:
     """Discrete forces at (q0, q1, s0), in units of momentum; derivatives only when order 2 was asked for.
 
-    They change the momenta, p_k = −(D1 + F⁻)/c and p_{k+1} = D2 + F⁺ (trap 4 of `docs/mathematics.md`), not the action.
+    Forces change the momenta, p_k = −(D1 + F⁻)/c and p_{k+1} = D2 + F⁺ (trap 4 of `docs/mathematics.md`), not the
+    action.
     """
 
     minus: Tensor  # (..., n) F⁻
@@ -72,26 +73,26 @@ class Forces:
     plus_1: Tensor = ABSENT  # (..., n, n) ∂F⁺/∂q0
     plus_2: Tensor = ABSENT  # (..., n, n) ∂F⁺/∂q1
     plus_3: Tensor = ABSENT  # (..., n) ∂F⁺/∂s0
-    # (..., n) the impulse that dry friction can hold where a coordinate stands still (q1 = q0), 0 where it slides:
-    # F⁻ then is any value between minus − held and minus + held. None: no friction is set-valued.
-    held: Tensor | None = None
-    grip: Tensor | None = None  # (..., n) the same where it slides too: the size of dry friction's part of F⁻
+    # The largest impulse of dry friction on a coordinate at rest (q1 = q0), where F⁻ is any value between minus − held
+    # and minus + held; 0 where the coordinate slides. None: no friction is set-valued.
+    held: Tensor | None = None  # (..., n)
+    grip: Tensor | None = None  # (..., n) size of dry friction's part of F⁻, of coordinates that slide too
 
     def weighted(self, P: Partials) -> Forces:
-        """Return the same with (1 + D3) F⁻ in the place of F⁻, as a step of order 2 has it where c depends on s."""
+        """Return these forces with (1 + D3) F⁻ in place of F⁻, the weight of order 2 where c depends on s."""
         minus, c = self.minus, P.c[..., None]
         if P.D11 is ABSENT:
             return replace(self, minus=c * minus)
-        by = lambda own, more: c[..., None] * own + minus[..., :, None] * more[..., None, :]  # noqa: E731
+        product = lambda dF, dc: c[..., None] * dF + minus[..., :, None] * dc[..., None, :]  # noqa: E731
         return replace(
-            self, minus=c * minus, minus_1=by(self.minus_1, P.D13), minus_2=by(self.minus_2, P.D23),
+            self, minus=c * minus, minus_1=product(self.minus_1, P.D13), minus_2=product(self.minus_2, P.D23),
             minus_3=c * self.minus_3 + minus * P.D33[..., None],
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Partials:
-    """Value and partial derivatives of L_d at (q0, q1, s0); second derivatives only when order 2 was asked for."""
+    """Value and partial derivatives of L_d at (q0, q1, s0), and its forces; second derivatives only at order 2."""
 
     L: Tensor  # (...)
     D1: Tensor  # (..., n)    ∂L/∂q0
@@ -103,7 +104,7 @@ class Partials:
     D13: Tensor = ABSENT  # (..., n)
     D23: Tensor = ABSENT  # (..., n)
     D33: Tensor = ABSENT  # (...)
-    force: Forces | None = None  # only where the Lagrangian comes with forces
+    force: Forces | None = None
 
     @property
     def c(self) -> Tensor:
@@ -111,13 +112,13 @@ class Partials:
         return 1.0 + self.D3
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Partials:
-        """`change` applied to every tensor."""
+        """Return the record with `change` applied to every tensor, those of the forces included."""
         return _map(self, change)
 
 
 def _map(record: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    known = {name: value for name, value in vars(record).items() if value is not None}
-    return type(record)(**{k: _map(x, change) if isinstance(x, Forces) else change(x) for k, x in known.items()})
+    present = {name: value for name, value in vars(record).items() if value is not None}
+    return type(record)(**{k: _map(x, change) if isinstance(x, Forces) else change(x) for k, x in present.items()})
 
 
 def partials(
@@ -130,16 +131,16 @@ def partials(
 ) -> Partials:
     """Value, gradient (D1, D2, D3 L_d) and, at order 2, Hessian blocks of L_d.
 
-    p0 = −D1 L_d / (1 + D3 L_d) and p1 = D2 L_d follow (section 1 of `docs/mathematics.md`).
-    Uses the closed form of L_d where it has one and autograd where it has not; both are differentiable again with
-    respect to the arguments and the parameters.
+    p0 = −D1 L_d / (1 + D3 L_d) and p1 = D2 L_d follow (section 1 of `docs/mathematics.md`). The derivatives come from
+    the `partials` method of L_d, or from autograd without such a method. Both are differentiable again with respect to
+    the arguments and the parameters.
 
     Parameters
     ----------
     L_d
         The discrete Lagrangian L_d(q0, q1, s0, h), which returns (...) numbers in units of action.
     q0, q1
-        (..., n) position and next position, in the units of L_d, as all that follows.
+        (..., n) position and next position, in the units of L_d.
     s0
         (...) action variable, in the unit of L_d.
     h
@@ -150,7 +151,7 @@ def partials(
     Returns
     -------
     Partials
-        D1 and D2 (..., n), D3 (...), and blocks such as D12 (..., n, n), in units of action over those of
+        D1 and D2 (..., n), D3 (...), and blocks such as D12 (..., n, n), in units of action over the units of
         the arguments; second derivatives are None at order 1.
 
     Raises
@@ -158,7 +159,7 @@ def partials(
     ValueError
         If `order` is neither 1 nor 2.
     InputError
-        If an argument is no tensor of positions or actions, or L_d is no function that returns a number a sample.
+        If an argument has the wrong type or shape, or L_d does not return one number for every sample.
     """
     if order not in (1, 2):
         raise ValueError(f"order must be 1 or 2, got {order}")
@@ -185,7 +186,7 @@ def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor
 
 
 def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] = ("q0", "q1", "s0")) -> None:
-    """Refuse what is no tensor, and positions without a last axis for the coordinates."""
+    """Raise InputError for an argument that is no tensor, or positions without a last axis for the coordinates."""
     for name, x in zip(names, (q0, q1, s0), strict=True):
         if not isinstance(x, Tensor):
             raise InputError(f"{name} must be a tensor, got a {type(x).__name__}; {REMEDY}")
@@ -206,39 +207,39 @@ def called(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tenso
         if "positional argument" not in str(error) or _takes_four(L_d):
             raise
         raise InputError(
-            f"{_name(L_d)} must take four arguments, L_d(q0, q1, s0, h): {error}; add those that are missing, and "
+            f"{_name(L_d)} must take four arguments, L_d(q0, q1, s0, h): {error}; add the missing arguments, and "
             "0 * s0 where nothing depends on s"
         ) from None
 
 
 def _takes_four(L_d: Any) -> bool:
-    """Whether a function can be called with four arguments by position; True where that is not known."""
+    """Whether a function accepts four arguments by position; True for a function without a signature."""
     try:
         signature(L_d.forward if isinstance(L_d, torch.nn.Module) else L_d).bind(*range(4))
     except TypeError:
         return False
-    except ValueError:  # of a function without a signature
-        return True
+    except ValueError:
+        pass
     return True
 
 
 def checked(L_d: Any, L: Any, like: Tensor) -> Tensor:
-    """L, if L_d returned a number a sample: a shape that only broadcasts would step to a wrong number in silence.
+    """L, if L is a tensor of the shape (...) of `like`; otherwise raise InputError.
 
-    Raise InputError if L is no tensor or has not the shape (...) of `like`.
+    A shape that only broadcasts would step to a wrong number in silence.
     """
     if isinstance(L, Tensor) and L.shape == like.shape:
         return L
     name = _name(L_d)
     got = f"shape {tuple(L.shape)}" if isinstance(L, Tensor) else f"a {type(L).__name__}"
     raise InputError(
-        f"{name} returned {got} where {tuple(like.shape)}, a number a sample, belongs; "
+        f"{name} returned {got} where {tuple(like.shape)}, one number per sample, belongs; "
         "sum over coordinates with .sum(-1), and add 0 * s0 where nothing depends on a sample"
     )
 
 
 def _check_alone(L_d: Any, L: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> None:
-    """Refuse an L_d whose first sample hangs on the steps of others: (q1 − q0) / h pairs samples of a batch of h."""
+    """Raise InputError if the first sample depends on the h of other samples, as with (q1 − q0) / h."""
     if L.numel() < 2:
         return
     first = (0,) * L.ndim
@@ -261,9 +262,9 @@ def _name(L_d: Any) -> str:
 def autograd_partials(
     L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1
 ) -> Partials:
-    """The same as `partials`, always by autograd: the slow twin that closed forms are tested against.
+    """Return the result of `partials`, always by autograd: the slow twin that closed forms are tested against.
 
-    Batched by the batch-sum trick: samples do not interact, so the gradient of the sum is the batch of gradients.
+    Samples do not interact, so the gradient of the sum over samples is the batch of gradients.
     """
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     q0, q1, s0, _ = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
@@ -298,7 +299,7 @@ def autograd_partials(
 def _autograd_forces(
     forces: tuple[Tensor, Tensor], xs: tuple[Tensor, Tensor, Tensor], order: int, keep_graph: bool
 ) -> Forces:
-    """F⁻ and F⁺ with their derivatives by rows."""
+    """F⁻ and F⁺, with their derivatives at order 2."""
     minus, plus = forces
     if order == 1:
         return Forces(minus, plus)
@@ -306,14 +307,14 @@ def _autograd_forces(
 
 
 def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> bool:
-    """Whether a result should carry a graph: an argument wants a gradient, or a parameter inside L_d does."""
+    """Whether the result carries a graph: an argument or a parameter inside L_d requires a gradient."""
     if q0.requires_grad or q1.requires_grad or s0.requires_grad:
         return True
     return checked(L_d, called(L_d, q0, q1, s0, h), s0).requires_grad
 
 
 def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor, ...]:
-    """Gradient of y.sum(); zeros where y does not depend on an argument."""
+    """Gradient of y.sum() by every x; zeros for an x that y does not depend on."""
     if not y.requires_grad:
         return tuple(torch.zeros_like(x) for x in xs)
     grads = torch.autograd.grad(y.sum(), xs, create_graph=create_graph, allow_unused=True)
@@ -323,7 +324,7 @@ def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor
 def _rows(y: Tensor, xs: tuple[Tensor, Tensor, Tensor], create_graph: bool) -> tuple[Tensor, ...]:
     """∂y/∂x for each x: (..., m, n), (..., m, n) and (..., m), the m components of y (..., m) in one backward pass.
 
-    A function of L_d whose backward pass is Python that looks at numbers cannot take all rows at once.
+    A custom backward pass that reads numbers cannot be batched: its rows are computed one by one.
     """
     m, batch = y.shape[-1], y.ndim - 1
     found: tuple[Tensor | None, ...] = (None,) * len(xs)

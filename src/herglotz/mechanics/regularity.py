@@ -26,21 +26,24 @@ CONDITIONS = {
 
 @dataclass(frozen=True)
 class Regularity:
-    """The margin of every condition at (q0, q1, s0); NaN where another failure leaves it undefined."""
+    """The margin of every condition at (q0, q1, s0); NaN where another failure leaves a margin undefined."""
 
     finite: Tensor  # (...) 1 or 0
     c: Tensor  # (...) |c| / (1 + |D3|)
-    M: Tensor  # (...) smallest singular value of M in units that make M, D11, D22 of size 1
+    M: Tensor  # (...) smallest singular value of M, coordinates scaled by the diagonals of M, D11, D22
     pole: Tensor  # (...) smallest of 1 and |M(h(1 ± √eps))| / |M(h)|
-    H_plus: Tensor  # (...) as M, of D2D2 L_d
-    H_minus: Tensor  # (...) as M, of c D1D1 L⁻
+    H_plus: Tensor  # (...) that of D2D2 L_d
+    H_minus: Tensor  # (...) that of c D1D1 L⁻
     h: Tensor  # (...)
     tol: float
 
     def lost(self, name: str) -> Tensor:
-        """(...) bool: whether the condition of that name fails."""
+        """(...) bool: whether the condition of that name fails.
+
+        NaN, where another failure leaves the margin undefined, is not below the bound.
+        """
         bound = 0.5 if name in ("finite", "pole") else self.tol
-        return getattr(self, name) < bound  # NaN, undefined because of another failure, is not this failure
+        return getattr(self, name) < bound
 
     def report(self) -> list[str]:
         """Return a line for every failed condition of a sample: `sample (3,), h = 5: c = 0: FL⁻ is not defined`."""
@@ -58,14 +61,15 @@ def regularity(
     s0: Tensor,  # (...)
     h: Tensor | float,
 ) -> Regularity:
-    """How far every condition is from failing at (q0, q1, s0).
+    """The margin of every condition at (q0, q1, s0).
 
-    L_d is also evaluated at h(1 ± √eps), to see a pole in h.
+    L_d is also evaluated at h(1 ± √eps): near a pole in h its derivatives change by a factor there.
 
     Source: erratum E4; for H⁻ the same argument on the left Lagrangian of erratum E5.
     """
     eps = torch.finfo(q0.dtype).eps
-    tol = 1e3 * eps  # a margin below this counts as lost
+    # A thousand roundings: a smaller margin cannot be told from 0.
+    tol = 1e3 * eps
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     with torch.no_grad():
         P = partials(L_d, q0, q1, s0, h, order=2)
@@ -94,9 +98,9 @@ def regularity(
 
 
 def left_hessian(P: Partials, p0: Tensor | None = None) -> Tensor:
-    """Return c D1D1 L⁻ = D11 + p0 ⊗ D13 + D13 ⊗ p0 + D33 p0 ⊗ p0, (..., n, n): H⁻ exists where it is not singular.
+    """Return c D1D1 L⁻ = D11 + p0 ⊗ D13 + D13 ⊗ p0 + D33 p0 ⊗ p0, (..., n, n), regular exactly where H⁻ exists.
 
-    It is the second derivative of L_d(x, q1, s0 + p0·(x − q0)) in x; p0 is that of the step unless it is given.
+    This matrix is the second derivative of L_d(x, q1, s0 + p0·(x − q0)) in x; `p0` defaults to that of the step.
     """
     p0 = momentum_minus(P) if p0 is None else p0
     cross = p0[..., :, None] * P.D13[..., None, :]
@@ -104,7 +108,7 @@ def left_hessian(P: Partials, p0: Tensor | None = None) -> Tensor:
 
 
 def scaled_margin(X: Tensor, *sizes: Tensor) -> Tensor:
-    """Smallest singular value of X, (..., n, n), each coordinate scaled by the diagonals of `sizes`; NaN if X is."""
+    """Smallest singular value of X (..., n, n), coordinates scaled by the diagonals of `sizes`; NaN if X has a NaN."""
     scale = torch.stack([x.diagonal(dim1=-2, dim2=-1).abs() for x in sizes]).sum(0)
     scale = torch.where(scale > 0, scale, 1.0).rsqrt()
     scaled = scale[..., :, None] * X * scale[..., None, :]
@@ -112,7 +116,10 @@ def scaled_margin(X: Tensor, *sizes: Tensor) -> Tensor:
 
 
 def least_singular_value(X: Tensor) -> Tensor:
-    """Of X (..., m, n), shape (...); 0 where X is not finite, which svdvals refuses for the whole batch."""
+    """Smallest singular value of X (..., m, n), shape (...); 0 where X is not finite.
+
+    (svdvals refuses a whole batch if one matrix is not finite.)
+    """
     finite = torch.isfinite(X).all(-1).all(-1)
     return torch.linalg.svdvals(torch.where(finite[..., None, None], X, 0.0))[..., -1]
 

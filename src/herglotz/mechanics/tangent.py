@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.legendre import momentum_jacobian
-from herglotz.mechanics.newton import solve_columns
+from herglotz.mechanics.linear import solve_columns
 from herglotz.mechanics.partials import Partials
 
 
 def step_derivative(
-    P: Partials,  # order 2, at a solved step (q0, q1, s0)
+    P: Partials,  # (q0, q1, s0) of a solved step, order 2
     p0: Tensor,  # (..., n)
 ) -> Tensor:
     """DΦ̃ at (q0, p0, s0), shape (..., 2n+1, 2n+1), ordered q, p, s.
@@ -34,7 +34,8 @@ def step_derivative(
         F_q0, F_s0 = F_q0 + P.force.minus_1, F_s0 + P.force.minus_3[..., None]
         p1_q0, p1_q1, p1_s0 = p1_q0 + P.force.plus_1, p1_q1 + P.force.plus_2, p1_s0 + P.force.plus_3[..., None]
     J = momentum_jacobian(P, p0)
-    if P.force is not None and P.force.held is not None:  # Δ = q1 − q0 = 0 in place of F = 0
+    # A coordinate that dry friction holds obeys Δ = q1 − q0 = 0 in place of F = 0.
+    if P.force is not None and P.force.held is not None:
         rows = (P.force.held > 0)[..., None]
         F_q0, F_p0, F_s0 = torch.where(rows, -J, F_q0), torch.where(rows, 0.0, F_p0), torch.where(rows, 0.0, F_s0)
     dq1 = -solve_columns(J, torch.cat([F_q0, F_p0, F_s0], -1))

@@ -1,4 +1,4 @@
-"""From the jet of L_d to the blocks of `Partials`."""
+"""The blocks of `Partials` from the jet of L_d."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from herglotz.models.jet import Jet
 
 
 def affine_partials(
-    L: Jet,  # over the 2n components of (q0, q1)
-    g: Tensor | Jet | None,  # the exponent of c; None: c = 1
+    L: Jet,
+    g: Tensor | Jet | None,
     c: Tensor | Jet | None,
     s0: Tensor,  # (...)
     force: Forces | None,
 ) -> Partials:
-    """Return the blocks of an L_d that is affine in s0: D3 = c − 1."""
+    """Return the blocks of an L_d that is affine in s0, from its jet over (q0, q1): D3 = c − 1 with c = e^g.
+
+    A g of None means c = 1.
+    """
     D3 = s0.new_zeros(()) if g is None else torch.expm1(g.value if isinstance(g, Jet) else g)
     D3 = D3.expand(s0.shape)
     gradient = L.gradient.movedim(0, -1)
@@ -28,7 +31,7 @@ def affine_partials(
 
 
 def action_partials(L: Jet) -> Partials:
-    """Return the blocks of an L that is a jet over the 2n + 1 variables (q0, q1, s0)."""
+    """Return the blocks of an L_d from its jet over the 2n + 1 variables (q0, q1, s0)."""
     gradient = L.gradient.movedim(0, -1)
     if L.order == 1:
         return _partials(L, gradient[..., :-1], gradient[..., -1], None)
@@ -39,7 +42,7 @@ def action_partials(L: Jet) -> Partials:
 def _partials(
     L: Jet, by_q: Tensor, D3: Tensor, second: tuple[Tensor, Tensor, Tensor] | None, force: Forces | None = None
 ) -> Partials:
-    """From the gradient by (q0, q1), D3, and the second derivatives by (q0, q1) twice, mixed with s0, and by s0."""
+    """Return the blocks from ∂L/∂(q0, q1), D3, and `second`: (q0, q1) twice, mixed with s0, s0 twice."""
     n = by_q.shape[-1] // 2
     first = (L.value, by_q[..., :n], by_q[..., n:], D3)
     if second is None:

@@ -1,4 +1,4 @@
-"""The terms of a model: the description by which stepping, fitting and export decide what is possible."""
+"""The terms of a model, from which stepping, fitting and export decide how a step is made."""
 
 from __future__ import annotations
 
@@ -9,23 +9,46 @@ from dataclasses import dataclass
 class Capabilities:
     """The terms of a model, and properties of a step that follow from the terms.
 
-    A new term is a field here; every other room reads the properties below and never a term.
+    A new term is a field here. Every other room reads the properties below, never a field.
+
+    Parameters
+    ----------
+    order
+        Order of the rule: 2, or 4 with the correction of `herglotz.models.order4`.
+    baseline
+        A kinetic term and a potential; without a baseline the correction is all of L_d but the damping.
+    constant_mass
+        K = Δᵀ m Δ / 2h with a constant matrix m.
+    constant_c
+        c depends on h alone: no damping, or a constant rate γ.
+    known_damping
+        The damping, if any, is a constant rate γ or the affine level's g(q̄, v).
+    correction
+        A network N of (q̄, v).
+    action_flow
+        The map of s is nonlinear, as at the full level.
+    nonlinear_force
+        Dry friction, or another force that is not linear in v.
+    sticking
+        Dry friction is set-valued.
+    coupling
+        A force that depends on the velocities of other joints, or on the position.
     """
 
-    order: int  # of the rule: 2, or 4 with the correction of `herglotz.models.order4`
-    baseline: bool  # a kinetic term and a potential; without, the correction is the whole of A
-    constant_mass: bool  # K = Δᵀ m Δ / 2h with a constant matrix m
-    constant_c: bool  # c depends on h alone: no damping, or a constant rate γ
-    known_damping: bool  # the damping, if any, is a constant rate γ or the affine level's g(q̄, v)
-    correction: bool  # a network N of (q̄, v)
-    action_flow: bool  # the full level: the map of s is nonlinear
-    nonlinear_force: bool  # dry friction, or another force that is not linear in v
-    sticking: bool  # dry friction is set-valued
-    coupling: bool  # a force that depends on the velocities of other joints, or on the position
+    order: int
+    baseline: bool
+    constant_mass: bool
+    constant_c: bool
+    known_damping: bool
+    correction: bool
+    action_flow: bool
+    nonlinear_force: bool
+    sticking: bool
+    coupling: bool
 
     @property
     def carries_s(self) -> bool:
-        """Whether the positions depend on s at all, as at the affine and full levels."""
+        """Whether the positions depend on s, as at the affine and full levels."""
         return not self.constant_c
 
     @property
@@ -36,7 +59,7 @@ class Capabilities:
 
     @property
     def by_terms(self) -> bool:
-        """Whether the step equation is known term by term (`herglotz.stepping.equation`); else jets evaluate L_d."""
+        """Whether `herglotz.stepping.equation` evaluates the step term by term; otherwise jets evaluate L_d."""
         whole = self.baseline and self.constant_mass and self.known_damping and self.order == 2
         return whole and not (self.action_flow or self.coupling or self.sticking)
 
@@ -47,6 +70,6 @@ class Capabilities:
 
 
 def capabilities(L_d: object) -> Capabilities | None:
-    """The capabilities that L_d states; None for a discrete Lagrangian that is no model, whose terms are not known."""
+    """The capabilities of a model L_d; None for any other discrete Lagrangian, whose terms are not known."""
     found = getattr(L_d, "capabilities", None)
     return found if isinstance(found, Capabilities) else None

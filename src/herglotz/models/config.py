@@ -14,24 +14,25 @@ from herglotz.models.translations import check_translations
 from herglotz.schema import from_plain
 
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
-POWERS = {"s^2": 2, "s^3": 3}  # that L may have beside −γ s, by name
+# Powers of s that L may have beside −γ s, by name.
+POWERS = {"s^2": 2, "s^3": 3}
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything that is needed to build a model; plain numbers, which JSON stores.
+    """All settings of a model, as plain numbers that JSON stores.
 
     Parameters
     ----------
     angles
-        Which of the n coordinates are angles in rad.
+        (n,) whether each coordinate is an angle in rad.
     level
-        Of the ladder: conservative, linear, affine, full or forced.
+        Level of the ladder: conservative, linear, affine, full or forced.
     scale, speed
         (n,) typical sizes of q and v, in the units of the data.
     stiffness, tilt, rate
-        Start of the baseline: kᵢ and bᵢ (n,) of V, and the damping rate γ (`docs/trajectory.md`, section 4); the first
-        mass is 1: in units of 1/time², of the coordinate over time², and of 1/time.
+        Starting values of the baseline: kᵢ and bᵢ of V (n,), in units of 1/time² and of the coordinate over time² at a
+        first mass of 1, and the damping rate γ, in units of 1/time (`docs/trajectory.md`, section 4).
     potential_width, potential_depth
         Units and layers of the network in V; a width of 0 leaves a network out.
     damping_width
@@ -41,37 +42,36 @@ class ModelConfig:
     baseline
         Without a baseline the correction is all of L_d, to show why a baseline is needed (trap 2).
     seed, activation
-        Of the networks' first weights; one of `herglotz.models.network.ACTIVATIONS`.
+        Seed of the networks' first weights; activation, one of `herglotz.models.network.ACTIVATIONS`.
     mass_width, mass_depth
         Units and layers of the network in a mass that depends on position; 0: a constant mass.
     action_width
         Units of the network in s, at the level full.
     dissipation
-        The powers of s that L has beside −γ s, "s^2" and "s^3", at the forced level and, in the place of networks, at
-        the level full.
+        Powers of s that L has beside −γ s, "s^2" and "s^3", at the forced level and, in place of networks, at the level
+        full.
     coulomb, sticking
-        Dry friction of each joint beside the viscous one (forced); set-valued: a joint can stand still.
+        Dry friction of each joint beside viscous friction (forced); set-valued: a joint can stand still.
     inputs, input_map, input_zero
-        Number m of inputs; the map to forces, n · m numbers row by row, in units of force (mass 1) over input, left
-        out: learned; whether each input has a learned zero.
+        Number m of inputs; the map to forces, n · m numbers row by row in units of force (mass 1) over input, learned
+        if left out; whether each input has a learned zero.
     features, known
-        Guessed terms of L, with learned coefficients, and known terms, as text
-        (`herglotz.models.features`).
+        Terms of L with learned coefficients, and known terms, as text (`herglotz.models.features`).
     alike, diagonal
-        One mass for all, and a potential of features alone; or a mass for each, and none between two.
+        One mass for all coordinates and a potential of features alone; a diagonal mass matrix.
     coupled, drag
-        Friction of differences of speeds; further friction forces such as "|v1| v1" (`herglotz.models.drag`); both of
+        Friction of velocity differences; further friction forces such as "|v1| v1" (`herglotz.models.drag`). Both need
         the forced level.
     order
-        Of the rule, 2 or 4; 4 adds the error term of the rule, from the features (`herglotz.models.order4`).
-        Forces stay of order 2.
+        Order of the rule, 2 or 4; at 4 L_d has the error term of the rule, from the features
+        (`herglotz.models.order4`). Forces stay of order 2.
     terms
         Further parts of V and of the forces, by their names in `herglotz.models.TERMS`.
     translations
-        Symmetries of L_d, named by the coordinates that move together ("q1 + q2"): no part of L_d depends on where
-        these coordinates are, and the rest of the baseline is not learned (`herglotz.models.translations`).
+        Symmetries of L_d, named by the coordinates that move together ("q1 + q2"): L_d does not depend on where these
+        coordinates are, and the rest of the baseline is not learned (`herglotz.models.translations`).
     absent
-        Numbers of the model that are 0 and not learned, as `numbers_of` names them: "potential.tilt[0]".
+        Numbers of the model that are fixed at 0, as `numbers_of` names them: "potential.tilt[0]".
 
     Raises
     ------
@@ -197,7 +197,7 @@ class ModelConfig:
 
     @property
     def networks(self) -> bool:
-        """Whether any part is a network, whose starting values are drawn."""
+        """Whether any part is a network, whose starting weights are drawn."""
         widths = self.potential_width or self.mass_width or self.correction_width
         in_s = self.level == "affine" or (self.level == "full" and not self.dissipation)
         return bool(widths) or not self.baseline or in_s

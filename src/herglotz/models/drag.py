@@ -1,15 +1,15 @@
 """Named friction forces of one joint or between two: |v| v, v³, q² v, and so on, with a learned coefficient each.
 
-The text of a force is a product: a power or a wave of a position (optional), |v|, and a power of the same speed v. The
-speed v is that of a joint, or the relative speed of two joints with a damper between:
+The text of a force is a product: a power or a wave of a position (optional), |v|, and a power of the same speed v, the
+speed of a joint or the relative speed of two joints with a damper between them:
 
     |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
     cos(q1) v1     sin(2.5 q2) v1     sin(2.5 v1)     cos(0.8 (v1 - v2))
 
-Dampers that saturate or act on one side are sums of waves of a speed. `load 2` is a constant force on coordinate 2; no
-periodic potential of an angle gives a constant force. `|v1|` is the difference of viscous friction between the two
-directions. `|v| v` is air drag on a body that moves in a plane or in space: |v| is the length of the whole velocity.
-Dry friction changes with the position, or with the load that a position puts on a bearing, by
+Dampers that saturate or act on one side are sums of waves of a speed. `load 2` is a constant force on coordinate 2,
+which no periodic potential of an angle gives. `|v1|` is the difference of viscous friction between the two directions.
+`|v| v` is air drag on a body that moves in a plane or in space: |v| is the length of the whole velocity. Dry friction
+that changes with the position, or with the load that a position puts on a bearing, is written as
 
     q1^2 sgn(v1)        cos(q1) sgn(v1)        sin(q2) sgn(v1)
 """
@@ -17,6 +17,7 @@ Dry friction changes with the position, or with the load that a position puts on
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,34 +28,41 @@ from herglotz.errors import InputError, refuse
 from herglotz.mechanics import Forces
 from herglotz.models.term import with_force
 
-HIGHEST = 9  # power of a speed or a position
-_APART = r"v\d+ - v\d+"
-_NUMBER = r"\d+(?:\.\d*)?(?:e[-+]?\d+)?"
-_AT = rf"(?:(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
-_TEXT = re.compile(
-    rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
-    r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)|\|v(?P<even>\d+)\|"
-)
-_OF_SPEED = re.compile(rf"(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))\)")
-_DRY = re.compile(rf"{_AT} sgn\(v(?P<v>\d+)\)")
+# Highest power of a speed or a position.
+MAX_POWER = 9
+_PAIR = r"v\d+ - v\d+"
+_SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
+_WAVE = r"(?P<wave>cos|sin)\((?:(?P<rate>\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?)?"
+_AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
+_TEXTS = [
+    re.compile(text)
+    for text in (
+        rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_PAIR})\| )?{_SPEED}(?:\^(?P<c>\d+))?",
+        rf"(?P<of_speed>){_WAVE}{_SPEED}\)",
+        rf"{_AT} sgn\((?P<dry>v\d+)\)",
+        r"load (?P<load>\d+)",
+        r"\|(?P<even>v\d+)\|",
+    )
+]
 AIR = "|v| v"
 
 
 @dataclass(frozen=True)
 class DragFeature:
-    """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of, which brakes the coordinate `on`, and drives `of`.
+    """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of: a force that brakes the coordinate `on` and drives `of`.
 
-    If `dry` q_at^a sgn(v). A `wave`, cos or sin, of rate · q_at replaces the power of q_at; if `of_speed`, the wave of
-    rate · v is the whole feature.
+    b is 0 or 1, and with b = c = 0 the force is constant. A `dry` feature is q_at^a sgn(v). A `wave`, cos or sin, of
+    rate · q_at replaces the power of q_at; with `of_speed` the wave of rate · v is the whole feature. `air` is |v| v of
+    the whole velocity, on every coordinate.
     """
 
     on: int
     at: int
     a: int
-    b: int  # 0 or 1
-    c: int  # 1 or more; 0: a constant force
+    b: int
+    c: int
     of: int | None = None
-    air: bool = False  # |v| v of the whole velocity, on every coordinate
+    air: bool = False
     dry: bool = False
     wave: str = ""
     rate: float = 1.0
@@ -66,23 +74,23 @@ class DragFeature:
         return (self.b, self.c) == (1, 0)
 
     def position(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the factor that depends on q_at, and the slope."""
+        """Return the factor that depends on q_at, and its slope."""
         return self._wave(q) if self.wave and not self.of_speed else (_power(q, self.a), _power(q, self.a - 1) * self.a)
 
     def speed(self, v: Tensor, width: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the factor that depends on v, and the slope; dry friction has this width, or is 0."""
+        """Return the factor that depends on v, and its slope; dry friction is tanh(v/width), or 0 without a width."""
         if self.of_speed:
             return self._wave(v)
         if self.dry:
             rate = 0.0 if width is None else 1 / width
-            grip = (v * rate).tanh()
-            return grip, (1.0 - grip * grip) * rate
+            sign = (v * rate).tanh()
+            return sign, (1.0 - sign * sign) * rate
         own = v.abs() if self.b else torch.ones_like(v)
         slope = v.sign() if self.even else own * _power(v, self.c - 1) * (self.b + self.c)
         return own * _power(v, self.c), slope
 
     def _wave(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the wave of rate · x, and the slope."""
+        """Return the wave of rate · x, and its slope."""
         x = x * self.rate
         value, slope = (x.cos(), -x.sin()) if self.wave == "cos" else (x.sin(), x.cos())
         return value, slope * self.rate
@@ -91,92 +99,55 @@ class DragFeature:
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     """Read the text of a friction force.
 
-    Raise InputError if the text is no friction force, or names a coordinate that the model has not.
+    Raise InputError if the text is no friction force, or names a coordinate that the model does not have.
     """
-    plain = " ".join(text.split())
+    plain, n = " ".join(text.split()), len(angles)
     if plain == AIR:
         refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
         return DragFeature(0, 0, 0, 1, 1, air=True)
-    if (dry := _DRY.fullmatch(plain)) is not None:
-        return _parse_dry(text, dry.groupdict(), angles)
-    if (of_speed := _OF_SPEED.fullmatch(plain)) is not None:
-        return _parse_wave(text, of_speed.groupdict(), len(angles))
-    return _parse_power(text, plain, angles)
-
-
-def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
-    """A product of powers, or a constant force."""
-    match, n = _TEXT.fullmatch(plain), len(angles)
+    match = next(filter(None, (pattern.fullmatch(plain) for pattern in _TEXTS)), None)
     if match is None:
         raise InputError(
             f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1' or "
             "'cos(q1) sgn(v1)'"
         )
-    found = match.groupdict()
-    speed = found["v"] or found["apart"]
-    on, *of = (int(digits) for digits in re.findall(r"\d+", speed or found["load"] or found["even"]))
-    at, a, wave, rate = _position(text, found, on, angles)
-    c = 0 if speed is None else int(found["c"] or 1)
-    refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
-        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
-        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in (None, speed),
-        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": speed and not (a <= HIGHEST >= c >= 1),
-    })  # fmt: skip
-    b = int(found["size"] is not None or found["even"] is not None)
-    return DragFeature(on - 1, at - 1, a, b, c, of[0] - 1 if of else None, wave=wave, rate=rate)
-
-
-def _parse_wave(text: str, found: dict[str, str | None], n: int) -> DragFeature:
-    """A wave of a speed."""
-    on, *of = (int(digits) for digits in re.findall(r"\d+", found["v"] or found["apart"] or ""))
-    refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, *of)),
-        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
-    })  # fmt: skip
-    rate = float(found["rate"] or 1)
-    return DragFeature(
-        on - 1, on - 1, 0, 0, 0, of[0] - 1 if of else None, wave=found["wave"] or "", rate=rate, of_speed=True
-    )
-
-
-def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) -> DragFeature:
-    """Dry friction of a joint by the position of a coordinate."""
-    on, n = int(found["v"] or 1), len(angles)
-    at, a, wave, rate = _position(text, found, on, angles)
-    refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at)),
-        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": not wave and not 1 <= a <= HIGHEST,
-    })  # fmt: skip
-    return DragFeature(on - 1, at - 1, a, 0, 0, dry=True, wave=wave, rate=rate)
-
-
-def _position(text: str, found: dict[str, str | None], on: int, angles: Sequence[bool]) -> tuple[int, int, str, float]:
-    """The number of the coordinate whose position a force depends on (`on` by default), the power, wave and rate."""
-    at, wave, rate = int(found["angle"] or found["q"] or on), found["wave"] or "", float(found["rate"] or 1)
-    a = int(found["a"] or 1) if found["q"] else 0
+    found = defaultdict(str, {name: part for name, part in match.groupdict().items() if part is not None})
+    of_speed, dry = "of_speed" in found, "dry" in found
+    speed = found["v"] or found["pair"]
+    on, *of = map(int, re.findall(r"\d+", speed or found["dry"] or found["load"] or found["even"]))
+    at = int(found["angle"] or found["q"] or on)
+    wave, rate = found["wave"], float(found["rate"] or 1)
+    a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
+    powers_fit = a <= MAX_POWER and (a >= 1 or bool(wave) if dry else 1 <= c <= MAX_POWER or not speed or of_speed)
     angle = any(angles[at - 1 : at])
     refuse({
-        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{at})' in its place": a and angle,
-        f"drag '{text}': a wave of an angle is periodic; write a whole number before q{at}": angle and rate % 1,
+        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{at})' instead": a and angle,
+        f"drag '{text}': a wave of an angle is periodic; write a whole number before q{at}":
+            angle and rate % 1 and not of_speed,
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
+        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
+        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in ("", speed),
+        f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not powers_fit,
     })  # fmt: skip
-    return at, a, wave, rate
+    b, second = int(bool(found["size"] or found["even"])), of[0] - 1 if of else None
+    return DragFeature(on - 1, at - 1, a, b, c, second, dry=dry, wave=wave, rate=rate, of_speed=of_speed)
 
 
 class Drag(nn.Module):
     """f = −Σ_g θ_g e q̄_j^a |v|^b v^c of the speeds v = e·Δ/h, with F⁻ = c (h/2) f and F⁺ = (h/2) f.
 
-    e has a 1 at a joint, and a −1 at a second joint where v is the relative speed of the two; drag through air is
-    f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters that start at 0; van der Pol's
-    oscillator has viscous friction of negative sign and the term q² v. The part of dry friction that depends on the
-    position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; for set-valued friction `held`, at q0.
+    e has 1 at a joint and, for the relative speed of two joints, −1 at the second joint; drag through air is
+    f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters of either sign that start at 0: van der
+    Pol's oscillator has negative viscous friction and the term q² v. The part of dry friction that depends on the
+    position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; set-valued friction takes the part `held` at q0.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):
         super().__init__()
         self.features = tuple(features)
         self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
-        eye = torch.eye(dof + 1, dof, dtype=torch.float64)  # last row 0: no second joint
+        # The last row is 0, for features without a second joint.
+        eye = torch.eye(dof + 1, dof, dtype=torch.float64)
         on, of = [f.on for f in features], [f.on if f.air else dof if f.of is None else f.of for f in features]
         self.air, self.dry = ([g for g, f in enumerate(features) if getattr(f, kind)] for kind in ("air", "dry"))
         self.register_buffer("on", eye[on] - eye[of], persistent=False)
@@ -185,7 +156,7 @@ class Drag(nn.Module):
         self.at: Tensor
 
     def held(self, q0: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Return the part of set-valued friction from these terms, (..., n), and ∂/∂q0, (..., n, n)."""
+        """Return the part of set-valued friction that depends on q0, (..., n), and ∂/∂q0, (..., n, n)."""
         if not self.dry:
             return None
         at, x = self.at[self.dry], q0 @ self.at[self.dry].T
@@ -194,36 +165,36 @@ class Drag(nn.Module):
         return value @ self.on[self.dry], self.on[self.dry].T @ (slope[..., None] * at)
 
     def terms(self, q: Tensor, v: Tensor, widths: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return φ_g, ∂φ_g/∂q̄_j and ∂φ_g/∂v, each (..., G); dry terms have these `widths` (n,), or are 0."""
+        """Return φ_g, ∂φ_g/∂q̄_j and ∂φ_g/∂v, each (..., G); dry terms have the `widths` (n,), or are 0 without."""
         x, y = q @ self.at.T, v @ self.on.T
         columns = []
         for g, f in enumerate(self.features):
-            position, slope = f.position(x[..., g])
-            grip, bend = f.speed(y[..., g], None if widths is None else widths[f.on])
-            columns.append((position * grip, slope * grip, position * bend))
+            position, by_q = f.position(x[..., g])
+            speed, by_v = f.speed(y[..., g], None if widths is None else widths[f.on])
+            columns.append((position * speed, by_q * speed, position * by_v))
         value, by_q, by_v = (torch.stack(x, -1) for x in zip(*columns, strict=True))
         return value, by_q, by_v
 
     def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces, widths: Tensor | None = None) -> Forces:
-        """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if `own` has.
+        """Return the forces `own` plus the drag at the mean position q and the velocity v, with derivatives if any.
 
-        `widths` are those of smooth dry friction, (n,).
+        `widths` (n,) are those of smooth dry friction.
         """
         value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v, widths))
         slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.on), (by_q, self.at)))
         f = -value @ self.on
         if self.air:
-            through_air, bend = self._through_air(v)
-            f, slope = f + through_air, slope + bend
+            air, air_slope = self._through_air(v)
+            f, slope = f + air, slope + air_slope
         return with_force(own, f, slope, c, h, by_position)
 
     def _through_air(self, v: Tensor) -> tuple[Tensor, Tensor]:
         """−θ |v| v, (..., n), and the slope −θ (|v| I + v vᵀ/|v|), (..., n, n)."""
         theta, eye = self.coefficient[self.air].sum(), torch.eye(v.shape[-1], dtype=v.dtype, device=v.device)
-        # `tiny` gives a derivative at rest; onnxruntime drops an addend that is 0 in float32.
+        # With `tiny` the root has a derivative at rest. A smaller addend is 0 in float32, and onnxruntime drops it.
         size = ((v * v).sum(-1, keepdim=True) + torch.finfo(torch.float32).tiny).sqrt()
-        bend = size[..., None] * eye + v[..., None] * (v / size)[..., None, :]
-        return -theta * size * v, -theta * bend
+        slope = size[..., None] * eye + v[..., None] * (v / size)[..., None, :]
+        return -theta * size * v, -theta * slope
 
 
 def _power(x: Tensor, k: int) -> Tensor:

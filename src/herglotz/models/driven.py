@@ -15,12 +15,13 @@ from herglotz.models.capabilities import Capabilities
 class DrivenLagrangian:
     """A discrete Lagrangian with the derivatives and forces of a model whose inputs are u."""
 
-    model: Any  # a `ContactLagrangian` or an `OwnLagrangian`, which make it
+    # A `ContactLagrangian` or an `OwnLagrangian`, whose modules import this one.
+    model: Any
     u: Tensor  # (..., m)
 
     @property
     def capabilities(self) -> Capabilities:
-        """The model's."""
+        """The capabilities of the model."""
         return self.model.capabilities
 
     def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
@@ -40,5 +41,5 @@ class DrivenLagrangian:
         return self.model.typical_increment(h)
 
     def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
-        """F⁻ and F⁺, each (..., n); None where the model has none."""
+        """F⁻ and F⁺, each (..., n); None for a model without forces."""
         return self.model.forces(q0, q1, s0, h, self.u)

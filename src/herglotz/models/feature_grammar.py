@@ -1,15 +1,14 @@
-"""The text of a feature, read by a grammar.
+"""The grammar of a feature's text, and its reader.
 
     feature = [sign] product { sign product }
-    product = factor { ["*"] factor }             one function of the position at most
+    product = factor { ["*"] factor }             at most one function of the position
     factor  = number | ("cos" | "sin") "(" form ")" | base [ "^" integer ]
     base    = "r" | "q" index | "v" index | "(" form ")" | size
     size    = "|" "q" index "|"                   |q1|^3, and before a power of the same coordinate: |q1| q1^2
     form    = [sign] addend { sign addend }
-    addend  = [ number ["*"] ] "q" index | number             a number in a wave alone: cos(2.5 q1 + 0.3)
+    addend  = [ number ["*"] ] "q" index | number             a number only in a wave: cos(2.5 q1 + 0.3)
 
-Only r takes negative powers; odd powers of |q1| stand for sgn(q1) q1^k, of k from 2 on. Blanks separate, and mean
-nothing else.
+Only r takes negative powers. Odd powers of |q1| stand for sgn(q1) q1^k, k ≥ 2. Blanks only separate.
 """
 
 from __future__ import annotations
@@ -22,7 +21,8 @@ from functools import cache
 
 from herglotz.errors import InputError
 
-HIGHEST_POWER = 16  # of data that vary by a factor of 10, such a power varies by 1e16: all the digits of float64
+# If data vary by a factor of 10, their 16th power varies by 1e16: all the digits of float64.
+HIGHEST_POWER = 16
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<coordinate>[qv]\d+)|(?P<word>cos|sin|r(?![a-z]))"
     r"|(?P<mark>[-+*^()|]))"
@@ -32,16 +32,17 @@ HOW = "write sums of products of numbers, v1, and one of cos(q1 - q2), sin(q1), 
 
 @dataclass(frozen=True)
 class Product:
-    """factor · f(w·q + phase) · ∏ v: f = cos, sin, a power of the form x, sgn(x) times one, or one of r = |q| (no w).
+    """factor · f(w·q + phase) · ∏ v, with the `form` w and the coordinates of the factors v, repeated for powers.
 
-    Waves alone have a phase.
+    The `function` f is "cos", "sin", "power" (x^power), "signed" (sgn(x) x^power) or "radius" (r^power with r = |q|, no
+    w). Only waves have a phase.
     """
 
     factor: float
-    function: str  # "cos", "sin", "power", "signed" or "radius"
-    form: tuple[float, ...] = ()  # w, n numbers
+    function: str
+    form: tuple[float, ...] = ()  # (n,)
     power: int = 0
-    velocities: tuple[int, ...] = ()  # coordinates of the factors v, repeated for powers
+    velocities: tuple[int, ...] = ()
     phase: float = 0.0
 
 
@@ -49,9 +50,9 @@ Feature = tuple[Product, ...]
 
 
 def parse(text: str, angles: Sequence[bool]) -> Feature:
-    """The products that a feature is the sum of.
+    """The products whose sum is the feature.
 
-    InputError names the feature and the part of it that cannot be read.
+    Raise InputError, with the feature and the unreadable part, if the text is no feature.
     """
     return _parsed(text, tuple(angles))
 
@@ -61,16 +62,16 @@ def _parsed(text: str, angles: tuple[bool, ...]) -> Feature:
     """`parse` with a memory: a search builds hundreds of models from the same terms."""
     feature = _Reader(text, angles).feature()
     if len({bool(p.velocities) for p in feature}) > 1:
-        raise InputError(f"feature '{text}': some products hold velocities and some do not; make two features of it")
+        raise InputError(f"feature '{text}': some products hold velocities and some do not; write two features")
     return feature
 
 
 class _Reader:
-    """Recursive descent, a method a rule of the grammar."""
+    """Recursive descent, one method for each rule of the grammar."""
 
     def __init__(self, text: str, angles: Sequence[bool]):
         self.text, self.angles, self.n = text, angles, len(angles)
-        self.tokens: list[tuple[str, str, int]] = []  # kind, text, where it begins
+        self.tokens: list[tuple[str, str, int]] = []  # (kind, text, start)
         at, end = 0, len(text.rstrip())
         while at < end:
             match = _TOKEN.match(text, at)
@@ -121,7 +122,7 @@ class _Reader:
         return self._checked(Product(factor, function, form, power, tuple(velocities), phase))
 
     def _checked(self, product: Product) -> Product:
-        """The product, if the coordinates allow it."""
+        """The product, if its function fits the coordinates."""
         radial = product.function == "radius"
         used = [True] * self.n if radial else product.form
         if product.power and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
@@ -133,7 +134,7 @@ class _Reader:
         return product
 
     def _function(self) -> tuple[str, tuple[float, ...], int, float]:
-        """cos, sin, or a power of a form, a coordinate or r: its name, the form, the power and the phase."""
+        """The name, form, power and phase of cos, sin, or a power of a form, a coordinate or r."""
         kind, token, where = self._next()
         if token in ("cos", "sin"):
             self.at += 1
@@ -155,7 +156,7 @@ class _Reader:
         raise self._unread(where)
 
     def _size(self) -> tuple[str, tuple[float, ...], int]:
-        """A power of |q_i|, times one of q_i where that follows: of an even power of |q_i| the size has no part."""
+        """The name, form and power of |q_i|^k, times q_i^m where that follows; an even k makes a plain power."""
         begin = self._next()[2]
         self.at += 1
         if self._next()[0] != "coordinate" or self._next()[1][0] != "q":
@@ -174,7 +175,7 @@ class _Reader:
         return ("signed" if own % 2 else "power"), tuple(float(i == j) for j in range(self.n)), power
 
     def _form(self) -> tuple[tuple[float, ...], float]:
-        """The n numbers w of a linear form in parentheses, and its constant."""
+        """The numbers w (n,) and the constant of a linear form in parentheses."""
         begin = self._next()[2]
         self.at += 1
         w, phase = [0.0] * self.n, 0.0
@@ -201,7 +202,7 @@ class _Reader:
         return tuple(w), phase
 
     def _power(self, negative: bool = False) -> int:
-        """The power after the present base; 1 where none is written."""
+        """The power after the present base; 1 without a power."""
         if not self._take("^"):
             return 1
         sign = -1 if negative and self._take("-") else 1

@@ -18,9 +18,9 @@ from herglotz.models.terms import Kinetic
 
 
 class FeatureKinetic(nn.Module):
-    """K = K of another term + h Σ_g θ_g f_g(w·q̄) ∏v: couplings of speeds, magnetic terms.
+    """K = K of `base` + h Σ_g θ_g f_g(w·q̄) ∏v: couplings of speeds, magnetic terms.
 
-    Positive definite where the data have been: the least-squares fit does not keep it so elsewhere.
+    A fit makes the mass positive definite where there are data, not elsewhere.
     """
 
     def __init__(
@@ -31,9 +31,10 @@ class FeatureKinetic(nn.Module):
         self.sum = Combination(features, known, dof)
         velocities = [tuple(sorted(p.velocities)) for p in self.sum.products]
         self.monomials = list(dict.fromkeys(velocities))
+        # The row of a product has 1 at its monomial of velocities.
         of = [[float(own == monomial) for monomial in self.monomials] for own in velocities]
-        self.register_buffer("of", torch.tensor(of, dtype=torch.float64), persistent=False)  # (A, monomials)
-        self.of: Tensor
+        self.register_buffer("of", torch.tensor(of, dtype=torch.float64), persistent=False)
+        self.of: Tensor  # (A, monomials)
 
     def forward(self, phase: Phase) -> Jet:
         """Return K as a jet over (q0, q1)."""
@@ -55,7 +56,7 @@ class FeatureKinetic(nn.Module):
         return out
 
     def straight(self, phase: Phase, rate: Tensor) -> Jet:
-        """Return K_qq[v, v] + 2γ K_q v + γ² K of the features: the change of K along the straight line."""
+        """Return K_qq[v, v] + 2γ K_q v + γ² K of the features, the change of K along the straight line."""
         v = coordinates(phase.velocity.value, phase.order)
         P, w = self._each([_times(v, of) for of in self.monomials]), v.linear(self.sum.form)
         Pw = P * w
@@ -70,14 +71,14 @@ class FeatureKinetic(nn.Module):
         return self._summed(phase, {1: P * (b @ form.T) - by_b * v.linear(form), 0: by_b * -rate - twice})
 
     def _each(self, monomials: list[Jet]) -> Jet:
-        """Return for each product what belongs to its monomial, (..., A), of scalar jets."""
+        """Return the scalar jet of each product's monomial, as a jet (..., A)."""
         first = monomials[0]
         return Jet(torch.stack([m.data for m in monomials], -1) @ self.of.T, first.tangents, first.order)
 
     def _summed(self, phase: Phase, by_order: dict[int, Jet]) -> Jet:
         """Return Σ_g θ_g Σ_k f_g⁽ᵏ⁾(w_g·q̄) R_k,g(v) over (q0, q1), for jets R_k over v, (..., A), by k.
 
-        As each f is a function of one number, its derivatives are those of f times w and w wᵀ: no jets are multiplied.
+        Each f is a function of one number, so its derivatives are f′ w and f″ w wᵀ and no jets are multiplied.
         """
         c, order = self.sum, phase.order
         x, weights = c.forms(phase.mean.value), c.weights()
@@ -97,7 +98,7 @@ class FeatureKinetic(nn.Module):
 
 
 def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | PositionKinetic | FeatureKinetic:
-    """Return the K of a model: a mass, constant or of the position, and the named features with velocities."""
+    """Return the K of a model: a constant or position-dependent mass, and the named features with velocities."""
     n = config.dof
     mass = PositionKinetic(config, generator) if config.mass_width else Kinetic(n, config.alike, config.diagonal)
     learned, known = (sorted_features(names, config.angles)[1] for names in (config.features, config.known))
@@ -105,7 +106,7 @@ def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | P
 
 
 def _times(v: Jet, velocities: tuple[int, ...]) -> Jet:
-    """Return the product ∏v, without velocities 1."""
+    """Return the product ∏v."""
     product = v.select(velocities[0])
     for i in velocities[1:]:
         product = product * v.select(i)

@@ -1,4 +1,4 @@
-"""Linear combinations of named features, and the potential that is one of them."""
+"""Linear combinations of named features, and the potential of named features."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from herglotz.models.config import ModelConfig
 from herglotz.models.features import Feature, Product, expand, parse
 from herglotz.models.jet import Jet, pairs
 
-RIDGES = ("cos", "sin", "power", "signed")  # functions of a linear form w·q; "radius" is a function of r²
+# Functions of a linear form w·q; "radius" is a function of r².
+RIDGES = ("cos", "sin", "power", "signed")
 
 
 class Combination(nn.Module):
-    """Σ_g θ_g φ_g, with θ learned from 0, plus the known features with their own numbers, where the first mass is 1."""
+    """Σ_g θ_g φ_g with θ learned from 0, plus the known features with their own numbers, at a first mass of 1."""
 
     def __init__(self, features: Sequence[Feature], known: Sequence[Feature], dof: int):
         super().__init__()
-        every = [(p, g) for g, feature in enumerate([*features, *known]) for p in feature]
+        grouped = [(p, g) for g, feature in enumerate([*features, *known]) for p in feature]
         names = [*RIDGES, "radius"]
-        every.sort(key=lambda pair: names.index(pair[0].function))  # sorts products of the same function together
-        self.products: list[Product] = [p for p, _ in every]
+        grouped.sort(key=lambda pair: names.index(pair[0].function))
+        self.products: list[Product] = [p for p, _ in grouped]
         self.counts = [sum(p.function == f for p in self.products) for f in names]
         self.ridges = sum(self.counts[: len(RIDGES)])
         self.dof, self.learned = dof, len(features)
@@ -38,7 +39,7 @@ class Combination(nn.Module):
             "phase": torch.tensor([p.phase for p in self.products[: self.ridges]], dtype=torch.float64),
             "outer": form[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w wᵀ
             "power": torch.tensor([float(p.power) for p in self.products], dtype=torch.float64),
-            "group": torch.tensor([g for _, g in every], dtype=torch.long),
+            "group": torch.tensor([g for _, g in grouped], dtype=torch.long),
         }
         for name, value in numbers.items():
             self.register_buffer(name, value, persistent=False)
@@ -58,12 +59,12 @@ class Combination(nn.Module):
         return torch.cat([self.coefficient, known])[self.group.clamp_max(self.learned)] * self.factor
 
     def forms(self, q: Tensor) -> Tensor:
-        """Return w·q and the phases, (..., ridges)."""
+        """Return w·q + phase, (..., ridges)."""
         x = q @ self.form.T
         return x + self.phase if self.shifted else x
 
     def ridge(self, x: Tensor, k: int) -> Tensor:
-        """Return the k-th derivative of the functions of w·q, at x = w·q + phase, (..., ridges)."""
+        """Return the k-th derivative of the functions of w·q at x = w·q + phase, (..., ridges)."""
         functions = (
             lambda y: _wave(y, k), lambda y: _wave(y, k + 3), lambda y: self._powers(y, k),
             lambda y: y.sign() * self._powers(y, k, "signed"),
@@ -73,23 +74,24 @@ class Combination(nn.Module):
         return found[0] if len(found) == 1 else torch.cat(found, -1)
 
     def _powers(self, x: Tensor, k: int, function: str = "power") -> Tensor:
-        """Return the k-th derivatives of the powers, or of those that have a sign."""
+        """Return the k-th derivative of the powers of kind `function`, without a sign."""
         exponent = self.power.split(self.counts)[RIDGES.index(function)]
         rest, product = exponent - k, torch.ones_like(x)
-        for j in range(self.highest - k):  # no pow: its forward-mode derivative takes the logarithm of negative numbers
+        # The forward-mode derivative of `pow` takes the logarithm of negative numbers.
+        for j in range(self.highest - k):
             product = product * torch.where(rest > j, x, 1.0)
         return _front(exponent, k) * product
 
     def radial(self, square: Tensor, k: int) -> Tensor:
-        """Return the k-th derivative of the functions of r², (..., number of radial functions)."""
+        """Return the k-th derivative of the radial functions by r², (..., number of radial functions)."""
         exponent = self.power.split(self.counts)[-1] / 2
         return _front(exponent, k) * square[..., None].pow(exponent - k)
 
 
 class FeaturePotential(nn.Module):
-    """V = Σ_g θ_g φ_g(q), a sum of products that are each a function of one number, so that no jets are multiplied.
+    """V = Σ_g θ_g φ_g(q), where every φ is a function of one number, so that no jets are multiplied.
 
-    With a ridge f(w·q): V′ = f′ w, V″ = f″ w wᵀ. With f(r²): V′ = 2 f′ q, V″ = 4 f″ q qᵀ + 2 f′ I.
+    A ridge f(w·q) has V′ = f′ w and V″ = f″ w wᵀ; f(r²) has V′ = 2 f′ q and V″ = 4 f″ q qᵀ + 2 f′ I.
     """
 
     def __init__(self, features: Sequence[Feature], known: Sequence[Feature], dof: int):
@@ -100,7 +102,8 @@ class FeaturePotential(nn.Module):
         """Return V as a jet over the n components of q, or V′y for a constant y = `along`, (..., n)."""
         c = self.sum
         ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
-        parts = [self._of_forms(q, ridge, order, along)] if c.ridges else []  # a file takes no tensor without entries
+        # Exported files take no tensor without entries.
+        parts = [self._of_forms(q, ridge, order, along)] if c.ridges else []
         parts += [self._radial(q, radial, order, along)] if c.ridges < len(c.products) else []
         return reduce(Jet.__add__, parts)
 
@@ -135,22 +138,22 @@ class FeaturePotential(nn.Module):
         i, j = pairs(n, q.device)
         same = (i == j).to(q.dtype)
         qi, qj = q[..., i], q[..., j]
-        bend = lambda a, b: 4 * b[..., None] * qi * qj + 2 * a[..., None] * same  # noqa: E731  of F: a = F′, b = F″
+        hessian = lambda F1, F2: 4 * F2[..., None] * qi * qj + 2 * F1[..., None] * same  # noqa: E731
         if y is None:
             rows = [F[0][None], (2 * F[1][..., None] * q).movedim(-1, 0)]
-            return Jet(torch.cat([*rows, bend(F[1], F[2]).movedim(-1, 0)] if order == 2 else rows), n, order)
+            return Jet(torch.cat([*rows, hessian(F[1], F[2]).movedim(-1, 0)] if order == 2 else rows), n, order)
         qy = (q * y).sum(-1)
         rows = [(2 * F[1] * qy)[None], (4 * (F[2] * qy)[..., None] * q + 2 * F[1][..., None] * y).movedim(-1, 0)]
         if order == 2:
             mixed = 4 * F[2][..., None] * (qi * y[..., j] + qj * y[..., i])
-            rows.append((2 * qy[..., None] * bend(F[2], F[3]) + mixed).movedim(-1, 0))
+            rows.append((2 * qy[..., None] * hessian(F[2], F[3]) + mixed).movedim(-1, 0))
         return Jet(torch.cat(rows), n, order)
 
 
 def baseline_features(
     angles: Sequence[bool], stiffness: Sequence[float], tilt: Sequence[float]
 ) -> tuple[list[str], list[float]]:
-    """Return the baseline's k (1 − cos q) + b sin q, or k q²/2 + b q, as features and their coefficients."""
+    """Return the baseline's k (1 − cos q) + b sin q, or k q²/2 + b q, as features with their coefficients."""
     names, values = [], []
     for i, (angle, k, b) in enumerate(zip(angles, stiffness, tilt, strict=True), 1):
         names += [f"cos(q{i})", f"sin(q{i})"] if angle else [f"q{i}^2", f"q{i}"]
@@ -159,12 +162,12 @@ def baseline_features(
 
 
 def baseline_is_named(config: Any) -> bool:
-    """Whether the first 2n features of a model are its baseline's: at order 4, where nothing else says what V is."""
+    """Whether the first 2n features of a model are its baseline, as at order 4, where features alone make V."""
     return config.order == 4 and not config.alike and not config.translations
 
 
 def named_potential(config: ModelConfig) -> FeaturePotential | None:
-    """Return the features of the position that a model names, at order 4 its baseline's as well; None without any."""
+    """Return the potential of a model's named features, at order 4 with its baseline; None without features."""
     own, values = [], []
     if baseline_is_named(config):
         own, values = baseline_features(config.angles, config.stiffness, config.tilt)
@@ -178,13 +181,13 @@ def named_potential(config: ModelConfig) -> FeaturePotential | None:
 
 
 def sorted_features(names: Sequence[str], angles: Sequence[bool]) -> tuple[list[Feature], list[Feature]]:
-    """Return the features of the potential and of the kinetic term; libraries are expanded and texts parsed."""
+    """Parse names and libraries into the features of the potential and of the kinetic term."""
     features = [parse(text, angles) for text in expand(names, angles)]
     return [f for f in features if not f[0].velocities], [f for f in features if f[0].velocities]
 
 
 def _wave(x: Tensor, k: int) -> Tensor:
-    """Return the k-th derivative of cos; the (k + 3)-th one is the k-th derivative of sin."""
+    """Return the k-th derivative of cos; k + 3 gives the k-th derivative of sin."""
     wave = x.sin() if k % 2 else x.cos()
     return -wave if k % 4 in (1, 2) else wave
 

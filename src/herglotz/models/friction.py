@@ -1,4 +1,4 @@
-"""Forces that one scalar s cannot express (trap 4): friction of each joint and between joints, and inputs."""
+"""Forces that the one scalar s cannot express (trap 4): friction of joints, between joints, and inputs."""
 
 from __future__ import annotations
 
@@ -8,24 +8,28 @@ from torch import Tensor, nn
 from herglotz.errors import InputError
 from herglotz.mechanics import Forces
 from herglotz.models.config import ModelConfig
-from herglotz.models.jet import Jet, pairs
+from herglotz.models.jet import pairs
 from herglotz.models.term import Term
 
-SMOOTH, STRIBECK = 0.02, 0.2  # starting widths v_s and v_st of dry friction, in typical speeds
-SHARPEST = 0.001  # least width, in typical speeds: without a bound sticking would make a step arbitrarily stiff
+# Starting widths v_s and v_st of dry friction, in typical speeds.
+START_SMOOTH_WIDTH, START_STRIBECK_WIDTH = 0.02, 0.2
+# Least width, in typical speeds: without a bound, data with sticking would make a step arbitrarily stiff.
+MIN_WIDTH = 0.001
 
 
 class Friction(nn.Module):
     """f = −b v − (τ + ε e^{−(v/v_st)²}) tanh(v/v_s) + G (u − u₀) for each joint, F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
 
-    b is viscous, τ the Coulomb force and τ + ε the breakaway force of Stribeck's curve; all three are plain parameters
-    of either sign that start at 0 (a logarithm collapses on short horizons and never comes back), so positive friction
-    is found, not forced. Only the widths v_s and v_st, which cannot be 0, are logarithms (above a
-    floor). f is taken at the velocity of
-    the step in both forces, so the step stays order 2, and linear in q1 where friction is viscous alone.
-    With `sticking` dry friction is set-valued, −(τ + ε e^{−(v/v_st)²}) Sgn(v) in place of the tanh, and the whole of it
-    is in F⁻ = c (h/2) f + c h f_dry (Moreau's implicit time-stepping): a joint stands still, Δ = 0 exactly, while
-    |F⁻| ≤ c h (τ + ε) suffices to hold it, and friction's work f_dry Δ is never positive.
+    b is viscous friction, τ the Coulomb force and τ + ε the breakaway force of Stribeck's curve. The three are plain
+    parameters of either sign that start at 0 (a logarithm collapses on short horizons and never comes back), so the
+    data decide the sign of friction. Only the widths v_s and v_st, which cannot be 0, are logarithms above a floor.
+    Both forces take f at the velocity of the step, so the step stays of order 2, and linear in q1 if friction is
+    viscous alone.
+
+    With `sticking` dry friction is set-valued, −(τ + ε e^{−(v/v_st)²}) Sgn(v) in place of the tanh, and acts in F⁻
+    alone, F⁻ = c (h/2) f + c h f_dry (Moreau's implicit time-stepping). A joint stands still, Δ = 0 exactly, while an
+    impulse |F⁻| ≤ c h (τ + ε) suffices to hold the joint, and the work f_dry Δ is never positive.
+
     The map G is learned from 0, or given; u₀ is 0, or learned: the zero of the sensors that recorded u.
     """
 
@@ -37,11 +41,11 @@ class Friction(nn.Module):
         self.viscous = nn.Parameter(zeros(n))
         if self.dry:
             speed = torch.tensor(config.speed, dtype=torch.float64)
-            self.register_buffer("sharpest", SHARPEST * speed, persistent=False)
+            self.register_buffer("sharpest", MIN_WIDTH * speed, persistent=False)
             self.coulomb, self.breakaway = nn.Parameter(zeros(n)), nn.Parameter(zeros(n))
             if not self.sticking:
-                self.log_smooth = nn.Parameter((SMOOTH * speed).log())
-            self.log_stribeck = nn.Parameter((STRIBECK * speed).log())
+                self.log_smooth = nn.Parameter((START_SMOOTH_WIDTH * speed).log())
+            self.log_stribeck = nn.Parameter((START_STRIBECK_WIDTH * speed).log())
         self.sharpest: Tensor
         self.input_map: Tensor
         if config.input_map:
@@ -51,14 +55,15 @@ class Friction(nn.Module):
         self.input_zero = nn.Parameter(zeros(m)) if config.input_zero else None
 
     def grip(self, v: Tensor, more: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
-        """Set-valued friction's |f| = τ⁺ + ε⁺ e^{−(v/v_st)²} at the velocity v, and its slope, (..., n) each.
+        """Set-valued friction's |f| = (τ + more)⁺ + ε⁺ e^{−(v/v_st)²} at the velocity v, and its slope, (..., n) each.
 
-        The positive parts τ⁺ and ε⁺ of τ (and what it has `more` at a position) and ε: friction that pushes would
-        create energy.
+        `more` is the part that depends on the position. Only positive parts count: negative friction would create
+        energy.
         """
-        x = v / (self.sharpest + self.log_stribeck.exp())
-        bump = self.breakaway.relu() * (-(x * x)).exp()
-        return (self.coulomb + more).relu() + bump, -2 * bump * x / (self.sharpest + self.log_stribeck.exp())
+        width = self.sharpest + self.log_stribeck.exp()
+        x = v / width
+        excess = self.breakaway.relu() * (-(x * x)).exp()
+        return (self.coulomb + more).relu() + excess, -2 * excess * x / width
 
     @property
     def widths(self) -> tuple[Tensor, Tensor]:
@@ -70,26 +75,16 @@ class Friction(nn.Module):
         """Return whether f is linear in v."""
         return not self.dry
 
-    def force(self, v: Tensor, u: Tensor | None) -> Jet:
-        """Return f, (..., n), with ∂f_i/∂v_i as its only tangent; without u no input acts."""
-        x = Jet(torch.stack([v, torch.ones_like(v)]), 1, 1)
-        f = x * -self.viscous
+    def value_and_slope(self, v: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return f without set-valued friction, and ∂f_i/∂v_i, each (..., n); without u no input acts."""
+        f, slope = -self.viscous * v, (-self.viscous).expand_as(v)
         if self.dry and not self.sticking:
             smooth, stribeck = self.widths
-            slow = x * (1 / stribeck)
-            f = f - ((-(slow * slow)).exp() * self.breakaway + self.coulomb) * (x * (1 / smooth)).tanh()
-        return f if u is None else f + self.applied(u)
-
-    def value_and_slope(self, v: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the force f and its slopes ∂f_i/∂v_i, each (..., n), without a jet, for an iteration of a step."""
-        f, slope = -self.viscous * v, -self.viscous
-        if self.dry:
-            smooth, stribeck = self.widths
             x, rate = v / stribeck, 1 / smooth
-            t, bump = (v * rate).tanh(), (-(x * x)).exp() * self.breakaway
-            grip = bump + self.coulomb
-            f = f - grip * t
-            slope = slope - grip * (1.0 - t * t) * rate + 2 * bump * x / stribeck * t
+            t, excess = (v * rate).tanh(), (-(x * x)).exp() * self.breakaway
+            size = excess + self.coulomb
+            f = f - size * t
+            slope = slope - size * (1.0 - t * t) * rate + 2 * excess * x / stribeck * t
         return f if u is None else f + self.applied(u), slope
 
     def forward(
@@ -98,11 +93,11 @@ class Friction(nn.Module):
     ) -> Forces:  # fmt: skip
         """Return F⁻ and F⁺ at the velocity v (..., n), with derivatives at order 2.
 
-        `more` is what set-valued friction has beside τ at q0, (..., n), and its slope there, (..., n, n).
+        `more` is the position-dependent part of set-valued friction at q0, (..., n), and its slope, (..., n, n).
         """
-        f = self.force(v, u)
+        f, slope = self.value_and_slope(v, u)
         before, after = (c * h / 2)[..., None], (h / 2)[..., None]
-        minus, plus = before * f.value, after * f.value
+        minus, plus = before * f, after * f
         held, grip, grip_slope = None, None, torch.zeros_like(v)
         if self.dry and self.sticking:
             grip, grip_slope = self.grip(v, 0.0 if more is None else more[0])
@@ -111,7 +106,7 @@ class Friction(nn.Module):
             grip_slope = grip_slope * v.sign()
         if order == 1:
             return Forces(minus, plus, held=held, grip=grip)
-        slope = f.gradient[0]  # ∂f/∂q1 = slope / h
+        # ∂f/∂q1 = slope / h
         minus_2 = torch.diag_embed((c / 2)[..., None] * slope - c[..., None] * grip_slope)
         minus_1 = -minus_2
         if more is not None and grip is not None:
@@ -135,9 +130,8 @@ class Friction(nn.Module):
 class CoupledFriction(Term):
     """f_i = −Σ_{j≠i} b_ij v_j with b symmetric, beside the b_ii of `Friction`: F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
 
-    Two links with angles from the vertical and viscous hinges b have b₁₁ = 2b, b₂₂ = b and b₁₂ = −b, which one number a
-    coordinate cannot say. The entries are plain parameters that start at 0; b is positive semidefinite where the data
-    say so, not by construction.
+    Two links with angles from the vertical and viscous hinges b have b₁₁ = 2b, b₂₂ = b and b₁₂ = −b, which
+    no number per coordinate expresses. The entries are plain parameters that start at 0; b may be indefinite.
     """
 
     def __init__(self, config: ModelConfig):

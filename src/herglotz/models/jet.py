@@ -1,13 +1,13 @@
 """Second-order jets: a function's value, gradient and Hessian carried together, in closed form.
 
-A jet holds f, ∂_i f and ∂_i ∂_j f (i ≤ j) with respect to d tangent directions as rows of one tensor of shape
-(1 + d + d(d+1)/2, ...), tangent index first, so that a network layer is a single matrix product. Sums, products,
-`exp`, `sin`, … follow the product and chain rules, and a Lagrangian written in jets reads like its formula:
+A jet holds f, ∂_i f and ∂_i ∂_j f (i ≤ j) along d tangent directions as rows of one tensor of shape
+(1 + d + d(d+1)/2, ...), so that a network layer is a single matrix product. Sums, products, `exp`, `sin`, … follow the
+product and chain rules, and a Lagrangian written in jets reads like its formula:
 
     L = (c - 1) * (s0 - h / 2 * V0) + K - h / 2 * (V0 + V1)
 
 At order 1 the Hessian rows are absent, at order 0 there are no tangent directions. Every operation is an ordinary torch
-operation: autograd and vmap go through.
+operation, so autograd and vmap apply.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def pairs(d: int, device: torch.device) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=64)
 def _unpack_index(d: int, device: torch.device) -> Tensor:
-    """(d, d) matrix of row numbers: where ∂_i ∂_j f stands among the Hessian rows."""
+    """(d, d) the row number of ∂_i ∂_j f among the Hessian rows."""
     i, j = pairs(d, device)
     index = torch.zeros(d, d, dtype=torch.long, device=device)
     index[i, j] = index[j, i] = torch.arange(len(i), device=device)
@@ -39,14 +39,14 @@ def _unpack_index(d: int, device: torch.device) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _upper_index(d: int, device: torch.device) -> Tensor:
-    """Where ∂_i ∂_j f, i ≤ j, stand among all d² of them: one index, for ONNX takes entries along one axis."""
+    """Indices of ∂_i ∂_j f, i ≤ j, in the flattened (d, d) matrix: ONNX takes entries along one axis."""
     i, j = pairs(d, device)
     return d * i + j
 
 
 @lru_cache(maxsize=64)
 def _embed_index(d: int, size: int, offset: int, order: int, device: torch.device) -> Tensor:
-    """Row numbers that place a jet over d tangents inside one over `size`; the last row (zeros) fills the rest."""
+    """Row numbers that place a jet over d tangents in a jet over `size`; the last row (zeros) fills the rest."""
     slot = {offset + k: k for k in range(d)}
     unpack = _unpack_index(d, torch.device("cpu")).tolist()
     zero = 1 + d + (d * (d + 1) // 2 if order == 2 else 0)
@@ -69,7 +69,7 @@ class Jet:
         self._parts: tuple[Tensor, ...] | None = None
 
     def _split(self) -> tuple[Tensor, ...]:
-        """The rows of f, its gradient and its Hessian: what is split at once is joined at once on the way back."""
+        """The rows of f, its gradient and its Hessian, split once so that the backward pass joins them once."""
         if self._parts is None:
             d = self.tangents
             self._parts = self.data.split([1, d, len(self.data) - 1 - d])
@@ -190,14 +190,14 @@ class Jet:
     __rmul__ = __mul__
 
     def embed(self, size: int, offset: int) -> Jet:
-        """The same function seen as one of `size` variables, its own starting at `offset`."""
+        """The same function as a jet over `size` variables, of which its own start at `offset`."""
         index = _embed_index(self.tangents, size, offset, self.order, self.data.device)
         rows = torch.cat([self.data, torch.zeros_like(self.data[:1])])
         return Jet(rows[index], size, self.order)
 
 
 def of_mean(jet: Jet) -> Jet:
-    """A function of q̄ = (q0 + q1)/2 as one of (q0, q1): from a jet over n components to one over 2n."""
+    """A function of q̄ = (q0 + q1)/2, given as a jet over the n components of q̄, as a jet over (q0, q1)."""
     n, half = jet.tangents, jet.gradient / 2
     rows = [jet.value[None], half, half]
     if jet.order == 2:
@@ -210,19 +210,22 @@ def of_mean_and_velocity(
     value: Tensor,  # (...)
     by_q: Tensor,  # (n, ...)
     by_v: Tensor,  # (n, ...)
-    second: tuple[Tensor, Tensor, Tensor] | None,  # rows ∂q_i ∂q_j for i ≤ j, ∂v_i ∂q_j (n, n, ...), rows ∂v_i ∂v_j
+    second: tuple[Tensor, Tensor, Tensor] | None,
     h: Tensor,  # (...)
 ) -> Jet:
-    """A function of q̄ = (q0 + q1)/2 and v = (q1 − q0)/h as a jet over (q0, q1), from its derivatives by q̄ and v."""
+    """A function of q̄ = (q0 + q1)/2 and v = (q1 − q0)/h as a jet over (q0, q1), from its derivatives by q̄ and v.
+
+    `second` holds the rows ∂q_i ∂q_j for i ≤ j, the matrix ∂v_i ∂q_j (n, n, ...), and the rows ∂v_i ∂v_j for i ≤ j.
+    """
     n, half, slope = len(by_q), by_q / 2, by_v / h
     rows = [value[None], half - slope, half + slope]
     if second is not None:
         unpack = _unpack_index(n, value.device)
-        same, move, mixed = second[0][unpack] / 4, second[2][unpack] / (h * h), second[1] / (2 * h)
-        turned = mixed.transpose(0, 1)
-        ends, sides, across = same + move, mixed + turned, same - move + turned - mixed
-        every = torch.cat([torch.cat([ends - sides, across], 1), torch.cat([across.transpose(0, 1), ends + sides], 1)])
-        rows.append(every.flatten(0, 1)[_upper_index(2 * n, value.device)])
+        qq, vv, vq = second[0][unpack] / 4, second[2][unpack] / (h * h), second[1] / (2 * h)
+        qv = vq.transpose(0, 1)
+        same, mixed, across = qq + vv, vq + qv, qq - vv + qv - vq
+        H = torch.cat([torch.cat([same - mixed, across], 1), torch.cat([across.transpose(0, 1), same + mixed], 1)])
+        rows.append(H.flatten(0, 1)[_upper_index(2 * n, value.device)])
     return Jet(torch.cat(rows), 2 * n, 1 if second is None else 2)
 
 

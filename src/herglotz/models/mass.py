@@ -11,16 +11,17 @@ from herglotz.models.network import Network, feature_count, position_features
 from herglotz.models.phase import Phase
 from herglotz.models.terms import Kinetic
 
-BOUND = 2.0  # a diagonal factor of the mass stays within e^±2 of its value at q = 0
+# A diagonal factor of the mass stays within e^±2 of its value at q = 0.
+MAX_LOG_FACTOR = 2.0
 
 
 class PositionKinetic(nn.Module):
-    """K = h |Tᵀ C̄ᵀ v|² / 2, so m(q̄) = C̄ T(q̄) T(q̄)ᵀ C̄ᵀ: symmetric and positive definite for every weight.
+    """K = h |Tᵀ C̄ᵀ v|² / 2, so m(q̄) = C̄ T(q̄) T(q̄)ᵀ C̄ᵀ is symmetric and positive definite for every weight.
 
-    C̄ is the constant Cholesky factor of `Kinetic`, T(q̄) a lower triangular matrix made by one zero-initialised
-    network of the position's features: T_ii = exp(2 tanh(r_ii / 2)), within e^±2 of 1, and T_ij = r_ij below the
-    diagonal. The network's value at q = 0 is subtracted, so T(0) = I: C̄C̄ᵀ is the mass at q = 0, and C̄₁₁ = 1 fixes
-    there the scale of L_d, which positions do not determine (gauge).
+    C̄ is the constant Cholesky factor of `Kinetic`. The lower triangular matrix T(q̄) comes from one zero-initialised
+    network r of the position's features: T_ii = exp(2 tanh(r_ii / 2)), within e^±2 of 1, and T_ij = r_ij below the
+    diagonal. The network's value at q = 0 is subtracted, so T(0) = I and C̄C̄ᵀ is the mass at q = 0, where C̄₁₁ = 1 fixes
+    the scale of L_d that positions do not determine (gauge).
     """
 
     def __init__(self, config: ModelConfig, generator: torch.Generator):
@@ -34,12 +35,11 @@ class PositionKinetic(nn.Module):
         place = torch.zeros(n, len(row), dtype=torch.float64)
         place[column, torch.arange(len(row))] = 1.0
         origin = torch.cat([torch.tensor([0.0, 1.0] if a else [0.0], dtype=torch.float64) for a in config.angles])
-        self.register_buffer("row", row, persistent=False)
-        self.register_buffer("place", place, persistent=False)  # (n, pairs) adds each pair to its column
-        self.register_buffer("origin", origin, persistent=False)  # features of q = 0
-        self.row: Tensor
-        self.place: Tensor
-        self.origin: Tensor
+        for name, value in (("row", row), ("place", place), ("origin", origin)):
+            self.register_buffer(name, value, persistent=False)
+        self.row: Tensor  # (pairs) row of each entry below the diagonal
+        self.place: Tensor  # (n, pairs) has 1 at the column of each entry
+        self.origin: Tensor  # (m) features of q = 0
 
     def mass(self, q: Tensor) -> Tensor:
         """Return m(q), (..., n, n), in units of the first coordinate's mass at q = 0; q is (..., n)."""
@@ -53,15 +53,18 @@ class PositionKinetic(nn.Module):
     def forward(self, phase: Phase) -> Jet:
         """Return K as a jet over (q0, q1)."""
         diagonal, below = self._factors(phase.position)
-        w = phase.velocity.linear(self.constant.factor().T)  # C̄ᵀ v
-        turned = diagonal * w
-        if len(self.row):  # a file takes no tensor without entries
-            turned = turned + (below * w.select(self.row)).linear(self.place)
-        return (turned * turned).sum() * (phase.h / 2)
+        # w = C̄ᵀ v, and then Tᵀ w.
+        w = phase.velocity.linear(self.constant.factor().T)
+        Tw = diagonal * w
+        # Exported files take no tensor without entries.
+        if len(self.row):
+            Tw = Tw + (below * w.select(self.row)).linear(self.place)
+        return (Tw * Tw).sum() * (phase.h / 2)
 
     def _factors(self, x: Jet) -> tuple[Jet, Jet]:
         """Return the diagonal (..., n) of T and the entries below it (..., n(n−1)/2)."""
         n = self.constant.dof
         at_zero = self.network(Jet(self.origin[None], 0, 1)).value
         r = self.network(x) - at_zero
-        return ((r.select(slice(0, n)) / BOUND).tanh() * BOUND).exp(), r.select(slice(n, None))
+        log_diagonal = (r.select(slice(0, n)) / MAX_LOG_FACTOR).tanh() * MAX_LOG_FACTOR
+        return log_diagonal.exp(), r.select(slice(n, None))

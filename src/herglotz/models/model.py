@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,15 +26,15 @@ from herglotz.models.phase import Phase
 from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
 
-# Of the time that a motion takes: damping changes nothing meanwhile, and float32 still has 1/h².
-INSTANT = 2.0**-50
+# A step that stands for h → 0, in typical times scale/speed: damping is negligible, and 1/h² is finite in float32.
+VANISHING_STEP = 2.0**-50
 
 
 def numbers_of(model: ContactLagrangian) -> dict[str, tuple[str, int]]:
-    """Parameter and entry of every number that a model learns, by its name: `damping.rate`, `friction.viscous[1]`.
+    """Name, parameter and entry of every number that a model learns: `damping.rate`, `friction.viscous[1]`.
 
-    The numbers stand in the order of the parameters. The baseline's springs and tilts have the same names at both
-    orders of the rule: at order 4 these are the first features, −k and b of an angle, k/2 and b of a length.
+    The order is that of the parameters. The springs and tilts of the baseline have the same names at both orders of
+    the rule; at order 4 the first features stand for them, −k and b of an angle, k/2 and b of a length.
     """
     own, n = baseline_is_named(model.config), model.config.dof
     found = {}
@@ -50,6 +50,11 @@ def numbers_of(model: ContactLagrangian) -> dict[str, tuple[str, int]]:
     return found
 
 
+def listed(numbers: Iterable[str]) -> str:
+    """Names of numbers for an error message, without the hundreds of weights of networks."""
+    return ", ".join(name for name in numbers if ".network." not in name)
+
+
 @dataclass(frozen=True)
 class Terms:
     """The jets of a model's terms at a set of points, for reports and tests; None for a term that the model lacks."""
@@ -59,7 +64,7 @@ class Terms:
     V0: Jet | None
     V1: Jet | None
     N: Jet | None
-    b: Jet | None  # inputs of the full level's units, made of q̄ and v
+    b: Jet | None  # (..., J) offsets of the full level's units, from q̄ and v
 
 
 class ContactLagrangian(nn.Module):
@@ -70,10 +75,10 @@ class ContactLagrangian(nn.Module):
     * affine: g depends on position and velocity.
     * full: the map of s over a step is half a step of `ActionFlow`, e^{g/2}, + K, e^{g/2}, and the flow's other half.
     * full and forced with `dissipation`: the same with `ActionPowers`, g = −γh and the work of inputs in L. Other
-      forces then have the weight 1 + D3 where they have c.
+      forces then have the weight 1 + D3 in place of c.
 
-    A discrete Lagrangian for `herglotz.mechanics`: call it for the value, `partials` for closed-form derivatives.
-    Every step h is allowed, and may differ from sample to sample.
+    The model is a discrete Lagrangian for `herglotz.mechanics`: a call returns the value, `partials` the closed-form
+    derivatives. Every step h is allowed, and may differ from sample to sample.
 
     Positions do not determine L_d (gauge): s′ = f(q, s) gives the same motion. The mass's first entry is fixed at 1,
     which leaves s′ = s + b(q) — within the span of the terms — and a constant shift of s. Only priors fix these two.
@@ -91,7 +96,8 @@ class ContactLagrangian(nn.Module):
         make = torch.Generator().manual_seed(c.seed)
         potential, damping = Potential(c, make), _damping(c, make)
         correction = Correction(c, make) if c.correction_width else None
-        self.kinetic = kinetic_term(c, make)  # drawn after the others, but first of the parameters
+        # The kinetic term draws its weights after the others, but stands first among the parameters.
+        self.kinetic = kinetic_term(c, make)
         self.potential, self.damping, self.correction = potential, damping, correction
         self.action = _action(c, make)
         self.friction = Friction(c) if c.level == "forced" else None
@@ -102,12 +108,11 @@ class ContactLagrangian(nn.Module):
         self._leave_out(c.absent)
 
     def _leave_out(self, absent: Sequence[str]) -> None:
-        """Fix these numbers at 0: `herglotz.training.parameter_vector` leaves fixed numbers out of a fit."""
+        """Set the `absent` numbers to 0; `herglotz.training.parameter_vector` leaves them out of a fit."""
         known = numbers_of(self)
         for name in absent:
             if name not in known:
-                own = ", ".join(other for other in known if ".network." not in other)  # weights are hundreds
-                raise InputError(f"absent: the model has no number '{name}'; its numbers are {own}")
+                raise InputError(f"absent: the model has no number '{name}'; its numbers are {listed(known)}")
             parameter, i = known[name]
             self.get_parameter(parameter).data.view(-1)[i] = 0.0
 
@@ -118,7 +123,7 @@ class ContactLagrangian(nn.Module):
 
     @property
     def forces_between(self) -> list[Term]:
-        """The terms with a force that may depend on every velocity."""
+        """The terms whose force may depend on every velocity."""
         known = [] if self.coupling is None else [self.coupling]
         return known + [term for term in self.named_terms if term.has_force()]
 
@@ -134,7 +139,7 @@ class ContactLagrangian(nn.Module):
 
     @property
     def s_enters_motion(self) -> bool:
-        """Whether the positions depend on s at all, as at the affine and full levels."""
+        """Whether the positions depend on s, as at the affine and full levels."""
         return self.capabilities.carries_s
 
     @property
@@ -161,7 +166,7 @@ class ContactLagrangian(nn.Module):
         )
 
     def terms(self, phase: Phase, instant: bool = False) -> Terms:
-        """Evaluate every term once; in an `instant` the potential moves nothing, and is not evaluated."""
+        """Evaluate every term once; in an `instant`, the limit h → 0, the potential is 0 and not evaluated."""
         order, n = phase.order, phase.q0.shape[-1]
         g = None if self.damping is None else self.damping(phase)
         N = None if self.correction is None else self.correction(phase)
@@ -171,7 +176,8 @@ class ContactLagrangian(nn.Module):
         K = self.kinetic(phase)
         if instant:
             return Terms(g, K, K * 0.0, K * 0.0, N, b)
-        V = self.potential(torch.stack([phase.q0, phase.q1]), order)  # both ends in the same network call
+        # One call of the network serves both ends.
+        V = self.potential(torch.stack([phase.q0, phase.q1]), order)
         V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
         if self.config.order == 4:
             N = self._missing(phase, V0, V1)
@@ -184,16 +190,16 @@ class ContactLagrangian(nn.Module):
         s0: Tensor,  # (...)
         h: Tensor | float,
         order: int = 1,
-        u: Tensor | None = None,  # (..., m) input; None: no input acts
+        u: Tensor | None = None,  # (..., m)
     ) -> Partials:
-        """Value and derivatives in closed form; see `herglotz.mechanics.partials`."""
+        """Value and derivatives in closed form, see `herglotz.mechanics.partials`; without u no input acts."""
         q0, q1, s0 = torch.broadcast_tensors(q0, q1, s0[..., None])
         return self._evaluate(self._phase(q0, q1, s0[..., 0], h, order), s0[..., 0], u)
 
     def partials_increment(
         self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor | float, order: int = 1, u: Tensor | None = None
     ) -> Partials:
-        """`partials` at (q0, q0 + Δ, s0), without the rounding of q1 − q0 when the step is small."""
+        """`partials` at (q0, q0 + Δ, s0), without the rounding of q1 − q0 in a small step."""
         q0, delta, s0 = torch.broadcast_tensors(q0, delta, s0[..., None])
         return self._evaluate(self._phase(q0, q0 + delta, s0[..., 0], h, order, delta), s0[..., 0], u)
 
@@ -205,9 +211,10 @@ class ContactLagrangian(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return p = L_v (..., n) and L_vv (..., n, n) of the model's L(q, v, s) = lim L_d(q, q + hv, s, h)/h, h → 0.
 
-        L_v and L_vv are the limits of D2 L_d and h D22 L_d: jets divide by h and subtract nothing.
+        L_v and L_vv are the limits of D2 L_d and h D22 L_d, evaluated at one tiny h: jets divide by h without
+        subtracting, so nothing cancels.
         """
-        h = torch.full_like(s, INSTANT * max(self.config.scale) / max(self.config.speed))
+        h = torch.full_like(s, VANISHING_STEP * max(self.config.scale) / max(self.config.speed))
         phase = Phase(q, q, h, 2, self.config, v * h[..., None])
         P = self._assembled(self.terms(phase, instant=True), phase, s, None)
         return P.D2, P.D22 * h[..., None, None]
@@ -215,7 +222,7 @@ class ContactLagrangian(nn.Module):
     def forces(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, u: Tensor | None = None
     ) -> tuple[Tensor, Tensor] | None:
-        """F⁻ and F⁺, each (..., n), in units of momentum; None at every level but `forced`."""
+        """F⁻ and F⁺, each (..., n), in units of momentum; None except at the level forced."""
         if self.friction is None:
             return None
         force = self._evaluate(self._phase(q0, q1, s0, h, 1), s0, u).force
@@ -231,19 +238,19 @@ class ContactLagrangian(nn.Module):
         return DrivenLagrangian(self, u)
 
     def typical_increment(self, h: Tensor) -> Tensor:
-        """The size of q1 − q0 at the data's top speed, shaped like h: the unit of the rounding of networks.
+        """The size of q1 − q0 at the data's top speed, shaped like h: the unit of the networks' rounding.
 
-        Networks do not vanish near rest as the motion does: rounding there leaves J⁻¹F of some eps of this size.
+        Networks do not vanish near rest as the motion does, so rounding leaves a J⁻¹F of some eps of this size.
         """
         return h * max(self.config.speed)
 
     def forward(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0, u: Tensor | None = None
     ) -> Tensor | Partials:
-        """L_d, shape (...); with `order` 1 or 2 its `Partials` (so that functional_call reaches both)."""
+        """L_d, shape (...); with `order` 1 or 2 its `Partials`, so that functional_call reaches both."""
         if not order:
             return self.partials(q0, q1, s0, h, 1).L
-        return self.partials(q0, q1, s0, h, order) if u is None else self.partials(q0, q1, s0, h, order, u)
+        return self.partials(q0, q1, s0, h, order, u)
 
     def _phase(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int, delta: Tensor | None = None
@@ -258,7 +265,7 @@ class ContactLagrangian(nn.Module):
         return self._assembled(terms, phase, s0, self._forces(phase, u))
 
     def _driven(self, t: Terms, phase: Phase, f: Tensor) -> Terms:
-        """The terms with the potential −f·q of the force f (..., n) of inputs: s gathers their work."""
+        """The terms with the potential −f·q of the inputs' force f (..., n), so that L has the work of the inputs."""
         assert t.V0 is not None
         assert t.V1 is not None
         n, order = self.dof, phase.order
@@ -272,7 +279,8 @@ class ContactLagrangian(nn.Module):
             return P if force is None else replace(P, force=force.weighted(P))
         c = None if t.g is None else t.g.exp()
         if t.K is None or t.V0 is None or t.V1 is None:
-            assert t.N is not None  # checked by ModelConfig
+            # ModelConfig has checked that there is a correction.
+            assert t.N is not None
             L = t.N if c is None else t.N + (c - 1.0) * s0
         else:
             V = h / 2 * (t.V0 + t.V1)
@@ -281,30 +289,31 @@ class ContactLagrangian(nn.Module):
         return affine_partials(L, t.g, c, s0, force)
 
     def _through_action(self, action: ActionFlow | ActionPowers, t: Terms, s0: Tensor, h: Tensor, order: int) -> Jet:
-        """L = s1 − s0 at the full level, over the 2n + 1 variables (q0, q1, s0), as a sum of increments."""
+        """L = s1 − s0 at the full level as a jet over (q0, q1, s0), built as a sum of increments of s."""
         size = 2 * self.dof + 1
         wide = lambda jet: None if jet is None else jet.embed(size, 0)  # noqa: E731
-        s = affine(s0, torch.eye(size, dtype=s0.dtype, device=s0.device)[-1], order)  # the last variable
+        s = affine(s0, torch.eye(size, dtype=s0.dtype, device=s0.device)[-1], order)
         K, V0, V1, N, b = map(wide, (t.K, t.V0, t.V1, t.N, t.b))
         assert t.g is not None
-        half_c = (t.g / 2).expm1()  # √c − 1
-        half_c = half_c.embed(size, 0) if isinstance(half_c, Jet) else half_c
+        root_less_1 = (t.g / 2).expm1()  # (...) √c − 1
+        root_less_1 = root_less_1.embed(size, 0) if isinstance(root_less_1, Jet) else root_less_1
         gained = s * 0.0 if V0 is None else -h / 2 * V0
         gained = action(s, gained, b, h)
-        gained = gained + half_c * (s + gained)
+        gained = gained + root_less_1 * (s + gained)
         gained = gained if K is None else gained + K
-        gained = gained + half_c * (s + gained)
+        gained = gained + root_less_1 * (s + gained)
         gained = action(s, gained, b, h, backward=True)
         gained = gained if V1 is None else gained - h / 2 * V1
         return gained if N is None else gained + N
 
     def _missing(self, phase: Phase, V0: Jet, V1: Jet) -> Jet:
-        """The correction that makes the rule of order 2 a rule of order 4."""
+        """The correction that turns the rule of order 2 into a rule of order 4."""
         features, kinetic, damping = self.potential.features, self.kinetic, self.damping
-        assert features is not None  # the baseline at least
+        # ModelConfig has checked the three: there are features, at least the baseline's.
+        assert features is not None
         assert not isinstance(kinetic, PositionKinetic)
         assert not isinstance(damping, AffineDamping)
-        # A constant, not a function of q0: ONNX treats a matrix for each sample and a matrix of the model differently.
+        # γ = 0 is a constant, not a function of q0: ONNX treats matrices of samples and of the model differently.
         rate = torch.zeros((), dtype=phase.q0.dtype, device=phase.q0.device) if damping is None else damping.rate
         return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 

@@ -10,24 +10,38 @@ from torch import Tensor, nn
 
 from herglotz.models.jet import Jet, affine, concatenate
 
-ACTIVATIONS = ("tanh", "softplus", "silu")  # methods of `Jet`
+# Methods of `Jet`. All are smooth: a Hessian of 0 would make the step equation singular (trap 6).
+ACTIVATIONS = ("tanh", "softplus", "silu")
 
 
 class Network(nn.Module):
     """Perceptron R^m → R (or R^k) with a zero-initialised last layer, so that a new model equals its baseline.
 
-    (`zero=False` draws the last layer too, for a model that has no baseline.)
+    Parameters
+    ----------
+    sizes
+        m, then the hidden units of each layer.
+    gain
+        Size of the initial weights relative to 1/√inputs; below 1 the network starts smooth.
+    generator
+        Generator of the initial weights.
+    zero
+        False draws the last layer too, for a model without a baseline.
+    outputs
+        Number k of outputs; None: a scalar.
+    activation
+        One of `ACTIVATIONS`.
     """
 
     def __init__(
         self,
-        sizes: Sequence[int],  # m, then the hidden units of each layer
-        gain: float,  # size of the initial weights relative to 1/√inputs: below 1 the network starts smooth
+        sizes: Sequence[int],
+        gain: float,
         generator: torch.Generator,
         *,
         zero: bool = True,
-        outputs: int | None = None,  # k; None: a scalar
-        activation: str = "tanh",  # of `ACTIVATIONS`: smooth, so that the Hessian is no zero (trap 6)
+        outputs: int | None = None,
+        activation: str = "tanh",
     ):
         super().__init__()
         self.activation, self.scalar = activation, outputs is None
@@ -46,16 +60,15 @@ class Network(nn.Module):
 
     @property
     def layers(self) -> list[Tensor]:
-        """The weights; the first reads features through the projection `blind`, where there is one."""
+        """The weights; the first layer reads the features through the projection `blind`, if there is one."""
         first, *rest = self.weights
         return [first if self.blind is None else first @ self.blind, *rest]
 
     def forward(self, x: Jet) -> Jet:
         """Apply the network to a jet of features (..., m); the result is a scalar jet, or (..., k)."""
-        hidden = self.layers[:-1]
+        *hidden, last = self.layers
         for weight, bias in zip(hidden, self.biases, strict=True):
             x = getattr(x.linear(weight, bias), self.activation)()
-        last = self.weights[len(hidden)]
         return x.linear(last).select(0) if self.scalar else x.linear(last)
 
 
@@ -80,7 +93,8 @@ def midpoint_velocity_jets(
     n = q0.shape[-1]
     eye = torch.eye(n, dtype=q0.dtype, device=q0.device)
     shape = q0.shape[:-1]
-    shape = shape if shape == h.shape else torch.broadcast_shapes(shape, h.shape)  # 0.1 ms, of a step's 10
+    # `broadcast_shapes` takes 0.1 ms of a step's 10 ms.
+    shape = shape if shape == h.shape else torch.broadcast_shapes(shape, h.shape)
     q0, q1 = q0.expand(*shape, n), q1.expand(*shape, n)
     rate = 1 / h.expand(shape)[..., None]  # (..., 1)
     eye_v = eye.reshape(n, *(1,) * len(shape), n) * rate  # (n, ..., n)

@@ -1,12 +1,12 @@
-"""The error of a rule of order 2 against the exact L_d, to order 4, from V and K: no further parameters.
+"""The correction of the rule of order 2 to order 4, from V and K alone, without further parameters.
 
 Between q0 and q1 the motion leaves the straight line by δ(τ) = a (τ² − h²/4)/2, |τ| ≤ h/2. With
 e = L_q − L_vq v − γ L_v at (q̄, v) and M = L_vv, the action of L = K − V − γ s is, to O(h⁵),
 
     L_d = (c − 1) s0 + √c ( h K + h³/24 (K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e) ) − h/6 (c V0 + 4 √c V(q̄) + V1),
 
-the integral along the line (Simpson's rule for V) and what the bend gains. With c = 1, a constant mass and V alone
-this is the force-gradient action of M. Takahashi and M. Imada, J. Phys. Soc. Jpn. 53 (1984) 3765.
+the integral along the straight line (Simpson's rule for V) plus the gain of the deviation δ. With c = 1, a constant
+mass and V alone L_d is the force-gradient action of M. Takahashi and M. Imada, J. Phys. Soc. Jpn. 53 (1984) 3765.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class Slope:
         self.potential, self.rate, self.phase = potential, rate, phase
         self.features = kinetic if isinstance(kinetic, FeatureKinetic) else None
         base = kinetic.base if isinstance(kinetic, FeatureKinetic) else kinetic
-        assert isinstance(base, Kinetic)  # ModelConfig checked
+        # ModelConfig refuses other masses at order 4.
+        assert isinstance(base, Kinetic)
         self.constant = base.mass()
         e = self._force()
         self.mass = self.constant.expand(*phase.q0.shape, phase.q0.shape[-1])
@@ -39,24 +40,24 @@ class Slope:
     def gain(self) -> Jet:
         """The jet of eᵀM⁻¹e = max_y 2yᵀe − yᵀMy.
 
-        With y = M⁻¹e held, its second derivative is (2yᵀe − yᵀMy)″ + 2 EᵀM⁻¹E, E the columns ∂_i(e − My): nothing
-        beyond the features' derivatives along y is needed.
+        At the constant y = M⁻¹e the second derivative is (2yᵀe − yᵀMy)″ + 2 EᵀM⁻¹E, where E has the columns
+        ∂_i(e − My). Only the features' derivatives along y are needed.
         """
         y = self.y
         out = self._along(self.phase, y, y / 2) * 2.0
         if out.order == 1:
             return out
         E = self._slope(y)
-        bend = 2 * E.transpose(-1, -2) @ solve(self.mass, E)
+        second = 2 * E.transpose(-1, -2) @ solve(self.mass, E)
         i, j = pairs(out.tangents, y.device)
-        more = bend.flatten(-2)[..., i * out.tangents + j].movedim(-1, 0)
-        return Jet(torch.cat([out.data[: 1 + out.tangents], out.data[1 + out.tangents :] + more]), out.tangents, 2)
+        rows = second.flatten(-2)[..., i * out.tangents + j].movedim(-1, 0)
+        return Jet(torch.cat([out.data[: 1 + out.tangents], out.data[1 + out.tangents :] + rows]), out.tangents, 2)
 
     def _along(self, phase: Phase, b: Tensor, y: Tensor) -> Jet:
         """The scalar bᵀ(e − M y) as a jet over (q0, q1), for constant b and y, (..., n)."""
-        push = b @ self.constant
+        bm = b @ self.constant
         out = -of_mean(self.potential(phase.mean.value, phase.order, b))
-        out = out - (phase.velocity * push).sum() * self.rate - (push * y).sum(-1)
+        out = out - (phase.velocity * bm).sum() * self.rate - (bm * y).sum(-1)
         return out if self.features is None else out + self.features.along(phase, b, y, self.rate)
 
     def _force(self) -> Tensor:
@@ -65,19 +66,19 @@ class Slope:
         e = -slope - self.rate * (self.phase.velocity.value @ self.constant)
         if self.features is None:
             return e
-        still = torch.zeros_like(e)
-        return e + self.features.along(*self._copies(still, 0), self.rate).value.movedim(0, -1)
+        y = torch.zeros_like(e)
+        return e + self.features.along(*self._copies(y, 0), self.rate).value.movedim(0, -1)
 
     def _slope(self, y: Tensor) -> Tensor:
         """The derivatives of e − M y along (q0, q1) for a constant y, (..., n, 2n)."""
         if self.features is not None:
             return self._along(*self._copies(y, 1)).gradient.movedim((1, 0), (-2, -1))
-        bend = self.potential(self.phase.mean.value, 2).hessian().movedim((0, 1), (-2, -1)) / 2
+        V_qq = self.potential(self.phase.mean.value, 2).hessian().movedim((0, 1), (-2, -1)) / 2
         drag = self.rate * self.constant / self.phase.h[..., None, None]
-        return torch.cat([drag - bend, -drag - bend], -1)
+        return torch.cat([drag - V_qq, -drag - V_qq], -1)
 
     def _copies(self, y: Tensor, order: int) -> tuple[Phase, Tensor, Tensor]:
-        """One copy of (q0, q1) and of y for each coordinate, (n, ...), with its direction: all of e − M y at once."""
+        """Return n copies of (q0, q1) and y, (n, ...), and the n unit vectors b, for all of e − M y at once."""
         p, n = self.phase, self.phase.q0.shape[-1]
         delta = None if p.delta is None else p.delta.expand(n, *p.q0.shape)
         h = p.h.expand(n, *p.q0.shape[:-1])
@@ -87,7 +88,7 @@ class Slope:
 
 
 def missing(slope: Slope, V0: Jet, V1: Jet, root: Tensor) -> Jet:
-    """The exact L_d less √c K − h/2 (c V0 + V1), to O(h⁵), over (q0, q1); `root` is √c."""
+    """The exact L_d minus √c K − h/2 (c V0 + V1), to O(h⁵), as a jet over (q0, q1); `root` is √c."""
     phase, rate = slope.phase, slope.rate
     h = phase.h
     v = phase.velocity
@@ -110,5 +111,6 @@ def solve(matrix: Tensor, b: Tensor) -> Tensor:
         adjugate = torch.stack([torch.stack([s, -q], -1), torch.stack([-r, p], -1)], -2)
         x = adjugate @ x / (p * s - q * r)[..., None, None]
     else:
-        x = torch.linalg.inv_ex(matrix)[0] @ x  # torch's forward-mode derivative of a solve is wrong under vmap
+        # The inverse, because torch's forward-mode derivative of a solve is wrong under vmap.
+        x = torch.linalg.inv_ex(matrix)[0] @ x
     return x[..., 0] if vector else x

@@ -1,4 +1,4 @@
-"""A user's own L_d in place of a model: the attributes that fits, exports and files read."""
+"""A user's own L_d in place of a model, with the attributes that fits, exports and files read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from herglotz.mechanics.functional import functional_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.driven import DrivenLagrangian
 
-# Nothing is known of its terms: every step iterates, and s may enter the motion.
+# The terms of a user's L_d are unknown: every step iterates, and s may enter the motion.
 UNKNOWN = Capabilities(
     order=2, baseline=False, constant_mass=False, constant_c=False, known_damping=False, correction=True,
     action_flow=True, nonlinear_force=False, sticking=False, coupling=False,
@@ -25,14 +25,17 @@ UNKNOWN = Capabilities(
 
 @dataclass(frozen=True)
 class OwnConfig:
-    """The description of a user's L_d, by the names of `ModelConfig`."""
+    """The description of a user's L_d, in the names of `ModelConfig`.
 
-    name: str  # of its class or function
-    angles: tuple[bool, ...]
+    `name` is that of the class or function. The level is "forced" for an L_d with forces, whose map is no contact map.
+    """
+
+    name: str
+    angles: tuple[bool, ...]  # (n,)
     scale: tuple[float, ...]  # (n,) typical sizes of q
-    speed: tuple[float, ...]  # (n,) and of its rate
+    speed: tuple[float, ...]  # (n,) typical sizes of q̇
     inputs: int = 0
-    level: str = "full"  # "forced" for an L_d with forces, whose map is no contact map
+    level: str = "full"
     baseline: bool = False
     absent: tuple[str, ...] = ()
     order: int = 2
@@ -71,10 +74,11 @@ class OwnLagrangian(nn.Module):
     """
 
     friction = damping = kinetic = correction = None
-    potential = SimpleNamespace(network=None, features=None)  # none
+    potential = SimpleNamespace(network=None, features=None)
     named_terms = ()
     capabilities = UNKNOWN
-    s_enters_motion = True  # unless a fit has looked (`herglotz.training.own_fit`)
+    # A fit may find that the motion does not depend on s (`herglotz.training.own_fit`).
+    s_enters_motion = True
     linear_in_q1 = False
 
     def __init__(
@@ -96,7 +100,8 @@ class OwnLagrangian(nn.Module):
         self.config = OwnConfig(
             name, angles or none, scale or one, speed or one, inputs, "forced" if forced else "full"
         )
-        if next(self.parameters(), None) is None:  # a function has a dtype, too
+        # A function without parameters gets an empty parameter, which carries the dtype.
+        if next(self.parameters(), None) is None:
             self.register_parameter("nothing", nn.Parameter(torch.empty(0, dtype=torch.float64), requires_grad=False))
 
     @property
@@ -117,7 +122,7 @@ class OwnLagrangian(nn.Module):
     def forward(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0, u: Tensor | None = None
     ) -> Tensor | Partials:
-        """L_d, shape (...); with `order` 1 or 2 its `Partials` (so that functional_call reaches both)."""
+        """L_d, shape (...); with `order` 1 or 2 its `Partials`, so that functional_call reaches both."""
         if order:
             return self.partials(q0, q1, s0, h, order, u)
         return self._driven(u)(q0, q1, s0, h)
@@ -134,13 +139,13 @@ class OwnLagrangian(nn.Module):
     def partials_increment(
         self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1, u: Tensor | None = None
     ) -> Partials:
-        """`partials` at (q0, q0 + Δ, s0); L_d subtracts q0 again, so that a short step in float32 rounds."""
+        """`partials` at (q0, q0 + Δ, s0); L_d subtracts q0 again, which rounds short steps in float32."""
         return self.partials(q0, q0 + delta, s0, h, order, u)
 
     def forces(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, u: Tensor | None = None
     ) -> tuple[Tensor, Tensor] | None:
-        """F⁻ and F⁺, each (..., n), in units of momentum; None where L_d has none."""
+        """F⁻ and F⁺, each (..., n), in units of momentum; None for an L_d without forces."""
         L_d = self._driven(u)
         return L_d.forces(q0, q1, s0, h) if isinstance(L_d, Forced) else None
 

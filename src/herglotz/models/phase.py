@@ -1,4 +1,4 @@
-"""The midpoint q̄ and the velocity v of a step, and the features that networks read, computed once for all terms."""
+"""The midpoint q̄, the velocity v and the networks' features of a step, computed once for all terms."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from herglotz.models.network import midpoint_velocity_jets, position_features
 
 @dataclass(eq=False)
 class Phase:
-    """q̄ = (q0 + q1)/2, v = Δ/h and their features as jets over (q0, q1), each made at its first use.
+    """q̄ = (q0 + q1)/2, v = Δ/h and their features as jets over (q0, q1), each computed at its first use.
 
-    A model whose terms read none of them pays nothing.
+    `order` is that of the jets, 0, 1 or 2; `sizes` has the angles, scale and speed of the coordinates.
     """
 
     q0: Tensor  # (..., n)
     q1: Tensor  # (..., n)
     h: Tensor  # (...)
-    order: int  # 0, 1 or 2
-    sizes: ModelConfig  # angles, scale and speed of the coordinates
-    delta: Tensor | None = None  # (..., n) q1 − q0 where it is known better than by subtraction
+    order: int
+    sizes: ModelConfig
+    delta: Tensor | None = None  # (..., n) q1 − q0 without the rounding of the subtraction
 
     @property
     def move(self) -> Tensor:

@@ -1,8 +1,8 @@
-"""A scalar network by one forward and one reverse sweep: the cheap twin of its jets, for a step's own derivatives.
+"""A scalar network by one forward and one reverse sweep: the cheap twin of its jets, for the iterations of a step.
 
-The step equation asks for the gradient of a network of (q̄, v) and for the derivative of that gradient along q1; a
-rollout asks for V and V′. A reverse sweep gives the gradient at the cost of the value, and tangents that go through
-both sweeps give the second derivative: 1 + n rows where a jet over (q0, q1) carries 1 + 2n + n(2n + 1).
+The step equation needs the gradient of a network of (q̄, v) and the derivative of the gradient along q1; a rollout needs
+V and V′. A reverse sweep gives the gradient at the cost of the value, and tangents through both sweeps give the second
+derivative: 1 + n rows in place of the 1 + 2n + n(2n + 1) rows of a jet over (q0, q1).
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from herglotz.models.network import Network
 class Trigonometry(NamedTuple):
     """The entries of features, each (..., n): sin q and cos q of angles, q itself of other coordinates."""
 
-    s: Tensor  # sin q, or q
-    c: Tensor  # cos q
-    ds: Tensor  # ∂s/∂q: cos q, or 1
-    minus_sin: Tensor  # ∂c/∂q
+    s: Tensor  # (..., n) sin q, or q
+    c: Tensor  # (..., n) cos q
+    ds: Tensor  # (..., n) ∂s/∂q: cos q, or 1
+    minus_sin: Tensor  # (..., n) ∂c/∂q
 
 
 @lru_cache(maxsize=64)
 def _angle_mask(angles: tuple[bool, ...], device: torch.device) -> Tensor | None:
-    """(n,) which coordinates are angles; None: all."""
+    """(n,) whether each coordinate is an angle; None if all are."""
     return None if all(angles) else torch.tensor(angles, device=device)
 
 
 def trigonometry(q: Tensor, angles: tuple[bool, ...]) -> Trigonometry:
-    """At q, (..., n)."""
+    """The trigonometry of q, (..., n)."""
     sin, cos = q.sin(), q.cos()
     mask = _angle_mask(angles, q.device)
     if mask is None:
@@ -42,11 +42,11 @@ def trigonometry(q: Tensor, angles: tuple[bool, ...]) -> Trigonometry:
 
 
 class Sweep:
-    """One scalar network at its present parameters, reading (s, c) or (s, c, v): `Trigonometry` and the velocity.
+    """A scalar network as a function of (s, c) or (s, c, v), the `Trigonometry` of q and the velocity.
 
-    The network's features are those of `Phase`, or of `position_features` where `speed` is None; `scale` and `speed` of
-    the coordinates go into the weights of the first layer. `factor`, a number or a tensor (...) such as h, multiplies
-    the network.
+    The network reads the features of `Phase`, or those of `position_features` if `speed` is None; `scale` and `speed`
+    are folded into the weights of the first layer, which stay as they are now. `factor`, a number or a tensor (...)
+    such as h, multiplies the network.
     """
 
     def __init__(
@@ -98,11 +98,14 @@ def _columns(
     dtype: torch.dtype,
     device: torch.device,
 ) -> tuple[Tensor | None, Tensor]:
-    """Which columns of the first layer read s, c and v, and their factors; None: the columns are those already."""
+    """The columns of the first layer that read s, c and v, and their factors; None if the columns need no change.
+
+    A coordinate that is no angle has no cosine: its factor is 0.
+    """
     sines, cosines, factors, column = [], [], [], 0
     for angle in angles:
         sines.append(column)
-        cosines.append(column + 1 if angle else column)  # a coordinate that is no angle has no cosine: factor 0
+        cosines.append(column + 1 if angle else column)
         factors.append(1.0 if angle else 0.0)
         column += 2 if angle else 1
     fold = [1.0 if a else 1.0 / x for a, x in zip(angles, scale, strict=True)] + factors
@@ -122,13 +125,14 @@ def numbers(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def activation(name: str, z: Tensor, *, second: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-    """The activation, its derivative and (if asked for, else the derivative once more) its second derivative."""
+    """The activation and its first two derivatives; without `second` the first stands for the second."""
     if name == "tanh":
         t, (zero, one) = z.tanh(), numbers(z.dtype, z.device)
-        f1 = torch.addcmul(one, t, t, value=-1)  # one operation, and no Python number to convert
+        # 1 − t² and −2 t f′ in one operation each, without the conversion of a Python number.
+        f1 = torch.addcmul(one, t, t, value=-1)
         return t, f1, torch.addcmul(zero, t, f1, value=-2) if second else f1
     up, down = z.sigmoid(), (-z).sigmoid()
     if name == "softplus":
         return -logsigmoid(-z), up, up * down if second else up
     f1 = up * (1.0 + z * down)
-    return z * up, f1, up * down * (2.0 + z * (down - up)) if second else f1  # silu
+    return z * up, f1, up * down * (2.0 + z * (down - up)) if second else f1

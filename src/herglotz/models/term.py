@@ -1,4 +1,4 @@
-"""Terms that a model takes by name: with one file and one line in `TERMS` a term steps, fits, verifies and exports."""
+"""Terms by name: one file and one line in `TERMS`, and a model with the term steps, fits, verifies and exports."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from herglotz.models.jet import Jet, coordinates
 class Term(nn.Module):
     """A part V(q) of the potential, a force −∂R/∂v of a dissipation function R(v) (Rayleigh), or both.
 
-    Write `potential` or `dissipation` in jets, which carry their derivatives along; everything else follows. The force
-    acts in halves, F⁻ = c (h/2) f and F⁺ = (h/2) f at v = Δ/h, and so needs the forced level. Parameters are float64
-    and start where the term vanishes, so that a new model equals its baseline. Source: trap 4 of
-    `docs/mathematics.md`.
+    Write `potential` or `dissipation` in jets, which carry their derivatives along. The force acts in halves,
+    F⁻ = c (h/2) f and F⁺ = (h/2) f at v = Δ/h, and needs the forced level. Parameters are float64 and start where the
+    term vanishes, so that a new model equals its baseline. A force that is not `linear` in v makes the step iterate.
+    `spread` is the σ of the prior of every parameter about its start; None: no prior.
+
+    Source: trap 4 of `docs/mathematics.md`.
 
     Parameters
     ----------
@@ -27,8 +29,8 @@ class Term(nn.Module):
         The `ModelConfig` of the model that the term joins.
     """
 
-    linear = True  # whether the force is linear in v, so that it needs no iteration
-    spread: float | None = None  # σ of the prior of every parameter about its start; None: no prior
+    linear = True
+    spread: float | None = None
 
     def __init__(self, config: Any):
         super().__init__()
@@ -36,15 +38,15 @@ class Term(nn.Module):
 
     @classmethod
     def has_force(cls) -> bool:
-        """Return whether the term dissipates."""
+        """Return whether the term has a force."""
         return cls.dissipation is not Term.dissipation or cls.force is not Term.force
 
-    def potential(self, q: Jet) -> Jet | None:  # noqa: ARG002  what a term does not have
-        """V as a function of the n coordinates."""
+    def potential(self, q: Jet) -> Jet | None:  # noqa: ARG002
+        """V as a function of the n coordinates; None for a term without a potential."""
         return None
 
     def dissipation(self, v: Jet) -> Jet | None:  # noqa: ARG002
-        """R as a function of the n velocities."""
+        """R as a function of the n velocities; None for a term without a dissipation function."""
         return None
 
     def force(self, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -60,7 +62,7 @@ TERMS: dict[str, type[Term]] = {}
 
 
 def check_terms(config: Any) -> None:
-    """Raise `InputError` for a term of a `ModelConfig` that nobody registered, or that its level cannot have."""
+    """Raise `InputError` for a term of a `ModelConfig` that is not registered, or that the level cannot have."""
     for name in config.terms:
         if name not in TERMS:
             known = ", ".join(TERMS) or "none"
@@ -72,7 +74,7 @@ def check_terms(config: Any) -> None:
 
 
 def with_force(own: Forces, f: Tensor, slope: Tensor, c: Tensor, h: Tensor, by_q: Tensor | float = 0.0) -> Forces:
-    """Return `own` plus a force f (..., n) in halves, F⁻ = c (h/2) f and F⁺ = (h/2) f, with derivatives if it has any.
+    """Return `own` plus a force f (..., n) in halves, F⁻ = c (h/2) f and F⁺ = (h/2) f, with derivatives if `own` has.
 
     `slope` is ∂f/∂v at v = Δ/h, and `by_q` ∂f/∂q̄ at the midpoint, (..., n, n) each.
     """
@@ -88,7 +90,7 @@ def with_force(own: Forces, f: Tensor, slope: Tensor, c: Tensor, h: Tensor, by_q
 
 
 def value_and_slope(terms: tuple[Term, ...], q: Tensor) -> tuple[Tensor, Tensor]:
-    """V (...) and V′ (..., n) of the terms together."""
+    """V (...) and V′ (..., n), summed over the terms."""
     V, slope = q.new_zeros(q.shape[:-1]), torch.zeros_like(q)
     for term in terms:
         if (jet := term.potential(coordinates(q, 1))) is not None:

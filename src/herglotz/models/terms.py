@@ -1,9 +1,9 @@
-"""The terms a model is a sum of; each knows its own closed-form derivatives through jets.
+"""The terms of a model, with closed-form derivatives by jets.
 
     L_d = (c − 1)(s0 − h/2 V0) + √c K − h/2 (V0 + V1) + N,    c = e^g
 
-V0 = V(q0), V1 = V(q1). Strang's splitting of kinetic, dissipative and potential parts: order 2 in h for every g(q, v),
-and exact for linear drag up to a constant factor on K.
+V0 = V(q0), V1 = V(q1). L_d is Strang's splitting into kinetic, dissipative and potential parts: of order 2 in h for
+every g(q, v), and exact for linear drag up to a constant factor on K.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from herglotz.models.translations import blind, projection
 class Kinetic(nn.Module):
     """K = Δᵀ m Δ / 2h with Δ = q1 − q0 and a constant mass matrix m = C Cᵀ, C₁₁ = 1.
 
-    Positions do not determine the scale of L_d (gauge), so the first entry of the mass is fixed at 1. `alike`: m = 1,
-    with no parameter; `diagonal`: no mass between coordinates.
+    Positions do not determine the scale of L_d (gauge), so the first entry of the mass is fixed at 1. With `alike`
+    m = 1, without parameters; with `diagonal` m is diagonal.
     """
 
     def __init__(self, dof: int, alike: bool = False, diagonal: bool = False):
@@ -71,10 +71,11 @@ class Kinetic(nn.Module):
 class Potential(nn.Module):
     """V(q) = Σ kᵢ (1 − cos qᵢ) + bᵢ sin qᵢ (angles) or Σ kᵢ qᵢ²/2 + bᵢ qᵢ (others), plus a zero-initialised network.
 
-    The tilt b moves the equilibrium: a sensor's zero is seldom there (and for a falling body it is the weight). The
-    network is multiplied by the energy scale Σ speed², so that its weights are of order one. `features` joins V as it
-    is. A model's `alike` and `order` 4 fix k and b: there the features say what V is. `translations` fix them too, at
-    the springs of what they leave alone (0 beside features): their sizes are the units in which masses are learned.
+    The tilt b moves the equilibrium away from the sensor's zero; for a falling body b is the weight. The network is
+    multiplied by the energy scale Σ speed², so that its weights are of order one. `features` are added to V.
+
+    With `alike` or `order` 4 the features make V, and k and b are fixed. With `translations` k and b are fixed too: at
+    0 beside features, otherwise as springs of the projected position, which set the unit of the learned masses.
     """
 
     def __init__(self, config: ModelConfig, generator: torch.Generator):
@@ -92,7 +93,8 @@ class Potential(nn.Module):
         self.register_buffer("across", projection(config.translations, config.angles), persistent=False)
         self.across: Tensor | None
         self.features = named_potential(config)
-        self.more: tuple[Term, ...] = ()  # the model's terms by name, which it holds itself
+        # The named terms of the model, which holds them as its own modules.
+        self.more: tuple[Term, ...] = ()
         self.network: Network | None = None
         if config.potential_width:
             sizes = [feature_count(config.angles), *[config.potential_width] * config.potential_depth]
@@ -100,7 +102,7 @@ class Potential(nn.Module):
             self.network.blind = blind(config, 0)
 
     def baseline(self, q: Tensor, order: int) -> Jet:
-        """The part of V that no network is needed for: Σ f(xᵢ) with x = A q, so V′ = Aᵀf′ and V″ = Aᵀ diag(f″) A."""
+        """The springs and tilts of V: Σ f(xᵢ) with x = A q, so V′ = Aᵀf′ and V″ = Aᵀ diag(f″) A."""
         n, A = q.shape[-1], self.across
         f = self._own(q if A is None else q @ A.T)
         rows = [f[0].sum(-1)[None], (f[1] if A is None else f[1] @ A).movedim(-1, 0)]
@@ -111,20 +113,20 @@ class Potential(nn.Module):
         return Jet(torch.cat(rows), n, order)
 
     def _own(self, x: Tensor) -> list[Tensor]:
-        """Each coordinate's own f(x), f′ and f″, (..., n)."""
+        """Return f(x), f′ and f″ of every coordinate, (..., n) each."""
         k, b, angles = self.stiffness, self.tilt, self.angles
-        straight = [k * (x * x * 0.5) + b * x, k * x + b, k.expand(x.shape)]
+        of_lengths = [k * (x * x * 0.5) + b * x, k * x + b, k.expand(x.shape)]
         if not any(angles):
-            return straight
+            return of_lengths
         sin, cos = x.sin(), x.cos()
-        turning = [k * (1.0 - cos) + b * sin, k * sin + b * cos, k * cos - b * sin]
+        of_angles = [k * (1.0 - cos) + b * sin, k * sin + b * cos, k * cos - b * sin]
         if all(angles):
-            return turning
+            return of_angles
         angle = torch.tensor(angles, device=x.device)
-        return [torch.where(angle, turned, moved) for turned, moved in zip(turning, straight, strict=True)]
+        return [torch.where(angle, a, b) for a, b in zip(of_angles, of_lengths, strict=True)]
 
     def departure(self, q: Jet) -> Jet | None:
-        """The network's part of V, or None where the model has no network."""
+        """The network's part of V, or None without a network."""
         if self.network is None:
             return None
         return self.network(position_features(q, self.angles, self.scale)) * self.energy
@@ -157,7 +159,7 @@ class LinearDamping(nn.Module):
 class AffineDamping(nn.Module):
     """g = −γ h + λ·Δ − h G(q̄, v) with a zero-initialised network G; c = e^g > 0 by construction.
 
-    λ alone is the parachute (c = e^{2λΔ}); G adds any drag that depends on position and velocity.
+    λ alone describes a parachute (c = e^{λΔ}); G adds any drag that depends on position and velocity.
     """
 
     constant = False
@@ -168,7 +170,8 @@ class AffineDamping(nn.Module):
         self.rate = nn.Parameter(torch.tensor(config.rate, dtype=torch.float64))
         self.drag = nn.Parameter(torch.zeros(config.dof, dtype=torch.float64))
         self.network: Network | None = None
-        if config.damping_width and config.level == "affine":  # the full level's units read q̄ and v themselves
+        # At the full level the units of `ActionFlow` read q̄ and v.
+        if config.damping_width and config.level == "affine":
             self.network = _of_position_and_velocity(config, config.damping_width, 1, 0.3, generator)
 
     def forward(self, phase: Phase) -> Jet:
@@ -188,10 +191,10 @@ class AffineDamping(nn.Module):
 class Correction(nn.Module):
     """Big-step correction N = h E G(q̄, v): a zero-initialised network that removes the rule's error at one step size.
 
-    E = Σ speed² is a fixed energy scale. A network of several layers starts smooth (gain 0.1): where the data leave a
-    hole, near a separatrix say, it then fills it in smoothly, which lowers the worst rollout errors by one to two
-    orders. A single layer (gain 0.5) learns faster, and is for data without holes.
-    Without a baseline it is the whole of A, a plain network without a baseline: the model that collapses (trap 2).
+    E = Σ speed² is a fixed energy scale. A network of several layers starts smooth (gain 0.1) and stays smooth where
+    there are no data, for example near a separatrix, which lowers the worst rollout errors by one to two orders of
+    magnitude. A single layer (gain 0.5) learns faster, for data without holes. Without a baseline the network is all
+    of L_d but the damping: the model that collapses (trap 2).
     """
 
     def __init__(self, config: ModelConfig, generator: torch.Generator):
@@ -209,7 +212,7 @@ class Correction(nn.Module):
 def _of_position_and_velocity(
     config: ModelConfig, width: int, depth: int, gain: float, generator: torch.Generator, zero: bool = True
 ) -> Network:
-    """A scalar network of the features of q̄ and v, which does not see the model's translations."""
+    """A scalar network of the features of q̄ and v, invariant under the model's translations."""
     inputs = feature_count(config.angles) + config.dof
     network = Network([inputs, *[width] * depth], gain, generator, zero=zero, activation=config.activation)
     network.blind = blind(config, config.dof)

@@ -1,4 +1,4 @@
-"""Scenes with known answers, the rules that discretise them, and the reference flow they are measured against."""
+"""Scenes with known answers, the rules that discretise Lagrangians, and the reference flow."""
 
 from herglotz.scenes.cart_pole import cart_pole as cart_pole
 from herglotz.scenes.chain import chain as chain

@@ -1,7 +1,7 @@
 """A pendulum that hangs from a cart: one length and one angle, and a mass matrix that depends on the angle.
 
-L = (M + m) v_x²/2 + m ℓ cos θ v_x v_θ + m ℓ² v_θ²/2 − m g ℓ (1 − cos θ) − γs, with θ from where the pole hangs. Nothing
-holds the cart: x itself enters nothing, so the momentum p_x falls as e^{−γt}.
+L = (M + m) v_x²/2 + m ℓ cos θ v_x v_θ + m ℓ² v_θ²/2 − m g ℓ (1 − cos θ) − γs, with θ = 0 where the pole hangs at rest.
+L does not depend on x, so the momentum p_x falls as e^{−γt}.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
     def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         vx, vt = v.unbind(-1)
         kinetic = 0.5 * first * vx**2 + second(q) * vx * vt + 0.5 * third * vt**2
-        potential = 2.0 * m * g * length * torch.sin(0.5 * q[..., 1]) ** 2  # 1 − cos θ without its cancellation
+        # 1 − cos θ = 2 sin²(θ/2) does not cancel.
+        potential = 2.0 * m * g * length * torch.sin(0.5 * q[..., 1]) ** 2
         return kinetic - potential - gamma * s
 
     def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001

@@ -1,7 +1,7 @@
-"""A chain of equal masses between two walls, its springs harder when stretched, one damping rate.
+"""A chain of equal masses between two walls, with hardening springs and one damping rate.
 
 L = Σ_i m v_i²/2 − Σ_j (k d_j²/2 + β d_j⁴/4) − γs with the stretches d = (q_1, q_2 − q_1, …, q_N − q_{N−1}, −q_N). The
-damping is uniform, m q̈ = F − mγq̇, so one scalar s says it exactly at any number of masses.
+damping is uniform, m q̈ = F − mγq̇, so one scalar s describes the damping of any number of masses exactly.
 """
 
 from __future__ import annotations

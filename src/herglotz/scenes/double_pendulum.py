@@ -1,8 +1,8 @@
 """The damped double pendulum, m = ℓ = 1, angles from the vertical: chaotic, no closed form.
 
 L = v1² + v2²/2 + v1v2 cos(q1 − q2) − g[2(1 − cos q1) + (1 − cos q2)] − γs. The default ranges start below the
-horizontal, |q| ≤ 1.2 rad and |v| ≤ 1.5 rad/s, which is chaotic only weakly: reference and computed motions can be
-compared for tens of seconds.
+horizontal, |q| ≤ 1.2 rad and |v| ≤ 1.5 rad/s, where the motion is only weakly chaotic: reference and computed motions
+can be compared for tens of seconds.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
     """
 
     def potential(q: Tensor) -> Tensor:
-        drop = 2.0 * torch.sin(0.5 * q) ** 2  # 1 − cos q, without its cancellation
-        return g * (2.0 * drop[..., 0] + drop[..., 1])
+        # 1 − cos q = 2 sin²(q/2) does not cancel.
+        height = 2.0 * torch.sin(0.5 * q) ** 2
+        return g * (2.0 * height[..., 0] + height[..., 1])
 
     def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         v1, v2 = v.unbind(-1)

@@ -1,7 +1,7 @@
-"""Scenes with one coordinate and a force that is given: a discrete Lagrangian for each step.
+"""Scenes with one coordinate and a given force: a discrete Lagrangian for each step.
 
-L = v²/2 − V(q) + u q − γs with mass m. The force u is given and held over a step, as the amplifier of a motor holds
-it, so that a motion is a product of contact maps, one Lagrangian L_d^k = L_d(·; u_k) each.
+L = m v²/2 − V(q) + u q − γs. The force u is held over a step, as by the amplifier of a motor, so that a motion is a
+product of contact maps, each with its own Lagrangian L_d^k = L_d(·; u_k).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from herglotz.scenes.scene import Scene, State
 
 @dataclass(frozen=True)
 class DrivenRule:
-    """L_d at the input `u0`; `at(u)` is the one of a step with the input u, (..., 1).
+    """L_d at the input `u0`; `at(u)` is L_d of a step with the input u, (..., 1).
 
     Source: section 6 of `docs/mathematics.md`, time-dependent L_d.
     """
@@ -35,7 +35,7 @@ class DrivenRule:
         return self.rule(self.u0)(q0, q1, s0, h)
 
     def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
-        """F⁻ and F⁺ of the rule, (..., n) each; None where it has none."""
+        """F⁻ and F⁺ of the rule, (..., n) each; None for a rule without forces."""
         own = self.rule(self.u0)
         return own.forces(q0, q1, s0, h) if isinstance(own, Forced) else None
 
@@ -47,7 +47,7 @@ class DrivenRule:
 def _rules(
     system_at: Callable[[Tensor | float], Natural], amplitude: float, external: External | None
 ) -> dict[str, DiscreteLagrangian]:
-    """The rules of the system at each input, with the force that no L has."""
+    """The rules of the system at each input, with the external force."""
 
     def forced(rule: DiscreteLagrangian) -> DiscreteLagrangian:
         return rule if external is None else ForcedRule(rule, external)
@@ -77,7 +77,7 @@ def driven_scene(
 ) -> Scene:
     """The scene of a potential, one damping rate and the force u(t) = A cos νt.
 
-    Its own functions are those of the force at t = 0; `at(u)` gives the scene of any other, and `drive(t)` the force.
+    The scene's functions have the force at t = 0; `at(u)` is the scene at the force u, and `drive(t)` is u(t).
 
     Parameters
     ----------
@@ -90,9 +90,9 @@ def driven_scene(
     m
         Mass.
     external
-        f(q, v), a force beside the Lagrangian's.
+        f(q, v), a force besides that of the Lagrangian.
     flow
-        (u, q, p, s, h) → (q1, p1, s1) where it is known; else the reference flow.
+        (u, q, p, s, h) → (q1, p1, s1) if known; by default the reference flow.
     fields
         The other fields of `Scene`.
     """

@@ -1,4 +1,4 @@
-"""Duffing's oscillator, ẍ = −γẋ − kx − βx³ + u, free or driven by a force u: no closed form but the reference flow.
+"""Duffing's oscillator, ẍ = −γẋ − kx − βx³ + u, free or driven by a force u; its answer is the reference flow.
 
 L = v²/2 − kx²/2 − βx⁴/4 − γs and H = p²/2 + kx²/2 + βx⁴/4 + γs, with mass 1 kg.
 """
@@ -40,7 +40,7 @@ def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
     Raises
     ------
     InputError
-        If β ≤ 0: the potential would have no bottom.
+        If β ≤ 0: the potential would have no lower bound.
     """
     if not beta > 0:
         raise InputError(f"duffing: cubic stiffness beta must be > 0, got {beta}; damped_oscillator is linear")

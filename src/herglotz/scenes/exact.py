@@ -1,8 +1,8 @@
 """The exact discrete Lagrangian of any contact system, to near round-off.
 
 L_d(q0, q1, s0, h) = s(h) − s0 along the motion with q(0) = q0, q(h) = q1, s(0) = s0. The boundary-value problem is
-solved by collocation: polynomials through Gauss–Lobatto nodes satisfy q̇ = v, ṗ = L_q + L_s p and ṡ = L there. All
-nodes of all samples are one Newton iteration, and the sensitivities of the motion are one more linear equation.
+solved by collocation: polynomials satisfy q̇ = v, ṗ = L_q + L_s p and ṡ = L at Gauss–Lobatto nodes. One Newton iteration
+solves for all nodes of all samples, and one more linear equation gives the sensitivities of the motion.
 """
 
 from __future__ import annotations
@@ -21,30 +21,34 @@ from herglotz.scenes.motion import Motion, lagrangian_motion
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step
 
-# In a step, the fewest that reach the tolerance; between two neighbours comes one to judge them.
+# Numbers of nodes that are tried in turn until a step reaches the tolerance; 2k − 1 nodes judge k nodes.
 NODES = (9, 17, 33, 65)
 
 
 class Reason(IntEnum):
-    """Why L_d is NaN at a sample."""
+    """Why L_d is NaN at a sample.
+
+    NOT_CONVERGED: no motion from q0 to q1 was found. CONJUGATE: a conjugate point lies inside the step, where motions
+    from q0 cross again and L_d has further branches. UNRESOLVED: the largest number of nodes misses the tolerance.
+    """
 
     NONE = 0
-    NOT_CONVERGED = 1  # found no motion from q0 to q1
-    CONJUGATE = 2  # a conjugate point inside the step: motions from q0 cross again, L_d has further branches
-    UNRESOLVED = 3  # the reference flow did not reach its tolerance
+    NOT_CONVERGED = 1
+    CONJUGATE = 2
+    UNRESOLVED = 3
 
 
 @dataclass(frozen=True)
 class Shot:
-    """The motion that joins q0 to q1, and everything that L_d is asked for."""
+    """The derivatives of L_d to order 2, NaN where `reason` is not NONE."""
 
-    P: Partials  # order 2, NaN where `reason` is not NONE
-    reason: Tensor  # (...) Reason values
+    P: Partials
+    reason: Tensor  # (...) values of `Reason`
 
 
 @dataclass(frozen=True)
 class NumericallyExact:
-    """The exact L_d of a `Motion`, with its partial derivatives in closed form of the flow's sensitivities.
+    """The exact L_d of a `Motion`, with partial derivatives by the flow's sensitivities.
 
     With Y_p = ∂q1/∂p0, Y_s = ∂q1/∂s0, P_p = ∂p1/∂p0, P_s = ∂p1/∂s0 of the flow and c = exp ∫ L_s dt:
 
@@ -52,10 +56,10 @@ class NumericallyExact:
         D22 = P_p Y_p⁻¹,  D23 = P_s − D22 Y_s,  D12 = −c Y_p⁻¹ − p0 ⊗ D23,
         D33 = ∂c/∂s0 − D23·Y_s,  D13 = c Y_p⁻¹ Y_s − p0 D33,  D11 = c Y_p⁻¹ Y_q − p0 ⊗ D13.
 
-    Always computed in float64. NaN without a motion or with several branches; `shoot` tells the two apart. There is
-    no conjugate point inside the step where none of its pieces has one and the action is a minimum in the positions
-    between them. L_d can be differentiated twice and the first partials once; a further derivative raises, and so does
-    a derivative with respect to h.
+    The computation is in float64. L_d is NaN without a motion or with several branches; `shoot` returns the reason.
+    A step has no conjugate point if none of its pieces has a conjugate point and the action is a minimum in the
+    positions between the pieces. L_d can be differentiated twice and the first partials once; a further derivative
+    raises, and so does a derivative with respect to h.
 
     Parameters
     ----------
@@ -64,9 +68,9 @@ class NumericallyExact:
     tolerance
         Largest residual of the integrated equations between the nodes, relative to 1 + |component|.
     max_nodes
-        Of a step; a sample that needs more is `UNRESOLVED`.
+        Largest number of nodes of a step; a sample that needs more is `UNRESOLVED`.
     max_iterations
-        Of Newton's method.
+        Largest number of Newton iterations.
 
     Source: section 1 of `docs/mathematics.md` (FL⁻, FL⁺ and Φ̃*η = cη along the flow).
     """
@@ -130,7 +134,7 @@ def exact_discrete_lagrangian(system: Motion | StateFunction, **options: Any) ->
     Parameters
     ----------
     system
-        L(q, v, s), any regular one, differentiated by autograd; or a `Motion` with the equations written out, which is
+        Any regular L(q, v, s), differentiated by autograd; or a `Motion` with the equations written out, which is
         several times faster.
     **options
         `tolerance`, `max_nodes` and `max_iterations` of `NumericallyExact`.
@@ -164,7 +168,10 @@ def _second(end: End) -> Partials:
 
 
 class _Last(torch.autograd.Function):
-    """The identity on x; a derivative of x in the arguments that would count is an error, not a silent zero."""
+    """The identity on x, whose derivative by the arguments is an error, not a silent zero.
+
+    The gradient is 0, and no error, where x only multiplies an increment of value 0.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, *arguments: Tensor) -> Tensor:  # noqa: ARG004
@@ -172,13 +179,13 @@ class _Last(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]  # noqa: ARG004
-        if bool((gradient.abs() > 0).any()):  # 0 where x only multiplies an increment whose value is 0
+        if bool((gradient.abs() > 0).any()):
             raise InputError("third derivatives of the numerically exact L_d are not available")
         return None, None, None, None
 
 
 def _attached(P: Partials, e0: Tensor, e1: Tensor, es: Tensor) -> Partials:
-    """Give the partials their derivatives: Taylor polynomials in increments whose values are zero."""
+    """The partials with their derivatives, as Taylor polynomials in increments e whose values are zero."""
     D11, D12, D22, D13, D23, D33 = (_Last.apply(x, e0, e1, es) for x in (P.D11, P.D12, P.D22, P.D13, P.D23, P.D33))
 
     def times(A: Tensor, e: Tensor) -> Tensor:

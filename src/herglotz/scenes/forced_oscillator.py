@@ -1,7 +1,7 @@
 """The damped oscillator with a periodic force: its exact L_d(q0, q1, s0, t0, h) and flow in closed form.
 
-L = mv²/2 − mΩ²q²/2 + f q cos(νt + φ) − γs. With the periodic motion Q(t) that the force sustains, y = q − Q is free.
-From m(Q̈ + γQ̇ + Ω²Q) = f cos θ, θ = νt + φ, every term of L that is linear in y is e^{−γt} d/dt(e^{γt} m y Q̇), so that
+L = mv²/2 − mΩ²q²/2 + f q cos(νt + φ) − γs. With the periodic motion Q(t) under the force, y = q − Q moves freely. From
+m(Q̈ + γQ̇ + Ω²Q) = f cos θ, θ = νt + φ, the terms of L that are linear in y are e^{−γt} d/dt(e^{γt} m y Q̇), so that
 
     s = z + m y·Q̇ + W(t),    Ẇ = −γW + mQ̇²/2 − mΩ²Q²/2 + f Q cos θ,
 
@@ -35,12 +35,12 @@ class ExactForcedOscillator:
     amplitude, frequency, phase
         f in units of force, ν > 0 in rad per unit of time, φ in rad.
     m, omega0, gamma
-        Those of `ExactOscillator`.
+        Mass, undamped angular frequency Ω and damping rate γ, as of `ExactOscillator`.
 
     Raises
     ------
     InputError
-        If m or ν is not positive, or the force drives an undamped oscillator at its own frequency: then no motion is
+        If m or ν is not positive, or the force drives an undamped oscillator at its own frequency, where no motion is
         periodic.
     """
 
@@ -55,7 +55,7 @@ class ExactForcedOscillator:
         require_positive("forced oscillator", mass_m=self.m, frequency=self.frequency)
         if self.omega0**2 == self.frequency**2 and self.gamma == 0:
             raise InputError(
-                "forced oscillator: at resonance without damping no motion is periodic; change one of them"
+                "forced oscillator: at resonance without damping no motion is periodic; change frequency or gamma"
             )
 
     @cached_property
@@ -71,9 +71,9 @@ class ExactForcedOscillator:
         return a * cos + b * sin, self.frequency * (b * cos - a * sin)
 
     def gained(self, t0: Tensor, h: Tensor) -> Tensor:
-        """W(t0 + h) for W(t0) = 0: what the periodic motion adds to s, ∫ e^{−γ(t1 − t)} (…) dt."""
+        """W(t0 + h) for W(t0) = 0, the part of the periodic motion in s: ∫ e^{−γ(t1 − t)} (…) dt."""
         (a, b), nu, gamma = self._amplitudes, self.frequency, self.gamma
-        # the source mQ̇²/2 − mΩ²Q²/2 + f Q cos θ is mean + C cos 2θ + D sin 2θ
+        # The source mQ̇²/2 − mΩ²Q²/2 + f Q cos θ is mean + C cos 2θ + D sin 2θ.
         kinetic, potential = 0.25 * self.m * nu**2, 0.25 * self.m * self.omega0**2
         mean = (kinetic - potential) * (a * a + b * b) + 0.5 * self.amplitude * a
         C = -(kinetic + potential) * (a * a - b * b) + 0.5 * self.amplitude * a
@@ -104,7 +104,7 @@ class ExactForcedOscillator:
         )
 
     def flow(self, q: Tensor, p: Tensor, s: Tensor, t0: Tensor | float, h: Tensor | float) -> State:
-        """(q1, p1, s1) after the time h, without conjugate points."""
+        """(q1, p1, s1) after the time h; conjugate points are no singularities."""
         h = as_step(h, q)
         t0 = torch.as_tensor(t0, dtype=q.dtype, device=q.device)
         (Q0, V0), (Q1, V1) = ((x[..., None] for x in self.sustained(t)) for t in (t0, t0 + h))
@@ -120,7 +120,7 @@ class ExactForcedOscillator:
 
     @cached_property
     def _amplitudes(self) -> tuple[float, float]:
-        """Of Q = a cos θ + b sin θ: a and b."""
+        """The a and b of Q = a cos θ + b sin θ."""
         gap, drag = self.omega0**2 - self.frequency**2, self.gamma * self.frequency
         size = self.m * (gap**2 + drag**2)
         return self.amplitude * gap / size, self.amplitude * drag / size

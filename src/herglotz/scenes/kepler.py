@@ -1,8 +1,8 @@
 """The planar Kepler problem with linear drag: L = m|v|²/2 + k/|q| − γs, no closed form.
 
-A body on a slowly shrinking ellipse. The default ranges start near |q| = 1 with a speed near the circular one
-(√(k/m) = 1), 0.8 ≤ v_y ≤ 1.2 and |v_x| ≤ 0.2, so that |q| stays above 0.15 over the first revolutions; q = 0 is
-singular and no step across or near it is exact to any order.
+The body moves on a slowly shrinking ellipse. The default ranges start near |q| = 1 with nearly the speed √(k/m) = 1 of
+a circular orbit, 0.8 ≤ v_y ≤ 1.2 and |v_x| ≤ 0.2, so that |q| stays above 0.15 over the first revolutions. L is
+singular at q = 0, and steps near or across q = 0 have no order.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class ExactLinearDrag:
         return torch.expm1(-self.gamma * h) * s0 + 0.5 * self.stiffness(h) * (delta * delta).sum(-1)
 
     def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks; the blocks are constants, for L_d is quadratic."""
+        """Value, gradient and Hessian blocks; L_d is quadratic, so the blocks are constant."""
         h = as_step(h, q0)
         L = self(q0, q1, s0, h)
         k = self.stiffness(h)[..., None]

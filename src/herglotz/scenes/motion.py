@@ -1,4 +1,4 @@
-"""A contact system as equations of motion, from explicit derivatives of L, or from any L."""
+"""The equations of motion of a contact system, from explicit derivatives of L or from any L by autograd."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ Balance = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tenso
 
 @dataclass(frozen=True)
 class Motion:
-    """The equations of motion of x = (q, y, s), where y is the momentum p or the velocity v, differentiable in x."""
+    """The equations of motion of x = (q, y, s), where y is the momentum p or the velocity v, differentiable in x.
 
-    start: StateFunction  # (q, v, s) → y: where a velocity is known
-    # (q, y, s) → (q̇, p, ṗ, ṡ, L_s), which needs no acceleration; L_s scales the contact form, ċ = c L_s.
-    balance: Balance
+    No acceleration is needed. L_s is the rate of the conformal factor, ċ = c L_s.
+    """
+
+    start: StateFunction  # (q, v, s) → y
+    balance: Balance  # (q, y, s) → (q̇, p, ṗ, ṡ, L_s)
 
     def vector_field(self, q: Tensor, p: Tensor, s: Tensor) -> State:
-        """(q̇, ṗ, ṡ), where y is the momentum."""
+        """(q̇, ṗ, ṡ) of equations whose y is the momentum."""
         q_dot, _, p_dot, s_dot, _ = self.balance(q, p, s)
         return q_dot, p_dot, s_dot
 
@@ -35,7 +37,7 @@ def herglotz_motion(
     force: StateFunction,  # (q, v, s) → L_q, (..., n)
     rate: StateFunction,  # (q, v, s) → L_s, (...)
 ) -> Motion:
-    """Return the equations in (q, p, s) by explicit derivatives, the fastest form: q̇ = v, ṗ = L_q + L_s p, ṡ = L."""
+    """Return the equations in (q, p, s) by explicit derivatives, the fast form: q̇ = v, ṗ = L_q + L_s p, ṡ = L."""
 
     def balance(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         v = velocity(q, p, s)

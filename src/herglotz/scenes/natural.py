@@ -1,8 +1,8 @@
-"""Short forms of a scene: without a closed form, and, as a case, with a constant mass and a constant damping rate.
+"""Scenes without a closed form, among them scenes with a constant mass and a constant damping rate.
 
 A scene may have an external force that no L(q, v, s) of a single action s describes, for example friction of one joint:
 ṗ = L_q + L_s p + f(q, v) (Lagrange–d'Alembert–Herglotz). The motion is then no contact flow and has no exact discrete
-Lagrangian; its rules are discrete Lagrangians with discrete forces.
+Lagrangian; the rules are discrete Lagrangians with discrete forces.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Natural:
         return p / self.m
 
     def functions(self) -> dict[str, Any]:
-        """The four fields of `Scene` that these are."""
+        """The four fields of `Scene` with these functions, by name."""
         return {name: getattr(self, name) for name in ("hamiltonian", "lagrangian", "momentum", "velocity")}
 
 
@@ -87,19 +87,19 @@ def scene_without_closed_form(
     external: External | None = None,
     **fields: Any,
 ) -> Scene:
-    """The scene whose flow and exact L_d are computed, from L with derivatives written out.
+    """The scene of an L with written-out derivatives, whose flow and exact L_d are computed numerically.
 
     Parameters
     ----------
     force, rate
         L_q(q, v, s), (..., n), and L_s(q, v, s), (...), or its constant value: written out, so that the flow is fast
-        and differentiable. The tests hold them to `contact_vector_field` of the Hamiltonian.
+        and differentiable. The tests compare them with `contact_vector_field` of the Hamiltonian.
     hamiltonian
         H(q, p, s); by default p·v − L(q, v, s) at v = `velocity`(q, p, s).
     rules
-        Discretisations beside the general ones of `rules.py`, or instead of those of the same name.
+        Discretisations in addition to those of `rules.py`, which rules of the same name replace.
     external
-        f(q, v), (..., n), a force beside the Lagrangian's: the rules carry it, and there is no exact L_d.
+        f(q, v), (..., n), a force besides that of the Lagrangian: the rules have discrete forces, and no L_d is exact.
     fields
         The other fields of `Scene`.
     """
@@ -108,8 +108,8 @@ def scene_without_closed_form(
         motion = herglotz_motion(lagrangian, momentum, velocity, force, rate)
     else:
         general = {name: ForcedRule(rule, external) for name, rule in general.items()}
-        whole = lambda q, v, s: force(q, v, s) + external(q, v)  # noqa: E731
-        motion = herglotz_motion(lagrangian, momentum, velocity, whole, rate)
+        total = lambda q, v, s: force(q, v, s) + external(q, v)  # noqa: E731
+        motion = herglotz_motion(lagrangian, momentum, velocity, total, rate)
     offered = {**general, **(rules or {})}
 
     def energy(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ def natural_scene(
     gamma, m
         Damping rate, and mass.
     rules
-        Discretisations beside the general ones; by default the composition `strang`.
+        Discretisations in addition to those of `rules.py`; by default the composition `strang`.
     fields
         The other fields of `Scene`.
     """

@@ -1,7 +1,7 @@
-"""Two degrees of freedom, nonlinear in s: every block of second derivatives of L_d is different from zero.
+"""Two degrees of freedom, nonlinear in s: no block of second derivatives of L_d is zero.
 
-L = ½(1 + .3 sin q1)v1² + .6v2² + .2v1v2 − cos(q1q2) − ¼|q|² − a[.3s + .1 sin(s)(1 + .2q2) + .05 s v1]. No physics: a
-system on which an exchanged index, a transposed block or a c taken for constant shows.
+L = ½(1 + .3 sin q1)v1² + .6v2² + .2v1v2 − cos(q1q2) − ¼|q|² − a[.3s + .1 sin(s)(1 + .2q2) + .05 s v1]. The system is no
+model of a machine: an exchanged index, a transposed block or a c that is taken for constant changes its motion.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
     Parameters
     ----------
     damping
-        The factor a of all terms in s; 0 is conservative.
+        Factor a of all terms in s; 0 is conservative.
     """
     drag = 0.05 * damping
 

@@ -23,7 +23,7 @@ class ExactOscillator:
 
     L_d = (E−1)s0 + (m/2S)[(E q0² + q1²) C − 2√E q0·q1] − (mγ/4)(q1² − E q0²)
 
-    evaluated in increments, (√E q0 − q1)² − (1 − C)(E q0² + q1²) for the bracket, so that small steps do not cancel.
+    with the bracket evaluated in increments, (√E q0 − q1)² − (1 − C)(E q0² + q1²), so that small steps do not cancel.
     Isotropic in any dimension. Singular at the conjugate points ωh = π, 2π, …
 
     Source: section 3 of `docs/mathematics.md`.
@@ -43,13 +43,14 @@ class ExactOscillator:
         h = as_step(h, q0)
         decay, k, versine, _ = self.coefficients(h)
         E = (1.0 + decay) ** 2
-        u = decay[..., None] * q0 - (q1 - q0)  # √E q0 − q1
+        # √E q0 − q1
+        u = decay[..., None] * q0 - (q1 - q0)
         r0, r1 = E * (q0 * q0).sum(-1), (q1 * q1).sum(-1)
         quadratic = 0.5 * k * ((u * u).sum(-1) - versine * (r0 + r1)) - 0.25 * self.m * self.gamma * (r1 - r0)
         return torch.expm1(-self.gamma * h) * s0 + quadratic
 
     def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks; the blocks are constants, for L_d is quadratic."""
+        """Value, gradient and Hessian blocks; L_d is quadratic, so the blocks are constant."""
         h = as_step(h, q0)
         q0, q1 = torch.broadcast_tensors(q0, q1)
         L = self(q0, q1, s0, h)
@@ -70,7 +71,7 @@ class ExactOscillator:
         return Partials(L, D1, D2, D3, D11, D12, D22, D13=zero, D23=zero, D33=torch.zeros_like(L))
 
     def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        """(q1, p1, s1). From d/dt(s − p·q/2) = −γ(s − p·q/2), s1 needs no S in a denominator: no conjugate points."""
+        """(q1, p1, s1), where d/dt(s − p·q/2) = −γ(s − p·q/2) gives s1 without dividing by S at conjugate points."""
         m, gamma, omega0 = self.m, self.gamma, self.omega0
         h = as_step(h, q)
         x = (omega0**2 - gamma**2 / 4) * h**2

@@ -1,8 +1,8 @@
 """Vertical fall with quadratic drag, q̈ = λq̇² − g (q upwards, λ > 0 while falling): closed form.
 
-L = mv²/2 − V + 2λvs with V = (mg/2λ)(e^{2λq} − 1), so p = mv + 2λs and H = (p − 2λs)²/2m + V. This is the corrected
-sign of erratum E9. With ω² = λg, S = sinh(ωh)/ω, C = cosh(ωh), t = tanh(ωh/2)/(ωh/2) and Δ = q1 − q0. All four are
-analytic in λg, so g = 0 (quadratic drag alone) needs no case of its own.
+L = mv²/2 − V + 2λvs with V = (mg/2λ)(e^{2λq} − 1), so p = mv + 2λs and H = (p − 2λs)²/2m + V, with the sign corrected
+by erratum E9. The formulas use ω² = λg, S = sinh(ωh)/ω, C = cosh(ωh), t = tanh(ωh/2)/(ωh/2) and Δ = q1 − q0. S, C and t
+are analytic in λg, so g = 0 (quadratic drag alone) needs no formulas of its own.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from herglotz.scenes.special import as_step, cosw, sincw, versw
 
 @dataclass(frozen=True)
 class ExactParachute:
-    """The exact discrete Lagrangian of the parachute, one degree of freedom, and the system that it belongs to.
+    """The exact discrete Lagrangian of the parachute, one degree of freedom, with L, H and the flow.
 
     L_d = (e^{2λΔ}−1)s0 + (m/2λ²S)[(1+e^{2λΔ})C − 2e^{λΔ}] − (mgh/2λ)e^{2λq1}
         = (e^{2λΔ}−1)s0 + (m/2λ²S)(e^{λΔ}−1)² + (mgh/2λ)[(t−1) + (t/2)(e^{2λΔ}−1) − (e^{2λq1}−1)]
 
-    The second line is the one evaluated: its terms stay finite as λ → 0.
+    The code evaluates the second line, whose terms stay finite as λ → 0.
 
     Source: section 3 of `docs/mathematics.md`.
     """
@@ -60,12 +60,14 @@ class ExactParachute:
         delta = (q1 - q0)[..., 0]
         e, e1 = torch.exp(lam * delta), torch.expm1(lam * delta)
         weight = m * g * h * torch.exp(2 * lam * q1[..., 0])
-        pull = e * e * (2 * lam * s0 + 0.5 * m * g * h * t) + m / (lam * S) * e * e1  # ∂L_d/∂Δ
+        # ∂L_d/∂Δ
+        pull = e * e * (2 * lam * s0 + 0.5 * m * g * h * t) + m / (lam * S) * e * e1
         D1, D2, D3 = (x.expand_as(L) for x in (-pull, pull - weight, torch.expm1(2 * lam * delta)))
         first = (L, D1[..., None], D2[..., None], D3)
         if order == 1:
             return Partials(*first)
-        pull2 = e * e * (4 * lam**2 * s0 + lam * m * g * h * t) + m / S * e * (e + e1)  # ∂²L_d/∂Δ²
+        # ∂²L_d/∂Δ²
+        pull2 = e * e * (4 * lam**2 * s0 + lam * m * g * h * t) + m / S * e * (e + e1)
         D11, D12, D22 = (x.expand_as(L)[..., None, None] for x in (pull2, -pull2, pull2 - 2 * lam * weight))
         D23 = (2 * lam * e * e).expand_as(L)[..., None]
         return Partials(*first, D11, D12, D22, D13=-D23, D23=D23, D33=torch.zeros_like(L))
@@ -91,23 +93,24 @@ class ExactParachute:
         return (p - 2 * self.lam * s[..., None]) / self.m
 
     def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        """q1 = q0 − ln(C − λv0 S)/λ, v1 = (v0 C − g S)/(C − λv0 S); NaN if the solution has escaped before h."""
+        """q1 = q0 − ln(C − λv0 S)/λ, v1 = (v0 C − g S)/(C − λv0 S); NaN if the motion is infinite before h."""
         g, lam = self.g, self.lam
         h = as_step(h, q)
         v = self.velocity(q, p, s)
         x = -lam * g * h**2
-        S, C1 = (h * sincw(x))[..., None], -versw(x)[..., None]  # C1 = C − 1
-        w = C1 - lam * v * S
+        S, C_less_1 = (h * sincw(x))[..., None], -versw(x)[..., None]
+        w = C_less_1 - lam * v * S
         q1 = q - torch.log1p(w) / lam
-        v1 = (v * (1.0 + C1) - g * S) / (1.0 + w)
+        v1 = (v * (1.0 + C_less_1) - g * S) / (1.0 + w)
         s1 = s + self(q, q1, s, h)
         return q1, self.momentum(q1, v1, s1), s1
 
     def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
         """H⁺ = p1·q1 − L_d, q1 = q0 + ln(x)/λ where A x² − B x = p1, on the branch that tends to q0 as h → 0.
 
-        B = m/(λS), A = B + a with a = 2λs0 + mgh t/2 − mgh e^{2λq0}; solved for x − 1, which is O(h). The branch is the
-        flow's while D2D2 L_d > 0, about 2λgh²e^{2λq} < 1; beyond that fold H⁺ is not single-valued (NaN where A/B < 0).
+        B = m/(λS), A = B + a with a = 2λs0 + mgh t/2 − mgh e^{2λq0}; the code solves for x − 1, which is O(h). The flow
+        is on this branch while D2D2 L_d > 0, about 2λgh²e^{2λq} < 1. Beyond this fold H⁺ has several values, and is NaN
+        where A/B < 0.
         """
         m, g, lam = self.m, self.g, self.lam
         h = as_step(h, q0)
@@ -115,7 +118,7 @@ class ExactParachute:
         B = m / (lam * S)
         a = 2 * lam * s0 + m * g * h * (0.5 * t - torch.exp(2 * lam * q0[..., 0]))
         p = p1[..., 0]
-        # B → ±∞ as h → 0 with the sign of λ; the root must cancel nothing against it on the near-identity branch.
+        # As h → 0, B → ±∞ with the sign of λ. A root of the same sign does not cancel B on the near-identity branch.
         root = torch.sign(B) * torch.sqrt(B**2 + 4 * (B + a) * p)
         q1 = q0 + (torch.log1p(2 * (p - a) / (B + 2 * a + root)) / lam)[..., None]
         return (p1 * q1).sum(-1) - self(q0, q1, s0, h)
@@ -123,9 +126,9 @@ class ExactParachute:
     def H_minus(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
         """H⁻ = −p0·q0 − (s1 − s0), q0 = q1 + ln(y)/λ, where (a − B)y² + By = p0, on the branch that tends to q1.
 
-        B = m/(λS) and a = 2λs1 − mgh(t/2 − e^{2λq1}), from p0 = ∂s0/∂q0 at fixed (q1, s1); solved for y − 1, which is
-        O(h). y = C − λv0S along the flow, whose branch it is while 2(1 − a/B)y > 1; beyond that fold H⁻ is not
-        single-valued, and NaN where the root is not real.
+        B = m/(λS) and a = 2λs1 − mgh(t/2 − e^{2λq1}), from p0 = ∂s0/∂q0 at fixed (q1, s1); the code solves for y − 1,
+        which is O(h). Along the flow y = C − λv0S, on this branch while 2(1 − a/B)y > 1. Beyond this fold H⁻ has
+        several values, and is NaN where the root is not real.
         """
         m, g, lam = self.m, self.g, self.lam
         h = as_step(h, q1)
@@ -198,8 +201,8 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
 def quadratic_drag(m: float = 1.0, lam: float = 0.01) -> Scene:
     """Motion with quadratic drag and no gravity, q̈ = λq̇²: the parachute's formulas, analytic in λg, at g = 0.
 
-    L = mv²/2 + 2λvs, H = (p − 2λs)²/2m, L_d = (e^{2λΔ}−1)s0 + (m/2λ²h)(e^{λΔ}−1)². It brakes where λq̇ < 0 and speeds up
-    without bound where λq̇ > 0: q1 = q0 − ln(1 − λv0h)/λ exists until λv0h = 1.
+    L = mv²/2 + 2λvs, H = (p − 2λs)²/2m, L_d = (e^{2λΔ}−1)s0 + (m/2λ²h)(e^{λΔ}−1)². The drag brakes where λq̇ < 0 and
+    accelerates without bound where λq̇ > 0: q1 = q0 − ln(1 − λv0h)/λ exists until λv0h = 1.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """The damped pendulum, θ̈ = −sin θ − γθ̇ + u, free or driven by a torque u, in units where m = ℓ = g = 1.
 
-L = v²/2 − (1 − cos q) − γs and H = p²/2 + (1 − cos q) + γs. No closed form, so its answer is the reference flow.
+L = v²/2 − (1 − cos q) − γs and H = p²/2 + (1 − cos q) + γs. There is no closed form; the answer is the reference flow.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from herglotz.scenes.scene import Scene
 
 
 def lifted(q: Tensor) -> Tensor:
-    """V = 1 − cos q, without its cancellation."""
+    """V = 1 − cos q = 2 sin²(q/2), which does not cancel."""
     return 2.0 * torch.sin(0.5 * q[..., 0]) ** 2
 
 

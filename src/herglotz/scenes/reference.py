@@ -1,8 +1,8 @@
-"""A reference flow: any contact vector field integrated until two resolutions agree to near round-off.
+"""The reference flow: a contact vector field, integrated until two resolutions agree to near round-off.
 
-Gragg's modified midpoint rule, whose error is a series in the square of the step, extrapolated to order 12
-(Gragg–Bulirsch–Stoer), with the number of substeps doubled until a sample has converged. Always in float64. Herglotz's
-action of any smooth path, the continuous Cauchy problem that L_d discretises, is integrated by the same method.
+The error of Gragg's modified midpoint rule is a series in the square of the step. The rule is extrapolated to order 12
+(Gragg–Bulirsch–Stoer), in float64, and the number of substeps is doubled until a sample has converged. The same method
+integrates Herglotz's action of any smooth path, the continuous Cauchy problem that L_d discretises.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ VectorField = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 Derivative = Callable[[Tensor], Tensor]
 
 # Midpoint steps per column: order 12, 37 evaluations a substep. Extrapolation multiplies round-off by the sum of
-# |weights|: 26 with these six columns; two more would gain order and make the sum 119, above the tolerance at h ≥ 5.
+# |weights|, 26 with these six columns. Two more columns would make the sum 119, above the tolerance at h ≥ 5.
 SEQUENCE = (2, 4, 6, 8, 10, 12)
 
-TOLERANCE = 1e-13  # of a sample, relative to 1 + |component|: a hundred times the rounding of a step
-HOPELESS = 8  # a sample that is not finite with this many substeps is given up
+# Largest error of a sample, relative to 1 + |component|: a hundred times the rounding of a step.
+TOLERANCE = 1e-13
+# A sample that is not finite with this many substeps is given up.
+MAX_SUBSTEPS_NOT_FINITE = 8
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class ReferenceSolution:
     q1: Tensor  # (..., n)
     p1: Tensor  # (..., n)
     s1: Tensor  # (...)
-    error: Tensor  # (...) largest difference to half as many substeps, relative to 1 + |component|
+    error: Tensor  # (...) largest difference from half as many substeps, relative to 1 + |component|
 
 
 def reference_solve(
@@ -48,10 +50,9 @@ def reference_solve(
 ) -> ReferenceSolution:
     """Integrate (q, p, s) over time h, and estimate the error.
 
-    A sample keeps the first result that agrees with that of half the substeps to `TOLERANCE`, and so does not depend
-    on the rest of the batch; after `max_substeps` the last result is kept, with `error`. The result is in the
-    dtype of q, and differentiable if the vector field is. `error` belongs to the coarser of the last two results: the
-    finer is returned.
+    A sample keeps the first result that agrees to `TOLERANCE` with the result of half as many substeps, or the result
+    of `max_substeps`; samples do not influence each other. The result has the dtype of q, and is differentiable if the
+    vector field is. `error` is that of the coarser of the last two results; the finer result is returned.
     """
     n, dtype = q.shape[-1], q.dtype
     h = torch.as_tensor(h, dtype=torch.float64, device=q.device)
@@ -66,12 +67,12 @@ def reference_solve(
 
 
 def _integrated(f: Derivative, x0: Tensor, span: Tensor, max_substeps: int) -> tuple[Tensor, Tensor]:
-    """ẋ = f(x) integrated, the number of substeps doubled from 2 until a sample agrees with itself.
+    """Integrate ẋ = f(x) with 1, 2, 4, … substeps until two results of a sample agree.
 
-    x at the end, (..., d), and the error of the coarser of the last two results, (...).
+    Return x at the end, (..., d), and the error of the coarser of the last two results, (...).
     """
     span, substeps = span[..., None], 2
-    # One substep, and the first of two: one batch.
+    # The one substep of the coarse result and the first substep of the finer result are one batch.
     x, half = _extrapolated_step(f, x0.expand(2, *x0.shape), torch.stack([span, span / 2]))
     finer = _extrapolated_step(f, half, span / 2)
     error = torch.full(x0.shape[:-1], torch.inf, dtype=x0.dtype, device=x0.device)
@@ -80,8 +81,8 @@ def _integrated(f: Derivative, x0: Tensor, span: Tensor, max_substeps: int) -> t
         done = error <= TOLERANCE
         x = torch.where(done[..., None], x, finer)
         error = torch.where(done, error, difference)
-        hopeless = ~torch.isfinite(error) & (substeps >= HOPELESS)
-        if substeps >= max_substeps or bool(((error <= TOLERANCE) | hopeless).all()):
+        given_up = ~torch.isfinite(error) & (substeps >= MAX_SUBSTEPS_NOT_FINITE)
+        if substeps >= max_substeps or bool(((error <= TOLERANCE) | given_up).all()):
             return x, error
         substeps *= 2
         finer = x0
@@ -92,10 +93,7 @@ def _integrated(f: Derivative, x0: Tensor, span: Tensor, max_substeps: int) -> t
 def reference_flow(
     vector_field: VectorField, q: Tensor, p: Tensor, s: Tensor, h: Tensor | float, max_substeps: int = 128
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The state of `reference_solve`, or an error where it has not converged.
-
-    Raise InputError if the estimated error of a sample is not below `TOLERANCE` (or is NaN).
-    """
+    """The state of `reference_solve`; raise InputError if the estimated error of a sample exceeds `TOLERANCE`."""
     solution = reference_solve(vector_field, q, p, s, h, max_substeps)
     failed = ~(solution.error <= TOLERANCE)
     if bool(failed.any()):
@@ -120,9 +118,9 @@ def _extrapolated_step(f: Derivative, x: Tensor, h: Tensor) -> Tensor:
 
 
 def _modified_midpoints(f: Derivative, x: Tensor, h: Tensor) -> list[Tensor]:
-    """Increments of x after each number of leapfrog steps of `SEQUENCE`, which start with an Euler step.
+    """Increments of x after every number of leapfrog steps in `SEQUENCE`, which start with an Euler step.
 
-    The columns are one batch, from which the finished ones leave: f is called 12 times instead of 37.
+    All columns are one batch, which finished columns leave: f is called 12 times instead of 37.
     """
     counts = torch.tensor(SEQUENCE, dtype=x.dtype, device=x.device)
     d = h / counts.reshape(-1, *(1,) * x.ndim)
@@ -136,16 +134,17 @@ def _modified_midpoints(f: Derivative, x: Tensor, h: Tensor) -> list[Tensor]:
     return found
 
 
-Path = Callable[[Tensor], tuple[Tensor, Tensor]]  # t ↦ (q(t), q̇(t)), (...) → (..., n) twice
+Path = Callable[[Tensor], tuple[Tensor, Tensor]]  # (...) t ↦ (q(t), q̇(t)), (..., n) each
 
 
 def path_action(lagrangian: Lagrangian, path: Path, s0: Tensor, T: Tensor | float) -> Tensor:
     """s(T) of ds/dt = L(q(t), q̇(t), s), s(0) = s0, along a path that need not be a motion; shape (...).
 
-    s(T) − s0 is Herglotz's action of the path. Among the paths with the same ends and the same s0 it is stationary
-    exactly at the solutions of Herglotz's equations; there the action is L_d(q(0), q(T), s0), the exact discrete
-    Lagrangian. Raise InputError if the integration does not converge.  Source: Cauchy problem and Herglotz action of
-    the paper.
+    s(T) − s0 is Herglotz's action of the path. Among the paths with the same ends and the same s0 the action is
+    stationary exactly at the solutions of Herglotz's equations, where it equals the exact discrete Lagrangian
+    L_d(q(0), q(T), s0). Raise InputError if the integration does not converge.
+
+    Source: Cauchy problem and Herglotz action of the paper.
     """
 
     def field(t: Tensor, _: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:

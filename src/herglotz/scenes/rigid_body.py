@@ -1,7 +1,7 @@
 """A free rigid body with one damping rate, in roll, pitch and yaw: a mass that depends on the position.
 
 L = ½ Ω·JΩ − γs, with Ω = W(q) q̇ the angular velocity in the body frame and q = (φ, θ, ψ) roll, pitch and yaw,
-R = R_z(ψ) R_y(θ) R_x(φ). The angular momentum in space, R JΩ, is scaled by e^{−γt} and never turned.
+R = R_z(ψ) R_y(θ) R_x(φ). The angular momentum in space, R JΩ, decreases as e^{−γt} in a constant direction.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class FreeBody:
 
     def lagrangian(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         """L, (...)."""
-        turning = self.body_velocity(q, v)
-        return 0.5 * (self.inertia(v) * turning * turning).sum(-1) - self.gamma * s
+        omega = self.body_velocity(q, v)
+        return 0.5 * (self.inertia(v) * omega * omega).sum(-1) - self.gamma * s
 
     def force(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG002
         """L_q = JΩ·Ω_q, with Ω_φ = (0, Ω3, −Ω2) and no yaw in L."""
@@ -71,10 +71,10 @@ class FreeBody:
 
 
 def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float = 0.1) -> Scene:
-    """A rigid body that no torque acts on but a uniform damping, J Ω̇ = JΩ × Ω − γJΩ.
+    """A rigid body without a torque except uniform damping, J Ω̇ = JΩ × Ω − γJΩ.
 
-    The angles are a chart of the rotations that ends at a pitch of ±π/2. The default ranges spin the body about its
-    first axis, where pitch and yaw only nutate; `herglotz.theory.RigidBodyStepper` needs no chart.
+    The angles are a chart of the rotations that is singular at a pitch of ±π/2. In the default ranges the body spins
+    about its first axis, where pitch and yaw only nutate; `herglotz.theory.RigidBodyStepper` needs no chart.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Quadrature rules: a continuous Lagrangian L(q, v, s) becomes a discrete one, L_d(q0, q1, s0, h).
 
-With v = (q1 − q0)/h and q̄ = (q0 + q1)/2. Once there is damping the order depends on *where s is taken* (trap 1 of
-`docs/mathematics.md`); ORDERS has the order of each rule, which a test measures.
+The rules use v = (q1 − q0)/h and q̄ = (q0 + q1)/2. With damping the order of a rule depends on *where s is taken* (trap
+1 of `docs/mathematics.md`); ORDERS has the order of each rule, which a test measures.
 """
 
 from __future__ import annotations
@@ -13,18 +13,20 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian
-from herglotz.mechanics.newton import find_root, solve
+from herglotz.mechanics.linear import solve
+from herglotz.mechanics.newton import find_root
 from herglotz.scenes.special import as_step
 from herglotz.theory.continuous import Lagrangian
 
-MAX_NEWTON = 30  # ends a scalar equation without a solution
-# With the Jacobian held fixed each Newton step inside the graph makes derivatives exact one order further.
+# Ends the iteration of a scalar equation without a solution.
+MAX_NEWTON = 30
+# With a constant Jacobian each Newton step inside the graph makes derivatives of one more order exact.
 EXACT_DERIVATIVES = 3
 Rule = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 def _rule(formula: Callable[..., Tensor]) -> Callable[[Lagrangian], Rule]:
-    """Make of a formula of (L, q0, q1, v, s0, h) the rule L ↦ L_d."""
+    """The rule L ↦ L_d of a formula of (L, q0, q1, v, s0, h)."""
 
     def rule(L: Lagrangian) -> Rule:
         def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
@@ -57,7 +59,7 @@ def right(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tenso
 def midpoint(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = h L(q̄, v, s0 + L_d/2), implicit in one scalar: order 2, c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
 
-    Self-adjoint. NaN where Newton's method for the scalar does not converge.
+    The rule is its own adjoint. L_d is NaN where Newton's method for the scalar does not converge.
     """
     q = 0.5 * (q0 + q1)
     return _implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
@@ -72,7 +74,7 @@ def midpoint_heun(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, 
 
 @_rule
 def midpoint_plain(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-    """L_d = h L(q̄, v, s0): order 1 with damping, 2 without. The trap, kept to be measured; use `midpoint_heun`."""
+    """L_d = h L(q̄, v, s0): order 1 with damping, 2 without. Trap 1, kept to be measured; use `midpoint_heun`."""
     return h * L(0.5 * (q0 + q1), v, s0)
 
 
@@ -90,7 +92,7 @@ def trapezoid(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: T
 def trapezoid_heun(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0 + h L(q0, v, s0))]: order 2, explicit.
 
-    The second stage has the Euler value of s1; its O(h²) error enters L_d at O(h³), which order 2 allows.
+    The second stage has the Euler value of s1, whose O(h²) error enters L_d at O(h³), which order 2 allows.
     """
     start = L(q0, v, s0)
     return 0.5 * h * (start + L(q1, v, s0 + h * start))
@@ -98,15 +100,15 @@ def trapezoid_heun(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor,
 
 @_rule
 def trapezoid_plain(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-    """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0)]: order 1 with damping, 2 without. The trap, kept to be measured."""
+    """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0)]: order 1 with damping, 2 without. Trap 1, kept to be measured."""
     return 0.5 * h * (L(q0, v, s0) + L(q1, v, s0))
 
 
 def strang(potential: Callable[[Tensor], Tensor], m: float, gamma: float) -> Rule:
-    """L_d = (E−1)s0 + √E [m|Δ|²/2h − (h/2)(V0 + V1)], E = e^{−γh}: order 2, its own adjoint, explicit to step.
+    """L_d = (E−1)s0 + √E [m|Δ|²/2h − (h/2)(V0 + V1)], E = e^{−γh}: order 2, its own adjoint, with an explicit step.
 
     L_d generates the splitting damp(h/2) ∘ kick(h/2) ∘ drift(h) ∘ kick(h/2) ∘ damp(h/2) of H = |p|²/2m + V(q) + γs into
-    γs, V and |p|²/2m. c = E, exactly.
+    γs, V and |p|²/2m, and c = E exactly.
     """
 
     def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
@@ -133,10 +135,10 @@ def all_rules(L: Lagrangian) -> dict[str, DiscreteLagrangian]:
 
 
 def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-    """The scalar x = action(x) of each sample, by Newton's method from 0; NaN where it has not converged.
+    """The scalar x = action(x) of each sample, by Newton's method from 0; NaN without convergence.
 
-    Solved outside the graph. Where gradients are on and the action wants them, further steps inside the graph carry the
-    first three derivatives of x with respect to all that the action depends on.
+    Newton's method runs outside the graph. If the action requires a gradient, `EXACT_DERIVATIVES` further steps inside
+    the graph give x its first three derivatives.
     """
     start = s0.new_zeros(*torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape), 1)
 
@@ -147,7 +149,7 @@ def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Te
         value, slope = jacobian(g, x)
         return x - value, 1.0 - slope
 
-    # The move after one below √eps is below rounding.
+    # After a move below √eps the next move is below rounding.
     tol = torch.finfo(start.dtype).eps ** 0.5
     root = find_root(equations, start, 1.0 + start, iterations=MAX_NEWTON, tol=tol)
     x = root.x + root.move

@@ -14,14 +14,14 @@ StateFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 State = tuple[Tensor, Tensor, Tensor]
 Step = Tensor | float
 DiscreteHamiltonian = Callable[[Tensor, Tensor, Tensor, Step], Tensor]
-Range = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]  # (low, high), a number or one a coordinate
+Range = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]  # (low, high), numbers or (n,) each
 
 
 @dataclass(frozen=True, repr=False)
 class Scene:
-    """One contact system with its continuous and discrete descriptions.
+    """A contact system with its continuous and discrete descriptions.
 
-    Everything is batched over leading dimensions: positions, velocities and momenta are (..., n), the action variable
+    Functions are batched over leading dimensions: positions, velocities and momenta are (..., n), the action variable
     s is (...), the step h is a number or a tensor (...). Units follow `units` and `time_unit`.
 
     Parameters
@@ -31,26 +31,26 @@ class Scene:
     momentum, velocity
         p = L_v(q, v, s) and v = H_p(q, p, s), shape (..., n), inverse to each other.
     flow
-        (q, p, s, h) → (q1, p1, s1): closed form where there is one, else the high-accuracy reference flow.
+        (q, p, s, h) → (q1, p1, s1) in closed form, or the high-accuracy reference flow.
     L_d
-        The principal discrete Lagrangian L_d(q0, q1, s0, h). `exact` says whether it generates `flow` exactly.
+        The principal discrete Lagrangian L_d(q0, q1, s0, h); `exact`: L_d generates `flow` exactly.
     L_d_rules
-        The discretisations offered for this scene, by name; `exact` never among them.
+        The discretisations of this scene by name, none of them exact.
     H_plus, H_minus
         Right and left discrete Hamiltonians of `L_d`, H⁺(q0, p1, s0, h) and H⁻(p0, q1, s1, h) with the conventions of
         errata E5 and E9; None where no closed form is known.
     q_range, v_range, h
-        Typical initial positions, initial velocities and step: where examples and generated data start. A range is
-        (low, high), each a number or a tuple of `dof` numbers.
+        Ranges of initial positions and velocities, and the step, of examples and generated data. A range (low, high)
+        has two numbers, or two tuples of `dof` numbers.
     numerical
-        The exact L_d computed by collocation (`herglotz.scenes.exact`), for a scene without a closed form.
+        The exact L_d by collocation (`herglotz.scenes.exact`), of a scene without a closed form.
     examples
-        Parameters off the defaults, at which the tests check the scene too: a default of 1 hides powers.
+        Parameters other than the defaults, for tests: a default of 1 hides powers.
     external
-        f(q, v), (..., n): a force beside the Lagrangian's, ṗ = L_q + L_s p + f; None: none, and the flow is a contact
-        flow. Where it stands for a set-valued force, `flow` has the force itself and this its smoothed form.
+        f(q, v), (..., n), a force besides that of the Lagrangian: ṗ = L_q + L_s p + f. None: the flow is a contact
+        flow. If `flow` has a set-valued force, `external` is its smoothed form.
     at, drive
-        Of a scene with inputs: the scene at the inputs u, (..., m), held constant, and the given inputs, t (...) ↦ u.
+        For a scene with inputs: the scene at constant inputs u, (..., m), and the given inputs, t (...) ↦ u.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Scene:
 
     @property
     def angles(self) -> tuple[bool, ...]:
-        """Which coordinates are angles: those in rad."""
+        """(n,) whether each coordinate is an angle, in rad."""
         return tuple(unit == "rad" for unit in self.units)
 
 
@@ -99,7 +99,7 @@ def left_of(H_plus: DiscreteHamiltonian) -> DiscreteHamiltonian:
 
 
 def require_positive(scene: str, **numbers: float) -> None:
-    """Refuse a parameter of a scene that is not positive; blanks in its name are written as `_`."""
+    """Raise InputError for a parameter that is not positive; `_` in its name stands for a blank."""
     for name, value in numbers.items():
         if not value > 0:
             raise InputError(f"{scene}: {name.replace('_', ' ')} must be > 0, got {value}")

@@ -1,11 +1,11 @@
 """A linear motor axis with dry friction and no spring, M ẍ = u − d ẋ − F_c sign ẋ + f₀, with true sticking.
 
-L = M v²/2 + (u + f₀) x − γs with γ = d/M: viscous friction is the contact term. Dry friction is set-valued: at rest it
-balances any force up to F_c. With u held over a step the motion is known piece by piece: between two events the speed
+L = M v²/2 + (u + f₀) x − γs with γ = d/M: viscous friction is the contact term. Dry friction is set-valued and balances
+any force up to F_c at rest. With u held over a step the motion is known piece by piece. Between two events the speed
 relaxes as e^{−γt}, so the time of a reversal is a logarithm, and a step has at most two pieces, before and after rest.
 
-The default numbers are of the size that a published identification of such an axis found: A. Janot, M. Gautier and
-M. Brunot, Data Set and Reference Models of EMPS, 2019 Workshop on Nonlinear System Identification Benchmarks.
+The default numbers have the size of a published identification of a motor axis: A. Janot, M. Gautier and M. Brunot,
+Data Set and Reference Models of EMPS, 2019 Workshop on Nonlinear System Identification Benchmarks.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from herglotz.errors import InputError
 from herglotz.scenes.driven import driven_scene
 from herglotz.scenes.scene import Scene, State, Step, require_positive
 
-# L_d has no set-valued force: below this share of the default speed range its dry friction is smoothed, as tanh.
-SMOOTHED = 0.01
-# Gauss–Legendre nodes on [−1, 1] for the action of a piece: exact to 1e-14 of it for γh up to 4.
+# L_d has no set-valued force: its dry friction is F_c tanh(v / this width), in m/s, a twentieth of the
+# default speeds.
+SMOOTH_WIDTH = 0.01
+# Gauss–Legendre nodes on [−1, 1] for the action of a piece, exact to a relative error of 1e-14 for γh up to 4.
 NODES, WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(10))
 
 
 class Axis(NamedTuple):
-    """The numbers of an axis."""
+    """Mass M [kg], damping rate γ [1/s] and dry friction F_c [N] of an axis."""
 
     m: float
     gamma: float
@@ -43,7 +44,7 @@ def servo_axis(
     Parameters
     ----------
     m, offset
-        Moving mass M, kg, and constant force f₀, N: an offset of the amplifier.
+        Moving mass M, kg, and constant force f₀, N, such as an offset of the amplifier.
     viscous, dry
         Viscous friction d ≥ 0, N s/m, and dry (Coulomb) friction F_c ≥ 0, N.
     amplitude, frequency
@@ -70,7 +71,7 @@ def servo_axis(
         amplitude,
         frequency,
         m=m,
-        external=lambda q, v: -dry * torch.tanh(v / SMOOTHED),  # noqa: ARG005
+        external=lambda q, v: -dry * torch.tanh(v / SMOOTH_WIDTH),  # noqa: ARG005
         flow=flow,
         name="servo_axis",
         description="motor axis with dry friction and sticking, no spring, in closed form between reversals",
@@ -87,7 +88,7 @@ def servo_axis(
 
 
 def _flow(axis: Axis, force: Tensor | float, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-    """The motion under a constant force: slip until rest, if that is within h; then stick, or slip where it pushes."""
+    """The motion under a constant force: slip until rest, if within h; then stick, or slip in the force's direction."""
     dtype = q.dtype
     q, p, s = (x.double() for x in (q, p, s))
     shape = torch.broadcast_shapes(q.shape[:-1], p.shape[:-1], s.shape, torch.as_tensor(h).shape)
@@ -104,21 +105,22 @@ def _flow(axis: Axis, force: Tensor | float, q: Tensor, p: Tensor, s: Tensor, h:
 
 
 def _pushed(F: Tensor, dry: float) -> Tensor:
-    """Where a body at rest is pushed: −1, 0 (it sticks) or 1."""
+    """The direction in which F moves a body at rest: −1, 0 (the body sticks) or 1."""
     return torch.where(F.abs() > dry, F.sign(), 0.0)
 
 
 def _time_to_rest(axis: Axis, F: Tensor, v: Tensor) -> Tensor:
-    """When v̇ = F/M − γv stops a body that moves at v; infinite where it does not."""
+    """The time at which v̇ = F/M − γv stops a body of velocity v; infinite if F does not stop the body."""
     a = F / axis.m
     brakes = (a * v < 0) & (v != 0)
-    ratio = torch.where(brakes, -v / torch.where(brakes, a, 1.0), 0.0)  # v = a(… ) reaches 0 after this time at γ = 0
-    time = torch.log1p(axis.gamma * ratio) / axis.gamma if axis.gamma > 0 else ratio
+    # The time without viscous friction, −v/a.
+    undamped = torch.where(brakes, -v / torch.where(brakes, a, 1.0), 0.0)
+    time = torch.log1p(axis.gamma * undamped) / axis.gamma if axis.gamma > 0 else undamped
     return torch.where(brakes, time, torch.inf)
 
 
 def _piece(axis: Axis, F: Tensor, way: Tensor, start: State, t: Tensor) -> State:
-    """Position, velocity and action after a time t of slip one way, or of rest (way and v are 0)."""
+    """Position, velocity and action after a time t of slip in the direction `way`, or of rest (way = v = 0)."""
     x, v, s = start
     rests = (way == 0) & (v == 0)
     a = torch.where(rests, 0.0, (F - way * axis.dry) / axis.m)
@@ -126,8 +128,9 @@ def _piece(axis: Axis, F: Tensor, way: Tensor, start: State, t: Tensor) -> State
     def motion(t: Tensor) -> tuple[Tensor, Tensor]:
         if axis.gamma == 0:
             return x + t * (v + 0.5 * t * a), v + t * a
-        lost = -torch.expm1(-axis.gamma * t) / axis.gamma  # ∫ e^{−γτ} dτ
-        return x + v * lost + a * (t - lost) / axis.gamma, v + lost * (a - axis.gamma * v)
+        # ∫ e^{−γτ} dτ from 0 to t
+        damped_time = -torch.expm1(-axis.gamma * t) / axis.gamma
+        return x + v * damped_time + a * (t - damped_time) / axis.gamma, v + damped_time * (a - axis.gamma * v)
 
     action = torch.exp(-axis.gamma * t) * s
     for node, weight in zip(NODES, WEIGHTS, strict=True):

@@ -1,4 +1,4 @@
-"""cos and sin(·)/· as functions of the square of their argument, analytic through zero, and the step as a tensor.
+"""cos and sin(·)/· as analytic functions of the square of their argument, and the step as a tensor.
 
 With x = ω²h² one formula covers under-damped (x > 0), critical (x = 0) and over-damped (x < 0) motion.
 """
@@ -10,14 +10,14 @@ import math
 import torch
 from torch import Tensor
 
-# At |x| ≤ 1 the first dropped term is x¹³/26!, and of the second derivative 156 x¹¹/26!: below 1e-24 either way.
+# At |x| ≤ 1 the first dropped term, x¹³/26!, and its second derivative, 156 x¹¹/26!, are below 1e-24.
 TERMS = 13
 
 
 def cosw(x: Tensor) -> Tensor:
     """Cos √x for x ≥ 0, cosh √−x for x < 0; entire in x, any number of derivatives.
 
-    The series serves |x| ≤ 1: there the closed form's derivatives lose digits like 1/x, and are NaN at 0.
+    For |x| ≤ 1 the series is used, because derivatives of the closed form lose digits like 1/x and are NaN at 0.
     """
     root = _far_root(x)
     far = torch.where(x > 0, torch.cos(root), torch.cosh(root))
@@ -47,7 +47,7 @@ def as_step(h: Tensor | float, like: Tensor) -> Tensor:
 
 
 def _far_root(x: Tensor) -> Tensor:
-    """√|x| where |x| > 1; 1 elsewhere, so that the branch not taken has finite derivatives."""
+    """√|x| where |x| > 1, else 1, so that the branch that is not taken has finite derivatives."""
     return torch.sqrt(torch.where(x.abs() > 1.0, x.abs(), 1.0))
 
 

@@ -1,7 +1,7 @@
-"""Van der Pol's oscillator, ẍ = μ(1 − x²)ẋ − x: damping that is negative near 0, so a limit cycle of size 2.
+"""Van der Pol's oscillator, ẍ = μ(1 − x²)ẋ − x: the damping is negative near 0, so there is a limit cycle of size 2.
 
-L = v²/2 − x²/2 without s; the damping is a force beside it, because one action s cannot say a rate that changes sign
-with x. No closed form: the reference flow is the answer.
+L = v²/2 − x²/2 does not contain s. The damping is an external force, because one action s cannot express a rate that
+changes sign with x. There is no closed form; the answer is the reference flow.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ def van_der_pol(mu: float = 1.0) -> Scene:
     Parameters
     ----------
     mu
-        Strength μ > 0 of the damping, per unit of time; the cycle is a sine for small μ and jumps for large.
+        Strength μ > 0 of the damping, per unit of time; the cycle is a sine for small μ and jumps for large μ.
 
     Raises
     ------
     InputError
-        If μ ≤ 0: without negative damping damped_oscillator is the scene.
+        If μ ≤ 0; without negative damping use the scene damped_oscillator.
 
     Source: B. van der Pol, On relaxation-oscillations, Phil. Mag. 2 (1926) 978.
     """

@@ -196,7 +196,7 @@ def test_dry_friction_holds_and_breaks_away():
         model.friction.coulomb.fill_(0.5)
         model.friction.breakaway.fill_(0.3)
         v = torch.tensor([[-2.0], [-0.1], [0.0], [0.1], [2.0]], dtype=torch.float64)
-        f = model.friction.force(v, None).value[:, 0]
+        f = model.friction.value_and_slope(v, None)[0][:, 0]
     assert f[2] == 0
     assert f[0] == pytest.approx(0.5)
     assert f[4] == pytest.approx(-0.5)

@@ -107,7 +107,7 @@ def test_dry_friction_is_found():
     model, _ = one_step_fit(data, level="forced", coulomb=True, potential_width=0, iterations=150)
     v = torch.linspace(-1.0, 1.0, 21, dtype=torch.float64)[:, None]
     with torch.no_grad():
-        f = [m.friction.force(v, None).value - m.damping.rate * v for m in (model, truth)]
+        f = [m.friction.value_and_slope(v, None)[0] - m.damping.rate * v for m in (model, truth)]
     assert float((f[0] - f[1]).abs().max()) < 1e-3
 
 
