@@ -91,6 +91,9 @@ MODELS = {
     "features of r, known": config(
         3, (False,) * 3, features=("r^-1", "central 2"), known=("0.5 q2^2",), level="affine"
     ),
+    "features with lever arms": config(
+        2, (False, True), features=("q1^2 cos(q2)", "0.1 q1 sin(2q2 + 0.3) v1 v2"), level="forced", coupled=True
+    ),
     "alike": config(8, (False,) * 8, alike=True, features=("sites 4", "chain 3"), potential_width=0),
     "order four": config(1, order=4, potential_width=0),
     "order four, conservative": config(

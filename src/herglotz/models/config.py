@@ -179,12 +179,14 @@ class ModelConfig:
     def _check_features(self) -> None:
         products = {text: parse(text, self.angles) for text in expand((*self.features, *self.known), self.angles)}
         for text, feature in products.items():
-            constant = not any(p.power or any(p.form) or p.velocities for p in feature)
+            constant = not any(p.power or p.degree or any(p.form) or p.velocities for p in feature)
             refuse({
                 f"feature '{text}': a constant moves nothing at the level '{self.level}'; leave it out":
                     constant and self.level not in ("affine", "full"),
                 f"feature '{text}': order 4 takes at most two velocities a product; set order=2":
                     self.order == 4 and max(len(p.velocities) for p in feature) > 2,
+                f"feature '{text}': order 4 takes no power beside a wave; set order=2":
+                    self.order == 4 and any(p.degree for p in feature),
             })  # fmt: skip
         alone = "alike" if self.alike else "translations" if self.translations else ""
         if self.order == 4 and alone and all(feature[0].velocities for feature in products.values()):

@@ -1,7 +1,7 @@
 """The grammar of a feature's text, and its reader.
 
     feature = [sign] product { sign product }
-    product = factor { ["*"] factor }             at most one function of the position
+    product = factor { ["*"] factor }             at most one function of the position, and one power beside a wave
     factor  = number | ("cos" | "sin") "(" form ")" | base [ "^" integer ]
     base    = "r" | "q" index | "v" index | "(" form ")" | size
     size    = "|" "q" index "|"                   |q1|^3, and before a power of the same coordinate: |q1| q1^2
@@ -32,10 +32,10 @@ HOW = "write sums of products of numbers, v1, and one of cos(q1 - q2), sin(q1), 
 
 @dataclass(frozen=True)
 class Product:
-    """factor · f(w·q + phase) · ∏ v, with the `form` w and the coordinates of the factors v, repeated for powers.
+    """factor · f(w·q + phase) · (a·q)^degree · ∏ v, with the forms w and a and the coordinates of the factors v.
 
     The `function` f is "cos", "sin", "power" (x^power), "signed" (sgn(x) x^power) or "radius" (r^power with r = |q|, no
-    w). Only waves have a phase.
+    w). Only waves have a phase, or a lever arm (a·q)^degree: r cos θ. Factors v are repeated for powers.
     """
 
     factor: float
@@ -44,6 +44,8 @@ class Product:
     power: int = 0
     velocities: tuple[int, ...] = ()
     phase: float = 0.0
+    arm: tuple[float, ...] = ()  # (n,) a, or none where the degree is 0
+    degree: int = 0
 
 
 Feature = tuple[Product, ...]
@@ -113,19 +115,24 @@ class _Reader:
             if numbers > 1:
                 raise self._error(f"'{self.text[begin:].strip()}' has two numbers in one product; write their product")
             count += 1
+        arm, degree = (), 0
+        if sorted(f[0] in ("cos", "sin") for f in functions) == [False, True]:
+            functions.sort(key=lambda f: f[0] in ("cos", "sin"))
+            if functions[0][0] == "power":
+                _, arm, degree, _ = functions.pop(0)
         if len(functions) > 1:
             raise self._error(
                 f"'{self.text[begin : self._next()[2]].strip()}' has {len(functions)} functions of the position, and a "
-                "product takes one; q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
+                "product takes one, or a power beside a wave; q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
             )
         function, form, power, phase = (functions or [("power", (0.0,) * self.n, 0, 0.0)])[0]
-        return self._checked(Product(factor, function, form, power, tuple(velocities), phase))
+        return self._checked(Product(factor, function, form, power, tuple(velocities), phase, arm, degree))
 
     def _checked(self, product: Product) -> Product:
         """The product, if its function fits the coordinates."""
         radial = product.function == "radius"
-        used = [True] * self.n if radial else product.form
-        if product.power and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
+        used = product.arm if product.degree else [True] * self.n if radial else product.form
+        if (product.power or product.degree) and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
             raise self._error("a power of an angle is not periodic; use cos or sin")
         if product.phase and product.function not in ("cos", "sin"):
             raise self._error(f"a power of q + {product.phase:g} is a sum of powers; write these, or a wave")

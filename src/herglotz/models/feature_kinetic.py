@@ -44,7 +44,7 @@ class FeatureKinetic(nn.Module):
     def mass(self, q: Tensor) -> Tensor:
         """Return the features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
         c, n = self.sum, self.sum.dof
-        f = (c.ridge(c.forms(q), 0) * c.weights()) @ self.of
+        f = (c.value(q, c.ridge(c.forms(q), 0)) * c.weights()) @ self.of
         out = q.new_zeros(*q.shape, n)
         for k, velocities in enumerate(self.monomials):
             if len(velocities) == 2:
@@ -80,20 +80,21 @@ class FeatureKinetic(nn.Module):
 
         Each f is a function of one number, so its derivatives are f′ w and f″ w wᵀ and no jets are multiplied.
         """
-        c, order = self.sum, phase.order
-        x, weights = c.forms(phase.mean.value), c.weights()
+        c, order, q = self.sum, phase.order, phase.mean.value
+        weights, x = c.weights(), c.forms(q)
         f = [c.ridge(x, k) * weights for k in range(max(by_order) + order + 1)]
-        whole = lambda part: reduce(torch.add, [part(k, R) for k, R in by_order.items()])  # noqa: E731
-        value = whole(lambda k, R: f[k] * R.value).sum(-1)
+        # The sums over k of the j-th derivatives of f times a part of R.
+        total = lambda j, part: reduce(torch.add, [f[k + j] * part(R) for k, R in by_order.items()])  # noqa: E731
+        values = [total(j, lambda R: R.value) for j in range(order + 1)]
+        value = c.value(q, values[0]).sum(-1)
         if not order:
             return Jet(value[None], 0, 0)
-        by_q = whole(lambda k, R: f[k + 1] * R.value) @ c.form
-        by_v = whole(lambda k, R: f[k] * R.gradient).sum(-1)
+        slopes = [total(j, lambda R: R.gradient) for j in range(order)]
+        by_q, by_v = c.slope(q, *values[:2]), c.value(q, slopes[0]).sum(-1)
         second = None
         if order == 2:
-            by_qq = whole(lambda k, R: f[k + 2] * R.value) @ c.outer
-            by_vq = whole(lambda k, R: f[k + 1] * R.gradient) @ c.form
-            second = by_qq.movedim(-1, 0), by_vq.movedim(-1, 1), whole(lambda k, R: f[k] * R.second).sum(-1)
+            by_qq, by_vq = c.bend(q, *values).movedim(-1, 0), c.slope(q, *slopes).movedim(-1, 1)
+            second = by_qq, by_vq, c.value(q, total(0, lambda R: R.second)).sum(-1)
         return of_mean_and_velocity(value, by_q.movedim(-1, 0), by_v, second, phase.h)
 
 

@@ -29,15 +29,22 @@ class Combination(nn.Module):
         self.counts = [sum(p.function == f for p in self.products) for f in names]
         self.ridges = sum(self.counts[: len(RIDGES)])
         self.dof, self.learned = dof, len(features)
+        self.highest_degree = max((p.degree for p in self.products), default=0)
         self.highest = max((p.power for p in self.products[: self.ridges]), default=0)
         self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
         form = torch.tensor([p.form for p in self.products[: self.ridges]], dtype=torch.float64).reshape(-1, dof)
         i, j = pairs(dof, torch.device("cpu"))
+        arm = torch.tensor([p.arm or (0.0,) * dof for p in self.products[: self.ridges]], dtype=torch.float64)
+        arm = arm.reshape(-1, dof)
         numbers = {
             "factor": torch.tensor([p.factor for p in self.products], dtype=torch.float64),
             "form": form,  # (ridges, n) w
             "phase": torch.tensor([p.phase for p in self.products[: self.ridges]], dtype=torch.float64),
             "outer": form[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w wᵀ
+            "arm": arm,  # (ridges, n) a
+            "degree": torch.tensor([float(p.degree) for p in self.products[: self.ridges]], dtype=torch.float64),
+            "arms": form[:, i] * arm[:, j] + arm[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w aᵀ + a wᵀ
+            "outer_arm": arm[:, i] * arm[:, j],  # (ridges, n(n+1)/2) rows of a aᵀ
             "power": torch.tensor([float(p.power) for p in self.products], dtype=torch.float64),
             "group": torch.tensor([g for _, g in grouped], dtype=torch.long),
         }
@@ -48,6 +55,10 @@ class Combination(nn.Module):
         self.phase: Tensor
         self.shifted = any(p.phase for p in self.products)
         self.outer: Tensor
+        self.arm: Tensor
+        self.degree: Tensor
+        self.arms: Tensor
+        self.outer_arm: Tensor
         self.power: Tensor
         self.group: Tensor
 
@@ -82,6 +93,31 @@ class Combination(nn.Module):
             product = product * torch.where(rest > j, x, 1.0)
         return _front(exponent, k) * product
 
+    def lever(self, q: Tensor, k: int) -> Tensor:
+        """Return the k-th derivative of (a·q)^degree, (..., ridges)."""
+        x, rest = q @ self.arm.T, self.degree - k
+        product = torch.ones_like(x)
+        for j in range(self.highest_degree - k):
+            product = product * torch.where(rest > j, x, 1.0)
+        return _front(self.degree, k) * product
+
+    def value(self, q: Tensor, f: Tensor) -> Tensor:
+        """Return f (a·q)^degree, for f (..., ridges) of the ridges: what they are times their lever arms."""
+        return f * self.lever(q, 0) if self.highest_degree else f
+
+    def slope(self, q: Tensor, f: Tensor, f1: Tensor) -> Tensor:
+        """Return the gradients by q, (..., n), of the sums of f (a·q)^degree over the ridges, f1 being f′."""
+        if not self.highest_degree:
+            return f1 @ self.form
+        return (f1 * self.lever(q, 0)) @ self.form + (f * self.lever(q, 1)) @ self.arm
+
+    def bend(self, q: Tensor, f: Tensor, f1: Tensor, f2: Tensor) -> Tensor:
+        """Return the Hessians by q, rows i ≤ j (..., n(n+1)/2), of these sums."""
+        if not self.highest_degree:
+            return f2 @ self.outer
+        a = [self.lever(q, k) for k in range(3)]
+        return (f2 * a[0]) @ self.outer + (f1 * a[1]) @ self.arms + (f * a[2]) @ self.outer_arm
+
     def radial(self, square: Tensor, k: int) -> Tensor:
         """Return the k-th derivative of the radial functions by r², (..., number of radial functions)."""
         exponent = self.power.split(self.counts)[-1] / 2
@@ -113,7 +149,8 @@ class FeaturePotential(nn.Module):
         ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
         if c.ridges:
             x = c.forms(q)
-            parts.append((c.ridge(x, 0) @ ridge, (c.ridge(x, 1) * ridge) @ c.form))
+            f, f1 = c.ridge(x, 0), c.ridge(x, 1) * ridge
+            parts.append((c.value(q, f) @ ridge, c.slope(q, f * ridge, f1)))
         if c.ridges < len(c.products):
             square = (q * q).sum(-1)
             parts.append((c.radial(square, 0) @ radial, 2 * (c.radial(square, 1) @ radial)[..., None] * q))
@@ -126,9 +163,9 @@ class FeaturePotential(nn.Module):
         if y is not None:
             weights = weights * (y @ c.form.T)
         f = [c.ridge(x, k + j) * weights for j in range(order + 1)]
-        rows = [f[0].sum(-1)[None], (f[1] @ c.form).movedim(-1, 0)]
+        rows = [c.value(q, f[0]).sum(-1)[None], c.slope(q, *f[:2]).movedim(-1, 0)]
         if order == 2:
-            rows.append((f[2] @ c.outer).movedim(-1, 0))
+            rows.append(c.bend(q, *f).movedim(-1, 0))
         return Jet(torch.cat(rows), c.dof, order)
 
     def _radial(self, q: Tensor, weights: Tensor, order: int, y: Tensor | None) -> Jet:

@@ -1,9 +1,9 @@
 """Grey-box features: functions of (q, v) that a user names as text, with learned or known coefficients.
 
 A feature without velocities joins the potential V, a feature with velocities the kinetic term K. A feature is a sum of
-products, each of at most one function of the position and any number of velocities:
+products, each of at most one function of the position, a power beside a wave, and any number of velocities:
 
-    cos(q1 - q2) v1 v2        (q2 - q1)^4 + (q3 - q2)^4        0.5 r^-1        q1 v2 - q2 v1
+    cos(q1 - q2) v1 v2        (q2 - q1)^4 + (q3 - q2)^4        0.5 r^-1        q1 v2 - q2 v1        q1 cos(q2)
 
 The functions are cos, sin and whole powers of a linear form of the q, whole powers of r = |q|, and |q1| q1 or |q1|^3
 of a length: |q1| q1 has the force |q1| of a spring that is stiffer on one side. One coefficient multiplies the whole
@@ -94,6 +94,20 @@ def lengths(angles: Sequence[bool]) -> list[str]:
     return names
 
 
+def polar(angles: Sequence[bool]) -> list[str]:
+    """Slides q_i that joints q_j turn: weight, the mass of the joint, and masses between the joint and other speeds.
+
+    A mass m at the distance q_i on a link with the angle q_j adds m q_i² v_j²/2 to K and m g q_i cos q_j to V; terms of
+    the first power of q_i say where its zero is.
+    """
+    coordinates = range(1, len(angles) + 1)
+    names = []
+    for i, j in product((i for i in coordinates if not angles[i - 1]), (j for j in coordinates if angles[j - 1])):
+        names += [f"q{i} cos(q{j})", f"q{i} sin(q{j})", f"q{i} v{j}^2", f"q{i}^2 v{j}^2"]
+        names += [f"q{i} {f}(q{j}) v{j} v{k}" for k in coordinates if k not in (i, j) for f in ("cos", "sin")]
+    return names
+
+
 def _waves(angles: Sequence[bool], highest: int, total: int) -> list[str]:
     """The waves of k·q with |k_i| ≤ highest and Σ|k_i| ≤ total, without the baseline's cos qᵢ and sin qᵢ in V."""
     which = [i for i, angle in enumerate(angles, 1) if angle]
@@ -119,5 +133,6 @@ LIBRARIES: dict[str, Callable[..., list[str]]] = {
     "pendulums": pendulums,
     "harmonics": harmonics,
     "revolute": revolute,
+    "polar": polar,
     "lengths": lengths,
 }

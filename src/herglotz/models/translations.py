@@ -66,12 +66,10 @@ def check_translations(config: Any) -> None:
 
 def unchanged(text: str, angles: Sequence[bool], moved: Sequence[tuple[float, ...]]) -> bool:
     """Whether a feature is invariant along all of the directions."""
-    return not any(
-        (product.power or any(product.form))
-        and (
-            product.function == "radius" or any(abs(sum(map(float.__mul__, product.form, d))) > ROUNDING for d in moved)
-        )
-        for product in parse(text, angles)
+    products = parse(text, angles)
+    forms = [form for p in products for form in (p.form, p.arm) if any(form)]
+    return not any(p.function == "radius" and p.power for p in products) and not any(
+        abs(sum(map(float.__mul__, form, d))) > ROUNDING for form in forms for d in moved
     )
 
 

@@ -30,7 +30,7 @@ from herglotz.training.equation_words import (
     feature_in_words,
     own_term,
     raised,
-    slope,
+    slopes,
     unit_of,
 )
 from herglotz.training.fitted_run import FittedRun
@@ -256,9 +256,9 @@ class Reader:
                 continue
             for i in range(len(self.names)):
                 for product in feature:
-                    if product.function == "radius" or product.form[i]:
-                        what, by, power = slope(product, i, self.names)
-                        yield Line(self.lefts[i], what, unit_of(self.data.units[i], power, self.time, 2), -by * value)
+                    for what, by, power in slopes(product, i, self.names):
+                        unit = "" if power is None else unit_of(self.data.units[i], power, self.time, 2)
+                        yield Line(self.lefts[i], what, unit, -by * value)
 
     @staticmethod
     def _numbers(

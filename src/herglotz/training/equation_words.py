@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from herglotz.models.drag import DragFeature
 from herglotz.models.feature_grammar import Feature, Product
@@ -40,8 +41,21 @@ def drag_in_words(f: DragFeature, i: int, names: Sequence[str], sign: str = "") 
     return " ".join([*position, *size, *([raised(speed, f.c)] if f.c else [])])
 
 
-def slope(p: Product, i: int, names: Sequence[str]) -> tuple[str, float, int]:
-    """∂/∂q_i of a product without velocities: its text, its factor, and the power of length in the unit of a force."""
+def slopes(p: Product, i: int, names: Sequence[str]) -> Iterator[tuple[str, float, int | None]]:
+    """∂/∂q_i of a product without velocities: texts, factors, and the powers of length in the units of the forces.
+
+    The factors of a product with a lever arm have units of several coordinates, and no power (None).
+    """
+    if p.degree and p.arm[i]:
+        text = f"{raised(_inner(p.arm, names), p.degree - 1)} {_product(replace(p, degree=0), names)}".strip()
+        yield text, p.factor * p.degree * p.arm[i], None
+    if p.function == "radius" or p.form[i]:
+        text, factor, power = _slope(p, i, names)
+        yield (text, factor, power) if not p.degree else (f"{_arm(p, names)} {text}", factor, None)
+
+
+def _slope(p: Product, i: int, names: Sequence[str]) -> tuple[str, float, int]:
+    """∂/∂q_i of the function of a product, beside its lever arm."""
     if p.function == "radius":
         return f"{raised(distance(names), p.power - 2)} {names[i]}".strip(), p.factor * p.power, 2 - p.power
     form, w = _form(p.form, names, p.phase), p.form[i]
@@ -88,10 +102,15 @@ def _product(p: Product, names: Sequence[str]) -> str:
         return raised(distance(names), p.power)
     form = _form(p.form, names, p.phase)
     if p.function in ("cos", "sin"):
-        return " ".join([f"{p.function}({form})", *speeds])
+        return " ".join([*([_arm(p, names)] if p.degree else []), f"{p.function}({form})", *speeds])
     power = p.power - (p.function == "signed")
     own = [f"|{form}|"] if p.function == "signed" else []
     return " ".join([*own, *([raised(_inner(p.form, names), power)] if power and form else []), *speeds])
+
+
+def _arm(p: Product, names: Sequence[str]) -> str:
+    """The lever arm of a product."""
+    return raised(_inner(p.arm, names), p.degree)
 
 
 def raised(base: str, power: int) -> str:
