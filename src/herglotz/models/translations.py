@@ -117,15 +117,13 @@ def blind(config: Any, velocities: int) -> Tensor | None:
     moved = directions(config.translations, config.angles)
     if not moved:
         return None
-    columns = [[] for _ in moved]
-    for i, (angle, scale) in enumerate(zip(config.angles, config.scale, strict=True)):
-        for column, d in zip(columns, moved, strict=True):
-            column += [d[i], d[i]] if angle else [d[i] / scale]
     rows = []
-    for column, d in zip(columns, moved, strict=True):
+    for d in moved:
+        coordinates = list(zip(d, config.angles, config.scale, strict=True))
+        row = [x for w, angle, scale in coordinates for x in ([w, w] if angle else [w / scale])]
         # The sine and the cosine of a moved angle are both removed; of moved lengths, their common direction.
-        angle = any(w and a for w, a in zip(d, config.angles, strict=True))
-        at = [i for i, x in enumerate(column) if x]
-        rows += [[float(i == j) for j in range(len(column))] for i in at] if angle else [column]
+        angle = any(w and a for w, a, _ in coordinates)
+        at = [i for i, x in enumerate(row) if x]
+        rows += [[float(i == j) for j in range(len(row))] for i in at] if angle else [row]
     removed = torch.tensor(rows, dtype=torch.float64)
     return _complement(torch.cat([removed, removed.new_zeros(len(removed), velocities)], 1))
