@@ -58,7 +58,7 @@ def check_translations(config: Any) -> None:
         "drag that depends on position": any("q" in text for text in config.drag),
     }
     for what in (name for name, present in not_invariant.items() if present):
-        raise InputError(f"translations: {what} would see them; leave it out, or the translations")
+        raise InputError(f"translations: not possible with {what}; leave one of the two out")
     for text in expand((*config.features, *config.known), config.angles):
         if not unchanged(text, config.angles, moved):
             raise InputError(f"feature '{text}': changes under the translation; name one of differences")
