@@ -377,7 +377,7 @@ def test_one_newton_step_solves_a_linear_step(settings):
         iterations = Stepper(model).step(State(q, torch.cos(q), s), 0.2).iterations
     # With powers of s and one mass F is linear times a factor, and the guess is right already.
     assert (iterations == 1) == (
-        model.linear_in_q1 or (settings.level, settings.dissipation) == ("full", ("s^2", "s^3"))
+        model.capabilities.linear_in_q1 or (settings.level, settings.dissipation) == ("full", ("s^2", "s^3"))
     )
 
 

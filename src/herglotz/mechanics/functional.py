@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.func import vjp
 
 from herglotz.mechanics.contact import split
-from herglotz.mechanics.partials import DiscreteLagrangian, Forced, Forces, Partials, called, checked
+from herglotz.mechanics.partials import DiscreteLagrangian, Forced, Forces, Partials, called, checked, second_blocks
 
 
 def functional_partials(
@@ -35,15 +35,11 @@ def functional_partials(
         return torch.cat([D1, D2, D3[..., None]], -1), L
 
     force = _forces(L_d, xs, h, order) if isinstance(L_d, Forced) else None
-    n = q0.shape[-1]
     if order == 1:
         D, L = first(*xs)
         return Partials(L, *split(D), force=force)
     D, by, L = _rows(first, xs)
-    return Partials(
-        L, *split(D), by[0][..., :n, :], by[1][..., :n, :], by[1][..., n : 2 * n, :], by[2][..., :n],
-        by[2][..., n : 2 * n], by[2][..., 2 * n], force,
-    )  # fmt: skip
+    return Partials(L, *split(D), **second_blocks(*by), force=force)
 
 
 def _rows(function: Callable[..., tuple[Tensor, Any]], xs: tuple[Tensor, ...]) -> tuple[Tensor, list[Tensor], Any]:

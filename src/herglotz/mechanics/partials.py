@@ -282,18 +282,18 @@ def autograd_partials(
         D1, D2, D3 = _grad(L, (a, b, s), create_graph=keep_graph or order == 2)
         P = Partials(L, D1, D2, D3, force=force)
         if order == 2:
-            n = q0.shape[-1]
-            by_q0, by_q1, by_s = _rows(torch.cat([D1, D2, D3[..., None]], -1), (a, b, s), keep_graph)
-            P = replace(
-                P,
-                D11=by_q0[..., :n, :],
-                D12=by_q1[..., :n, :],
-                D22=by_q1[..., n : 2 * n, :],
-                D13=by_s[..., :n],
-                D23=by_s[..., n : 2 * n],
-                D33=by_s[..., 2 * n],
-            )
+            gradient = torch.cat([D1, D2, D3[..., None]], -1)
+            P = replace(P, **second_blocks(*_rows(gradient, (a, b, s), keep_graph)))
     return P if keep_graph else P.map(Tensor.detach)
+
+
+def second_blocks(by_q0: Tensor, by_q1: Tensor, by_s: Tensor) -> dict[str, Tensor]:
+    """The second derivatives of `Partials` from those of (D1, D2, D3): (..., 2n+1, n) twice, and (..., 2n+1)."""
+    n = by_q0.shape[-1]
+    return {
+        "D11": by_q0[..., :n, :], "D12": by_q1[..., :n, :], "D22": by_q1[..., n : 2 * n, :],
+        "D13": by_s[..., :n], "D23": by_s[..., n : 2 * n], "D33": by_s[..., 2 * n],
+    }  # fmt: skip
 
 
 def _autograd_forces(

@@ -143,11 +143,6 @@ class ContactLagrangian(nn.Module):
         return self.capabilities.carries_s
 
     @property
-    def linear_in_q1(self) -> bool:
-        """Whether the step equation, forces included, is linear in q1, so that a single Newton step solves it."""
-        return self.capabilities.linear_in_q1
-
-    @property
     def capabilities(self) -> Capabilities:
         """The terms of the model, and properties of its steps."""
         return Capabilities(

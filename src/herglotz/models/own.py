@@ -79,7 +79,6 @@ class OwnLagrangian(nn.Module):
     capabilities = UNKNOWN
     # A fit may find that the motion does not depend on s (`herglotz.training.own_fit`).
     s_enters_motion = True
-    linear_in_q1 = False
 
     def __init__(
         self,

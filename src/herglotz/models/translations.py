@@ -58,7 +58,7 @@ def check_translations(config: Any) -> None:
         "drag that depends on position": any("q" in text for text in config.drag),
     }
     for what in (name for name, present in not_invariant.items() if present):
-        raise InputError(f"translations: {what} would see them; leave it out, or the translations")
+        raise InputError(f"translations: not possible with {what}; leave one of the two out")
     for text in expand((*config.features, *config.known), config.angles):
         if not unchanged(text, config.angles, moved):
             raise InputError(f"feature '{text}': changes under the translation; name one of differences")
@@ -115,15 +115,13 @@ def blind(config: Any, velocities: int) -> Tensor | None:
     moved = directions(config.translations, config.angles)
     if not moved:
         return None
-    columns = [[] for _ in moved]
-    for i, (angle, scale) in enumerate(zip(config.angles, config.scale, strict=True)):
-        for column, d in zip(columns, moved, strict=True):
-            column += [d[i], d[i]] if angle else [d[i] / scale]
     rows = []
-    for column, d in zip(columns, moved, strict=True):
+    for d in moved:
+        coordinates = list(zip(d, config.angles, config.scale, strict=True))
+        row = [x for w, angle, scale in coordinates for x in ([w, w] if angle else [w / scale])]
         # The sine and the cosine of a moved angle are both removed; of moved lengths, their common direction.
-        angle = any(w and a for w, a in zip(d, config.angles, strict=True))
-        at = [i for i, x in enumerate(column) if x]
-        rows += [[float(i == j) for j in range(len(column))] for i in at] if angle else [column]
+        angle = any(w and a for w, a, _ in coordinates)
+        at = [i for i, x in enumerate(row) if x]
+        rows += [[float(i == j) for j in range(len(row))] for i in at] if angle else [row]
     removed = torch.tensor(rows, dtype=torch.float64)
     return _complement(torch.cat([removed, removed.new_zeros(len(removed), velocities)], 1))

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.oscillator import ExactOscillator, damped_oscillator
+from herglotz.scenes.oscillator import damped_oscillator
 from herglotz.scenes.scene import Scene, State, require_positive
 from herglotz.scenes.special import as_step
 
@@ -96,12 +96,7 @@ class ExactForcedOscillator:
         (Q0, V0), (Q1, V1) = self.sustained(t0), self.sustained(t0 + h)
         y0, y1 = q0 - Q0[..., None], q1 - Q1[..., None]
         before, after = (self.m * (y.sum(-1) * V) for y, V in ((y0, V0), (y1, V1)))
-        return (
-            ExactOscillator(self.m, self.omega0, self.gamma)(y0, y1, s0 - before, h)
-            + after
-            - before
-            + self.gained(t0, h)
-        )
+        return self.free.L_d(y0, y1, s0 - before, h) + after - before + self.gained(t0, h)
 
     def flow(self, q: Tensor, p: Tensor, s: Tensor, t0: Tensor | float, h: Tensor | float) -> State:
         """(q1, p1, s1) after the time h; conjugate points are no singularities."""

@@ -25,24 +25,10 @@ from herglotz.scenes.van_der_pol import van_der_pol
 SCENES: dict[str, Callable[..., Scene]] = {
     make.__name__: make
     for make in (
-        cart_pole,
-        chain,
-        damped_oscillator,
-        damped_pendulum,
-        double_pendulum,
-        driven_duffing,
-        driven_pendulum,
-        duffing,
-        kepler,
-        linear_drag,
-        nonlinear_action,
-        parachute,
-        quadratic_drag,
-        rigid_body,
-        servo_axis,
-        van_der_pol,
+        cart_pole, chain, damped_oscillator, damped_pendulum, double_pendulum, driven_duffing, driven_pendulum, duffing,
+        kepler, linear_drag, nonlinear_action, parachute, quadratic_drag, rigid_body, servo_axis, van_der_pol,
     )
-}
+}  # fmt: skip
 
 
 def scene_names() -> tuple[str, ...]:

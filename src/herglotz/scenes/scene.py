@@ -74,13 +74,12 @@ class Scene:
     H_minus: DiscreteHamiltonian | None = None
     numerical: DiscreteLagrangian | None = None
     examples: tuple[Mapping[str, float], ...] = ()
-
-    def __repr__(self) -> str:
-        return f"Scene({self.name}: {', '.join(self.coordinates)})"
-
     at: Callable[[Tensor], Scene] | None = None
     drive: Callable[[Tensor], Tensor] | None = None
     external: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name}: {', '.join(self.coordinates)})"
 
     @property
     def dof(self) -> int:

@@ -152,7 +152,7 @@ class _Search:
         for multiple, width, model in self._models():
             h = multiple * self.run.h
             if (multiple, width) == (1, None) or "eager" in self.config.artefacts:
-                solved = model.linear_in_q1  # then a tolerance changes nothing
+                solved = model.capabilities.linear_in_q1  # then a tolerance changes nothing
                 for tol in dict.fromkeys((None, *(() if solved else self.config.tolerances))):
                     yield self._tried(
                         Setting(multiple, h, width, "eager", "float64", tol), Stepper(model, tol=tol), model

@@ -1,7 +1,5 @@
 """Discrete forces: p_k = −(D1L + F⁻)/c, p_{k+1} = D2L + F⁺ (trap 4 of `docs/mathematics.md`)."""
 
-import math
-
 import torch
 
 from herglotz.mechanics import (
@@ -94,24 +92,3 @@ def test_the_forced_residual_vanishes_along_steps():
         q0, q1, q2 = out.q.unbind(-2)
         R = herglotz_residual(L_d, q0, q1, q2, state.s, H, H)
     assert R.abs().max() < 1e-12
-
-
-def test_joint_friction_is_what_one_scalar_s_cannot_do():
-    # fails if both joints are damped alike, as a contact system without forces must
-    free = State(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64), torch.tensor(0.0).double())
-
-    class Free(ForcedPendula):
-        def __call__(self, q0, q1, s0, h):
-            h = torch.as_tensor(h, dtype=q0.dtype)
-            return (q1 - q0).square().sum(-1) / (2 * h) + 0.0 * s0
-
-        def forces(self, q0, q1, s0, h):  # noqa: ARG002
-            force = -self.friction * (q1 - q0) / 2
-            return force, force
-
-    h, steps = 0.01, 200
-    with torch.no_grad():
-        out = Stepper(Free(gamma=0.0)).rollout(*free, h=h, steps=steps)
-    speed = out.p[-1]
-    for i, rate in enumerate((0.3, 0.05)):
-        assert abs(float(speed[i]) - math.exp(-rate * h * steps)) < 1e-3

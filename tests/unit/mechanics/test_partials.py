@@ -6,8 +6,6 @@ import torch
 from herglotz.mechanics import (
     autograd_partials,
     herglotz_residual,
-    legendre_minus,
-    legendre_plus,
     mixed_hessian,
     momentum_jacobian,
     partials,
@@ -91,17 +89,6 @@ def test_herglotz_residual_vanishes_along_a_flow_and_only_there():
     R = herglotz_residual(oscillator.L_d, q, q1, q2, s, 0.3, 0.4)
     assert float(R.abs().max()) < 1e-13
     assert float(herglotz_residual(oscillator.L_d, q, q1, q2 + 0.01, s, 0.3, 0.4).abs().min()) > 1e-3
-
-
-def test_legendre_transforms_of_the_exact_lagrangian():
-    # fails if FL⁻ forgets to divide by c, or FL⁺ divides by it
-    oscillator = scene("damped_oscillator", gamma=0.9)
-    q, p = torch.tensor([[0.2]], dtype=torch.float64), torch.tensor([[-0.6]], dtype=torch.float64)
-    s = torch.tensor([0.1], dtype=torch.float64)
-    q1, p1, s1 = oscillator.flow(q, p, s, 0.5)
-    torch.testing.assert_close(legendre_minus(oscillator.L_d, q, q1, s, 0.5)[1], p, rtol=1e-13, atol=0)
-    end = legendre_plus(oscillator.L_d, q, q1, s, 0.5)
-    torch.testing.assert_close((end[1], end[2]), (p1, s1), rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize(("c2", "c3", "expected"), [(1.0, 0.0, 0.0), (0.0, 1.0, 1.0)])

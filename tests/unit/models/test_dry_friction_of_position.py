@@ -19,8 +19,8 @@ def body(drag, coefficients, *, coulomb=1.0, angle=False, sticking=True, inputs=
     """A unit mass without a potential, and with this friction."""
     model: Any = ContactLagrangian(
         ModelConfig(
-            angles=(angle,), scale=(1.0,), speed=(1.0,), stiffness=(0.0,), tilt=(0.0,), rate=rate, level="forced",
-            coulomb=True, sticking=sticking, drag=drag, inputs=inputs, input_map=(1.0,) * inputs, potential_width=0,
+            angles=(angle,), stiffness=(0.0,), rate=rate, level="forced", coulomb=True, sticking=sticking, drag=drag,
+            inputs=inputs, input_map=(1.0,) * inputs, potential_width=0,
         )
     )  # fmt: skip
     with torch.no_grad():
@@ -110,10 +110,7 @@ def test_friction_by_direction_is_friction_and_a_constant_force():
 def test_dry_terms_need_dry_friction():
     # fails if a model steps without the width or the hold of its friction
     with pytest.raises(InputError, match="set coulomb=True"):
-        ModelConfig(
-            angles=(False,), scale=(1.0,), speed=(1.0,), stiffness=(0.0,), tilt=(0.0,), level="forced",
-            drag=("q1^2 sgn(v1)",),
-        )  # fmt: skip
+        ModelConfig(angles=(False,), level="forced", drag=("q1^2 sgn(v1)",))
 
 
 def test_dry_terms_bring_dry_friction():

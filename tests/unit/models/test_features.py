@@ -19,20 +19,17 @@ from herglotz.training.problems.one_step import MANY, ResidualProblem
 ANGLES, LENGTHS = (True, True), (False, False)
 
 
+def built(angles, **settings) -> Any:
+    """A model without networks and without springs of its own."""
+    one, zero = (1.0,) * len(angles), (0.0,) * len(angles)
+    sizes: dict[str, Any] = {"scale": one, "speed": one, "stiffness": zero, "tilt": zero, "potential_width": 0}
+    return ContactLagrangian(ModelConfig(angles=angles, **sizes | settings))
+
+
 def double_pendulum(level="linear", order=4, gamma=0.4, viscous=0.0) -> Any:
     """The scene's L in units of its first mass, 2: nothing is learned."""
-    settings: dict[str, Any] = {
-        "known": ("0.5 cos(q1 - q2) v1 v2", "-9.81 cos(q1) - 4.905 cos(q2)"),
-        "potential_width": 0,
-    }
-    sizes: dict[str, Any] = {
-        "angles": ANGLES,
-        "scale": (1.0,) * 2,
-        "speed": (1.0,) * 2,
-        "stiffness": (0.0,) * 2,
-        "tilt": (0.0,) * 2,
-    }
-    model: Any = ContactLagrangian(ModelConfig(level=level, order=order, rate=gamma, **sizes, **settings))
+    known = ("0.5 cos(q1 - q2) v1 v2", "-9.81 cos(q1) - 4.905 cos(q2)")
+    model = built(ANGLES, level=level, order=order, rate=gamma, known=known)
     with torch.no_grad():
         model.kinetic.base.log_diagonal.fill_(math.log(0.5) / 2)
         if level == "forced":
@@ -70,15 +67,7 @@ def test_a_rule_of_order_four_with_damping_and_a_mass_of_position():
 
 def test_a_rule_of_order_four_in_r():
     # fails if the derivatives of a power of r along y are wrong
-    settings: dict[str, Any] = {
-        "angles": LENGTHS,
-        "known": ("-1 r^-1",),
-        "alike": True,
-        "potential_width": 0,
-        "rate": 0.2,
-    }
-    sizes: dict[str, Any] = {"scale": (1.0,) * 2, "speed": (1.0,) * 2, "stiffness": (0.0,) * 2, "tilt": (0.0,) * 2}
-    model = ContactLagrangian(ModelConfig(order=4, **settings, **sizes))
+    model = built(LENGTHS, order=4, known=("-1 r^-1",), alike=True, rate=0.2)
     assert measured_order(model, exact_end(scene("kepler", gamma=0.2)), 1.0) == pytest.approx(4.0, abs=0.3)
 
 
@@ -143,8 +132,7 @@ def test_mistakes_in_texts_are_named():
     }
     for text, words in wrong.items():
         with pytest.raises(InputError, match=words):
-            ModelConfig(angles=LENGTHS, features=(text,), scale=(1.0,) * 2, speed=(1.0,) * 2, stiffness=(1.0,) * 2,
-                        tilt=(0.0,) * 2)  # fmt: skip
+            built(LENGTHS, features=(text,))
     with pytest.raises(InputError, match="a power of an angle is not periodic"):
         parse("(q1 - q2)^2", ANGLES)
     wrong_at_4 = {
@@ -154,7 +142,7 @@ def test_mistakes_in_texts_are_named():
     }
     for words, settings in wrong_at_4.items():
         with pytest.raises(InputError, match=words):
-            ModelConfig(order=4, **({"potential_width": 0} | settings))
+            built((True,), order=4, **settings)
 
 
 def test_libraries_stand_for_lists_of_features():
@@ -172,28 +160,21 @@ def test_libraries_stand_for_lists_of_features():
 
 def test_a_diagonal_mass_has_no_other_entries():
     # fails if masses between coordinates are learned all the same, or the first is no longer 1
-    sizes: dict[str, Any] = {"scale": (1.0,) * 3, "speed": (1.0,) * 3, "stiffness": (1.0,) * 3, "tilt": (0.0,) * 3}
-    settings: dict[str, Any] = {"angles": (False,) * 3, "potential_width": 0, "diagonal": True, **sizes}
-    model: Any = ContactLagrangian(ModelConfig(**settings))
+    model = built((False,) * 3, diagonal=True)
     assert "kinetic.off_diagonal" not in dict(model.named_parameters())
     with torch.no_grad():
         model.kinetic.log_diagonal.copy_(torch.tensor([0.1, -0.2]))
     expected = torch.tensor([1.0, math.exp(0.2), math.exp(-0.4)], dtype=torch.float64).diag()
     torch.testing.assert_close(model.kinetic.mass().detach(), expected)
     with pytest.raises(InputError, match="mass that depends on position is not diagonal"):
-        ModelConfig(**settings, mass_width=4)
+        built(LENGTHS, diagonal=True, mass_width=4)
     with pytest.raises(InputError, match="leave features, known, alike, diagonal out"):
-        ModelConfig(**{**settings, "baseline": False, "correction_width": 4})
+        built(LENGTHS, diagonal=True, baseline=False, correction_width=4)
 
 
 def test_one_coefficient_for_a_whole_sum():
     # fails if the springs of a chain are learned one by one, or a known feature is learned
-    angles = (False,) * 5
-    sizes: dict[str, Any] = {"scale": (1.0,) * 5, "speed": (1.0,) * 5, "stiffness": (0.0,) * 5, "tilt": (0.0,) * 5}
-    settings = ModelConfig(
-        angles=angles, features=("chain 3",), known=("q1^4",), alike=True, potential_width=0, **sizes
-    )
-    model: Any = ContactLagrangian(settings)
+    model = built((False,) * 5, features=("chain 3",), known=("q1^4",), alike=True)
     shapes = {name: tuple(p.shape) for name, p in model.named_parameters()}
     assert shapes == {"potential.features.sum.coefficient": (2,), "damping.rate": ()}
     with torch.no_grad():
@@ -209,12 +190,7 @@ def test_one_coefficient_for_a_whole_sum():
 def test_the_jacobian_of_many_coordinates(order):
     # fails if the shortcut for many coordinates is another derivative where the model fits the data
     data = simulate(scene("chain", masses=MANY), trajectories=2, steps=6, h=0.01, seed=0)
-    zero, one = (0.0,) * MANY, (1.0,) * MANY
-    settings = ModelConfig(
-        angles=(False,) * MANY, scale=one, speed=one, stiffness=zero, tilt=zero, features=("chain",), alike=True,
-        potential_width=0, order=order,
-    )  # fmt: skip
-    model: Any = ContactLagrangian(settings)
+    model = built((False,) * MANY, features=("chain",), alike=True, order=order)
     with torch.no_grad():
         model.potential.features.sum.coefficient.copy_(torch.tensor([0.5, 0.0, 0.125]))
     problem = ResidualProblem(model, data)

@@ -54,6 +54,18 @@ def test_viscous_friction_is_second_order():
     assert torch.log2(error(40) / error(80)).tolist() == pytest.approx([2, 2], abs=0.1)
 
 
+def test_affine_drag_is_second_order():
+    # fails if the drag λ enters c with the wrong factor: c = e^{2λΔ} of quadratic drag
+    model = build(
+        ModelConfig(angles=(False,), level="affine", rate=0.0, damping_width=0, potential_width=0, stiffness=(0.0,))
+    )
+    with torch.no_grad():
+        model.damping.drag.fill_(0.5)
+    q, p, s, t = (torch.tensor(x, dtype=torch.float64) for x in ([[1.2]], [[0.7]], [0.3], 2.0))
+    exact = scene("quadratic_drag", lam=0.25).flow(q, p, s, t)
+    assert slopes(model, torch.cat([x.reshape(-1) for x in exact])) == pytest.approx([2, 2, 2], abs=0.1)
+
+
 def random_networks(config, size=0.5) -> Any:
     model = build(config)
     make = torch.Generator().manual_seed(3)

@@ -95,17 +95,6 @@ def test_it_sticks_exactly_and_never_gains_energy():
     assert (float(x[0]), float(x[1])) == (0.3, 0.0)
 
 
-def test_a_step_is_as_good_as_its_halves():
-    # fails if a step with an event inside differs from two steps
-    for force in (1.3, -1.3, 0.3):
-        whole = at(force).flow(*state(0.1, 0.4), 1.7)
-        x = state(0.1, 0.4)
-        for h in (0.9, 0.8):
-            x = at(force).flow(*x, h)
-        for a, b in zip(whole, x, strict=True):
-            assert abs(float(a - b)) < 1e-13
-
-
 def test_without_dry_friction_it_is_a_contact_map():
     # fails if s does not belong to (q, p), or viscous friction is not the contact term: c = e^{−γh}
     system, (q, p, s) = at(1.3, dry=0.0), state(0.1, 0.4, 0.2)

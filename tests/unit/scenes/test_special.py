@@ -6,24 +6,7 @@ import torch
 
 from herglotz.scenes.special import cosw, sincw, versw
 
-POINTS = [
-    -60.0,
-    -3.7,
-    -1.0 - 1e-9,
-    -1.0 + 1e-9,
-    -0.3,
-    -1e-7,
-    -1e-300,
-    0.0,
-    1e-300,
-    1e-12,
-    0.04,
-    0.97,
-    1.0,
-    1.5,
-    9.0,
-    80.0,
-]
+POINTS = [-60.0, -3.7, -1 - 1e-9, -1 + 1e-9, -0.3, -1e-7, -1e-300, 0.0, 1e-12, 0.04, 0.97, 1.0, 1.5, 9.0, 80.0]
 
 
 def exact(name, x, order):
