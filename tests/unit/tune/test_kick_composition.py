@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -14,7 +15,8 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
 from herglotz.tune import CompiledKicks, KickStepper, export_kicks_c, fit_kicks
-from herglotz.tune.kick_composition import _Flow, _leapfrog
+from herglotz.tune.distil import FlowProblem
+from herglotz.tune.kick_composition import _leapfrog, _misses
 from herglotz.tune.kick_header import kicks_c
 
 try:
@@ -61,10 +63,9 @@ def pairs(count, seed, h, system):
     return State(q, p, s), State(*system.flow(q, p, s, h))
 
 
-@pytest.mark.parametrize(("kicks", "worst"), [(3, 1e-4), (4, 1e-5)])
-def test_a_few_kicks_reproduce_a_large_step_of_the_pendulum(kicks, worst):
+def test_a_few_kicks_reproduce_a_large_step_of_the_pendulum():
     # fails if the fit does not converge, γ is not the model's, or s is off by a constant
-    system = scene("damped_pendulum")
+    system, kicks, worst = scene("damped_pendulum"), 3, 1e-4
     model = ContactLagrangian(ModelConfig(rate=0.2, potential_width=0))
     found = fit_kicks(model, *pairs(300, 0, H, system), H, kicks=kicks, iterations=60)
     start, end = pairs(200, 1, H, system)
@@ -74,19 +75,15 @@ def test_a_few_kicks_reproduce_a_large_step_of_the_pendulum(kicks, worst):
     assert float((out.s - end.s).square().mean().sqrt()) < 2 * worst
     assert found.error < worst
     # a null model: leapfrog with as many kicks of the true force is worse by orders
-    drifts, cosines = (
-        torch.full((kicks + 1,), H / kicks, dtype=torch.float64),
-        torch.zeros(kicks, 1, dtype=torch.float64),
-    )
+    drifts, cosines = torch.full((kicks + 1,), H / kicks).double(), torch.zeros(kicks, 1).double()
     drifts[0] = drifts[-1] = H / kicks / 2
     plain = KickStepper(H, 0.2, True, 0.0, 1.0, drifts, cosines - H / kicks, cosines)
     assert float((plain.step(start, H).state.q - end.q).square().mean().sqrt()) > 10 * worst
 
 
-@pytest.mark.parametrize("h", [1.0, 3.0])
-def test_two_kicks_are_the_oscillator_wherever_the_data_lie(h):
+def test_two_kicks_are_the_oscillator_wherever_the_data_lie():
     # fails if a kick vanishes at the middle of the data instead of where the force does: 1e-3 a step was left
-    system = scene("damped_oscillator")
+    system, h = scene("damped_oscillator"), 3.0
     model = ContactLagrangian(ModelConfig(angles=(False,), rate=0.2, potential_width=0))
     start = State(torch.linspace(-0.4, 1.6, 40).double()[:, None], torch.cos(torch.arange(40.0)).double()[:, None],
                   torch.zeros(40).double())  # fmt: skip
@@ -109,22 +106,20 @@ def test_the_unit_of_length_decides_nothing():
     assert float((found[0] - found[1]).abs().max()) < 1e-7
 
 
-def test_the_normal_equations_of_kicks_are_the_derivatives_of_the_cost():
-    # fails if a factor or a sign of the cost is not that of its slope
+def test_the_normal_equations_of_a_flow_are_the_derivatives_of_its_cost():
+    # fails if a factor or a sign of the cost is not that of its slope, or σ divides another residual
     start, end = pairs(20, 1, H, scene("damped_pendulum"))
     own = random_kicks(angle=True)
-    given = [y.reshape(-1) for y in (*start[:2], *end[:2])]
-    problem = _Flow(lambda x: replace(own, drifts=x), 0.7, given)
-    cost, A, b = problem.normal_equations(own.drifts)
-    x = own.drifts.clone().requires_grad_(True)
-    (slope,) = torch.autograd.grad(problem.cost(x), x)
-    torch.testing.assert_close(b, slope)
-    J = torch.func.jacrev(lambda x: problem._local(x, *given).reshape(-1))(own.drifts)
-    torch.testing.assert_close(A, J.T @ J)
-    p = start.p.square().mean()
+    x = torch.cat([own.drifts, own.cosines.flatten(), own.sines.flatten()]).requires_grad_(True)
+    sigma = torch.tensor([0.7, 0.4], dtype=torch.float64)
+    cost, A, b = FlowProblem(partial(_misses, own), start, end, sigma).normal_equations(x.detach())
     q1, p1, _ = own.step(start, H).state
-    errors = (q1 - end.q).square().sum() / 0.7**2 + (p1 - end.p).square().sum() / p
+    errors = (q1 - end.q).square().sum() / 0.7**2 + (p1 - end.p).square().sum() / 0.4**2
     torch.testing.assert_close(cost, errors / 2)
+    scaled = lambda x: (_misses(own, x, start, end) / sigma).reshape(-1)  # noqa: E731
+    torch.testing.assert_close(b, torch.autograd.grad(scaled(x).square().sum() / 2, x)[0])
+    J = torch.func.jacrev(scaled)(x.detach())
+    torch.testing.assert_close(A, J.T @ J)
 
 
 @needs_c
