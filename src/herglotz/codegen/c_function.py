@@ -30,7 +30,7 @@ def function(
 def _computed(
     program: Program, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
 ) -> Iterator[str]:
-    """Rows as variables, unless a structure holds them or no one but their loop reads them, and all statements."""
+    """Declarations of rows, unless a structure holds a row or only its own loop reads the row, and all statements."""
     computed = [i for i in sorted(numbers) if not program.statements[i].name]
     read = {x.statement for row in outputs.values() for x in row_of(row) if isinstance(x, Ref)}
     texts, inner = fused(program, computed, read | set(handed_on))
@@ -59,12 +59,12 @@ def _name(program: Program, number: int, handed_on: Mapping[int, str]) -> str:
 
 
 def as_scalars(text: str) -> str:
-    """A text of `REAL` and `FN_` for one sample."""
+    """A C text of `REAL` and `FN_` as code for a single sample."""
     return text.replace("SPREAD(", "(").replace("FN_", "hz_").replace("REAL", "hz_real")
 
 
 def whole(program: Program, head: str, outputs: Outputs) -> str:
-    """A function that is one piece."""
+    """The C function of all statements that the outputs need."""
     return function(program, head, needed_by(program, outputs), outputs, {})
 
 

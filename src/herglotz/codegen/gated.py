@@ -21,20 +21,24 @@ from herglotz.codegen.program import NAME, Program, Ref
 SUMS = ("{0} + {1}", "{0} - {1}", "{0} + {1} * {2}", "{0} - {1} * {2}")
 # Operations whose results on finite numbers are finite, and which cost next to nothing.
 PLAIN = (*SUMS, "{0} * {1}", "-{0}")
-CONSTANT = ("theta", "sharpest")  # arguments that do not change from step to step
+# Arguments that do not change from step to step.
+CONSTANT = ("theta", "sharpest")
 # Number of plain operations from which a branch is cheaper than the operations.
 WORTH_A_BRANCH = 3
 
-Gate = frozenset[int] | None  # None: always open
+# Parameters of which one must be on; None: always open.
+Gate = frozenset[int] | None
 
 
 @dataclass
 class Prepared:
     """Arguments that all functions of a library share: gates, and numbers that depend on parameters alone."""
 
-    gates: dict[frozenset[int], int] = field(default_factory=dict)  # gate → index in the array of flags
-    fixed: int = 0  # how many numbers depend on parameters alone
-    parts: list[str] = field(default_factory=list)  # blocks of C that compute the fixed numbers
+    # Gate → index in the array of flags.
+    gates: dict[frozenset[int], int] = field(default_factory=dict)
+    # Count of the fixed numbers, which depend on parameters alone, and blocks of C that compute them.
+    fixed: int = 0
+    parts: list[str] = field(default_factory=list)
 
     def flag(self, gate: frozenset[int]) -> str:
         """The C expression of a gate's flag."""
@@ -173,11 +177,10 @@ def _statements(
             yield f"  REAL @{i}{' = 0' if i in zeros else ''};"
     for own, statements in blocks:
         lines = [program.statements[i].text.removeprefix("const REAL " if i in shared else "") for i in statements]
-        yield from [f"  {line}" for line in lines] if own is None else _behind(prepared.flag(own), lines)
-
-
-def _behind(flag: str, lines: list[str]) -> list[str]:
-    return [f"  if ({flag}) {{", *(f"    {line}" for line in lines), "  }"]
+        if own is None:
+            yield from (f"  {line}" for line in lines)
+        else:
+            yield from (f"  if ({prepared.flag(own)}) {{", *(f"    {line}" for line in lines), "  }")
 
 
 def _read_outside(

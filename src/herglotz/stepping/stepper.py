@@ -104,7 +104,7 @@ class Stepper(OneStepMethod):
     def init_qv(self, q: Tensor, v: Tensor, s: Tensor | None = None, h: Tensor | float = 1.0) -> State:
         """The state (q, p, s) of a position and a velocity: p = L_v(q, v, s) of the model's L = lim L_d/h, h → 0.
 
-        Source: section 9 of `docs/trajectory.md`; `herglotz.stepping.velocity` has what stands for it elsewhere.
+        Source: section 9 of `docs/trajectory.md`; `herglotz.stepping.velocity` defines p for an L_d that is no model.
 
         Parameters
         ----------

@@ -17,8 +17,8 @@ def local_errors(stepper: OneStepMethod, out: Rollout, h: Tensor | float) -> Ten
 
     Values near 1 and above mean that h does not resolve the motion, even where every step equation was solved: a step
     over the pericentre of a thin ellipse is as regular as any other. For a method of order p the value estimates the
-    error of the step times 1 − 2^{−p}. The estimate takes two steps for each step of the rollout. Values for a model with
-    a learned correction mean nothing, because a correction is right at its own step only.
+    error of the step times 1 − 2^{−p}. The estimate takes two steps for each step of the rollout. Values for a model
+    with a learned correction mean nothing, because a correction is right at its own step only.
 
     Parameters
     ----------
