@@ -123,9 +123,10 @@ def test_beside_a_conjugate_point_and_at_rest_steps_go_on():
 
 
 def test_the_error_names_the_condition():
-    # fails if `throw` says SINGULAR and leaves the reader to find out why
+    # fails if `throw` says SINGULAR without the sample, the remedy and the reason
     h = torch.tensor([0.1, 5.0], dtype=torch.float64)
-    with pytest.raises(StepError, match=r"sample \(1,\): SINGULAR, .*; sample \(1,\), h = 5.0: SINGULAR: c = 0"):
+    words = r"sample \(1,\): SINGULAR, residual .*; try a smaller h; sample \(1,\), h = 5.0: SINGULAR: c = 0"
+    with pytest.raises(StepError, match=words):
         Stepper(LEFT, throw=True).step(states(2), h)
     with pytest.raises(StepError, match=r"step 0: .*; sample \(0,\), h = 3.157\d*: SINGULAR: L_d has a pole at this h"):
         Stepper(OSCILLATOR.L_d, throw=True).rollout(*states(2), h=CONJUGATE, steps=3)

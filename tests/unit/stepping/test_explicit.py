@@ -11,44 +11,21 @@ from herglotz.stepping.explicit import leapfrog
 from herglotz.stepping.field import FieldOf
 from tests.lagrangians import random_model, states_in_turn
 
+
+def config_of(angles, **settings):
+    """A model whose sizes differ between coordinates."""
+    sizes = {"scale": (2.0, 1.0, 0.5), "speed": (1.0, 1.5, 2.0), "stiffness": (1.0, 2.0, 0.5), "tilt": (0.1, 0.0, 0.3)}
+    return ModelConfig(angles=angles, **{name: x[: len(angles)] for name, x in sizes.items()}, **settings)
+
+
 SETTINGS = {
     "pendulum": ModelConfig(),
     "conservative": ModelConfig(level="conservative"),
     "no network": ModelConfig(potential_width=0),
-    "mixed coordinates": ModelConfig(
-        angles=(False, True, False),
-        scale=(2.0, 1.0, 0.5),
-        speed=(1.0, 1.0, 2.0),
-        stiffness=(1.0, 2.0, 0.5),
-        tilt=(0.1, 0.0, 0.3),
-        potential_depth=2,
-        activation="silu",
-    ),
-    "two angles": ModelConfig(
-        angles=(True, True),
-        scale=(1.0, 1.0),
-        speed=(1.0, 1.0),
-        stiffness=(1.0, 2.0),
-        tilt=(0.0, 0.2),
-        activation="softplus",
-    ),
-    "viscous joints and a motor": ModelConfig(
-        angles=(True, False),
-        level="forced",
-        scale=(1.0, 1.0),
-        speed=(1.0, 1.0),
-        stiffness=(1.0, 2.0),
-        tilt=(0.0, 0.2),
-        inputs=1,
-    ),
-    "features and a term by name": ModelConfig(
-        angles=(True, False),
-        scale=(1.0, 1.0),
-        speed=(1.0, 1.0),
-        stiffness=(1.0, 2.0),
-        tilt=(0.0, 0.2),
-        features=("cos(2 q1)", "q2^3"),
-    ),
+    "mixed coordinates": config_of((False, True, False), potential_depth=2, activation="silu"),
+    "two angles": config_of((True, True), activation="softplus"),
+    "viscous joints and a motor": config_of((True, False), level="forced", inputs=1),
+    "features and a term by name": config_of((True, False), features=("cos(2 q1)", "q2^3")),
 }
 
 

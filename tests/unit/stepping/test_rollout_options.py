@@ -64,7 +64,7 @@ def test_inputs_reach_their_own_step():
     assert float((shared.q[1] - out.q[1]).abs().max()) > 1e-3
     by_hand = Stepper(Motor(inputs[:, 2])).init(out.q[:, 2], out.q[:, 3], out.s[:, 2], 0.1)
     torch.testing.assert_close(tuple(stepper.init(out.q[:, 2], out.q[:, 3], out.s[:, 2], 0.1, inputs[:, 2])), by_hand)
-    torch.testing.assert_close(by_hand.p, out.p[:, 3], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(tuple(by_hand), (out.q[:, 3], out.p[:, 3], out.s[:, 3]), rtol=1e-12, atol=1e-12)
 
 
 def test_gradients_with_respect_to_inputs():

@@ -57,23 +57,6 @@ class Counted:
         return partials(self.L_d, q0, q1, s0, h, order)
 
 
-def torch_func_step(L_d, q0, p0, s0, h, iterations=6):
-    """The step as it is written first: vmap, grad and jacrev, a fixed number of Newton iterations."""
-    from torch.func import grad, jacrev, vmap
-
-    def one(q0, p0, s0):
-        def F(q1):
-            D1, D3 = grad(L_d, (0, 2))(q0, q1, s0, h)
-            return D1 + (1 + D3) * p0
-
-        q1 = q0
-        for _ in range(iterations):
-            q1 = q1 - torch.linalg.solve(jacrev(F)(q1), F(q1))
-        return q1, grad(L_d, 1)(q0, q1, s0, h), s0 + L_d(q0, q1, s0, h)
-
-    return vmap(one)(q0, p0, s0)
-
-
 @pytest.mark.parametrize("name", LEVELS)
 def test_both_orders_and_a_plain_newton_agree(name):
     # fails if a kept Jacobian changes the answer, or its P, residual or status belongs to another point
@@ -93,26 +76,6 @@ def test_both_orders_and_a_plain_newton_agree(name):
             step = torch.linalg.solve(momentum_jacobian(P, p), momentum_residual(P, p)[..., None])[..., 0]
             q1 = q1 - step
         torch.testing.assert_close(full.q1, q1, rtol=1e-13, atol=1e-13)
-
-
-def test_the_torch_func_twin_gives_the_same_step():
-    # fails if a single step and the step as one would write it first differ
-    n, h = 2, 0.2
-
-    def L_d(q0, q1, s0, h):
-        v, q = (q1 - q0) / h, (q0 + q1) / 2
-        potential = torch.cos(q).sum() + 0.1 * torch.sin(q[0] * q[1])
-        return h * (0.5 * (v * v).sum() + potential - 0.2 * s0 - 0.05 * torch.sin(s0) * v[0])
-
-    def batched(q0, q1, s0, h):
-        v, q = (q1 - q0) / h[..., None], (q0 + q1) / 2
-        potential = torch.cos(q).sum(-1) + 0.1 * torch.sin(q[..., 0] * q[..., 1])
-        return h * (0.5 * (v * v).sum(-1) + potential - 0.2 * s0 - 0.05 * torch.sin(s0) * v[..., 0])
-
-    start = states(n)
-    out = Stepper(batched).step(start, h)
-    for a, b in zip(out.state, torch_func_step(L_d, *start, h), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13)
 
 
 def test_a_good_guess_costs_one_second_derivative():
