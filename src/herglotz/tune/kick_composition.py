@@ -39,21 +39,19 @@ class KickStepper(OneStepMethod):
     """A stepper of kicks and drifts, with `step` and `rollout` as `Stepper` has them, at its own h only.
 
     V_i = Σ_n a_in cos nq + b_in sin nq for an angle, Σ_n a_in x^n, n ≥ 1, with x = (q − middle)/half for a length.
+    `rate` is γ in c = e^{−γh}. `offset` is added to s after a step: the sum of the constants of the V_i, which move
+    neither q nor p. `error` is the RMS error of q after a step, in units of q.
     """
 
     h: float
-    # γ in c = e^{−γh}
     rate: float
-    # Whether q is an angle.
     angle: bool
     middle: float
     half: float
     drifts: Tensor  # (K + 1,) d_0 … d_K, in time over mass
     cosines: Tensor  # (K, N) a_in
     sines: Tensor  # (K, N) b_in
-    # The sum of the constants of the V_i, which move neither q nor p, added to s after a step.
     offset: float = 0.0
-    # RMS error of q after a step, in units of q.
     error: float = 0.0
 
     dof = 1
@@ -107,11 +105,9 @@ class KickStepper(OneStepMethod):
         if state.q.shape[-1] != 1:
             raise InputError(f"kicks step one coordinate, got {state.q.shape[-1]}")
         q, p, s = self.map(state.q[..., 0], state.p[..., 0], state.s)
-        bad = ~(torch.isfinite(q) & torch.isfinite(p) & torch.isfinite(s))
-        nan = torch.where(bad, torch.nan, torch.zeros_like(s))
-        c = torch.exp(-self.rate * self.h + nan)
-        status = torch.where(bad, Status.DIVERGED, Status.CONVERGED).to(torch.uint8)
-        return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
+        new = State(q[..., None], p[..., None], s)
+        status = torch.where(new.finite, Status.CONVERGED, Status.DIVERGED).to(torch.uint8)
+        return Step.of(new, torch.full_like(s, -self.rate * self.h).exp(), status, torch.zeros_like(s), 0)
 
 
 def _polynomial(coefficients: Tensor, x: Tensor) -> Tensor:

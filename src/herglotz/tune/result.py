@@ -20,18 +20,19 @@ from herglotz.tune.kick_composition import KickStepper
 
 @dataclass(frozen=True)
 class Setting:
-    """A way to step: a model, a step size and a form."""
+    """A way to step: a model, a step size and a form.
 
-    # Step in steps of the run.
+    `multiple` is the step h in steps of the run. `width` is the number of hidden units of the distilled correction,
+    None for the run's own model. `tol` is the tolerance of the eager Newton iteration, None for the default. `kicks` is
+    the number of kicks if a `KickStepper` replaces the model.
+    """
+
     multiple: float
     h: float
-    # Hidden units of the distilled correction; None: the run's own model.
     width: int | None
     artefact: str
     dtype: str
-    # Tolerance of the eager Newton iteration; None: the default.
     tol: float | None
-    # Number of kicks, where a `KickStepper` replaces the model.
     kicks: int | None = None
 
     @property
@@ -46,17 +47,18 @@ class Setting:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting with the measured error and cost."""
+    """A setting with the measured error and cost.
+
+    The error of a start is the largest |q − reference| over the horizon, in units of q; `bound` is the error that the
+    demanded share of all starts keeps. `kicks` replaces the model; `stepper` is the form that was measured.
+    """
 
     setting: Setting
-    # Errors are the largest |q − reference| over the horizon, in units of q: of the median start, the error that the
-    # demanded share of all starts keeps, and that of the worst start.
     median: float
     bound: float
     worst: float
     cost: Cost
     model: ContactLagrangian = field(repr=False)
-    # The stepper that replaces the model, and the form that was measured.
     kicks: KickStepper | None = field(default=None, repr=False)
     stepper: Any = field(default=None, repr=False)
 
@@ -94,19 +96,20 @@ def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 @dataclass(frozen=True)
 class Tuning:
-    """All settings tried, the choice, and the errors of the choice on starts that had no part in choosing."""
+    """All settings tried, the choice, and the errors of the choice on starts that had no part in choosing.
+
+    `asked` is max_error or budget_us with its value. `motions` are the training motions of the reference at the chosen
+    step. `notes` has the settings that could not be tried, each with the reason.
+    """
 
     run: Run
     config: TuneConfig
     horizon: float
-    # max_error or budget_us, with its value.
     asked: dict[str, float]
     candidates: list[Candidate]
     chosen: Candidate
     held_out: dict[str, Any]
-    # The training motions of the reference at the chosen step, (B, K+1, …).
-    motions: State
-    # Settings that could not be tried, each with the reason.
+    motions: State  # (B, K+1, …)
     notes: list[str]
 
     @property
