@@ -52,6 +52,11 @@ class StepEquation(Protocol):
         ...
 
 
+def partials_at(L_d: Any, q0: Tensor, x: Tensor, s0: Tensor, h: Tensor, order: int, increments: bool) -> Partials:
+    """The partials of L_d at (q0, x) or, in increments, at (q0, q0 + x), which L_d then has to offer."""
+    return L_d.partials_increment(q0, x, s0, h, order) if increments else partials(L_d, q0, x, s0, h, order)
+
+
 class PartialsEquation:
     """The step equation of any L_d; `rest` holds its partials."""
 
@@ -65,12 +70,7 @@ class PartialsEquation:
     def __call__(self, x: Tensor, second: bool) -> Point:
         """See `StepEquation`."""
         order = 2 if second else self.order
-        if self.increments:
-            # Whoever asks for increments has checked that L_d offers them.
-            form: Any = self.L_d
-            P: Partials = form.partials_increment(self.q0, x, self.s0, self.h, order)
-        else:
-            P = partials(self.L_d, self.q0, x, self.s0, self.h, order)
+        P = partials_at(self.L_d, self.q0, x, self.s0, self.h, order, self.increments)
         return Point(momentum_residual(P, self.p0), momentum_jacobian(P, self.p0) if order == 2 else None, P)
 
     def push(self, point: Point) -> Tensor:

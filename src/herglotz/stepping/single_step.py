@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian, Driven, Partials, momentum_plus, momentum_residual, partials
+from herglotz.mechanics import DiscreteLagrangian, Driven, momentum_plus, momentum_residual
 from herglotz.mechanics.newton import Found, attached
 from herglotz.mechanics.regularity import regularity
 from herglotz.stepping.equation import ModelEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.field import Field
 from herglotz.stepping.newton import find_root, status_of
-from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
+from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation, partials_at
 from herglotz.stepping.state import State, Status, Step
 
 # Steps shorter than this part of a model's time, typical q over typical v, are solved for Δ. Solved for q1, p ~ mΔ/h
@@ -155,24 +154,15 @@ def _attach(
 ) -> tuple[Tensor, End]:
     """Attach the derivative to the solved x: a Newton step of value zero and slope dx = −J⁻¹ dF."""
     q0, p0, s0 = state
-    P = _evaluate(L_d, q0, x, s0, h, increments)
+    P = partials_at(L_d, q0, x, s0, h, 1, increments)
     F = momentum_residual(P, p0)
     # A sticking coordinate has q1 = q0.
     if P.force is not None and P.force.held is not None and not increments:
         F = F + torch.where(P.force.held > 0, J.diagonal(0, -2, -1) * (x - q0), 0.0)
     if F.requires_grad:
         x = attached(x, J, F)
-        P = _evaluate(L_d, q0, x, s0, h, increments)
+        P = partials_at(L_d, q0, x, s0, h, 1, increments)
     return x, End(momentum_plus(P), P.L, P.c)
-
-
-def _evaluate(L_d: DiscreteLagrangian, q0: Tensor, x: Tensor, s0: Tensor, h: Tensor, increments: bool) -> Partials:
-    """First derivatives at (q0, x) or, in increments, at (q0, q0 + x)."""
-    if increments:
-        # Whoever asks for increments has checked that L_d offers them.
-        form: Any = L_d
-        return form.partials_increment(q0, x, s0, h, 1)
-    return partials(L_d, q0, x, s0, h)
 
 
 def _compensated(state: State, change: State, low: State | None) -> tuple[State, State]:
