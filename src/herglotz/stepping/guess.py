@@ -39,8 +39,6 @@ class Extrapolation:
     def __call__(self, trail: tuple[Tensor, ...], k: int) -> Tensor:
         """The guess for the end of step k from the positions (..., n) that led to its start, at most `LENGTH`."""
         count = len(trail)
-        if count == 1:
-            return trail[-1]
         if self.equal:
             weights = EQUAL[count]
             guess = weights[-1] * trail[-1]

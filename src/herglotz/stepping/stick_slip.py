@@ -31,10 +31,9 @@ SWEEPS = 8
 
 
 class PartialsAtHand(StepEquation, Protocol):
-    """A step equation whose `rest` is its partials, with set-valued forces; `order` is that of its derivatives."""
+    """A step equation whose `rest` is its partials, with set-valued forces."""
 
     p0: Tensor  # (..., n)
-    order: int
     sticking: bool
 
 
@@ -88,13 +87,10 @@ class StickSlip:
         unknown = self.unknown(z)
         return (unknown if self.equation.increments else unknown - self.equation.q0).abs() > 0
 
-    def __call__(self, x: Tensor, second: bool) -> Point:
-        """G at z = x, and ∂G/∂z if `second`."""
-        order = 2 if second else self.equation.order
-        P, slides = self.equation(self.unknown(x), second).rest, self.slides(x)
+    def __call__(self, x: Tensor, second: bool) -> Point:  # noqa: ARG002  one signature for all
+        """G and ∂G/∂z at z = x."""
+        P, slides = self.equation(self.unknown(x), True).rest, self.slides(x)
         G = unheld_residual(P, self.equation.p0) - torch.where(slides, 0.0, self.stiffness * x)
-        if order != 2:
-            return Point(G, None, P)
         J = torch.where(slides[..., None, :], unheld_jacobian(P, self.equation.p0), 0.0)
         return Point(G, J - torch.diag_embed(torch.where(slides, 0.0, self.stiffness)), P)
 

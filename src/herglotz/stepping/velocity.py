@@ -120,7 +120,7 @@ def _symmetric(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tens
 class _AtVelocity:
     """L_v(q, v, s) = p as a step equation in v: F = p − L_v, with the impulse of dry friction as in a step."""
 
-    increments, order = True, 2
+    increments = True
 
     def __init__(self, transform: Transform, state: State, h: Tensor):
         self.transform, self.state, self.h = transform, state, h
