@@ -18,7 +18,7 @@ Linear = dict[Any, float]
 
 
 class Angle(NamedTuple):
-    """A linear form in one order with a positive first coefficient, and the sign of the form before."""
+    """A linear form with sorted terms and a positive first coefficient, and the sign that was divided out."""
 
     form: tuple[tuple[Any, float], ...]
     sign: float

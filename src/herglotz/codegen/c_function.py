@@ -1,4 +1,4 @@
-"""One C function of statements of a `Program`: locals, statements in order, outputs in their places."""
+"""A C function of statements of a `Program`: locals, statements in order, outputs in their places."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def named(program: Program, lines: Iterable[str], names: Mapping[int, str] = {})
 def function(
     program: Program, head: str, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
 ) -> str:
-    """One C function of statements and outputs; `handed_on` names results that a structure holds."""
+    """A C function of statements and outputs; `handed_on` names results that a structure holds."""
     text = named(program, [*_computed(program, numbers, outputs, handed_on), *_written(program, outputs)], handed_on)
     body = "".join(f"  {line}\n" for line in text.splitlines())
     unused = "".join(f"  (void){x};\n" for x in re.findall(r"(\w+)(?:\[\w+\])?(?=[,)])", head.rsplit("static", 1)[1])

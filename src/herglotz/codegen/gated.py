@@ -18,14 +18,14 @@ from herglotz.codegen.c_function import Outputs, named, needed_by, places
 from herglotz.codegen.program import Program, Ref
 
 SUMS = ("{0} + {1}", "{0} - {1}", "{0} + {1} * {2}", "{0} - {1} * {2}")
-# Operations whose results on finite numbers are finite, and which cost next to nothing.
+# Operations with finite results for finite operands, each cheaper than a branch.
 PLAIN = (*SUMS, "{0} * {1}", "-{0}")
 # Arguments that do not change from step to step.
 CONSTANT = ("theta", "sharpest")
 # Number of plain operations from which a branch is cheaper than the operations.
 WORTH_A_BRANCH = 3
 
-# Parameters of which one must be on; None: always open.
+# Parameters of which at least one must be on for the gate to open; None: always open.
 Gate = frozenset[int] | None
 
 

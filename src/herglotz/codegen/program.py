@@ -182,7 +182,7 @@ class Program:
         return "\n".join(lines)
 
     def product(self, x: Sequence[Atom], weight: np.ndarray, bias: Sequence[Atom] | None) -> list[Atom]:
-        """Σ_j x_j w_jk + b_k for one row x (k,), w (k, m) and b (m,)."""
+        """Σ_j x_j w_jk + b_k for a row x (k,), w (k, m) and b (m,)."""
         kept = [j for j, value in enumerate(x) if value != 0.0 and np.any(weight[j] != 0.0)]
         x, weight = [x[j] for j in kept], weight[kept]
         size = weight.shape[1]

@@ -16,7 +16,7 @@ from herglotz.errors import InputError
 aten = torch.ops.aten
 # Batch sizes of examples, larger than any layer: a multiple of the batch size in a shape is the batch.
 PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)
-# Largest multiple of the batch size that is taken for the batch in shapes (rows · B, …).
+# Multiples of the batch size up to this one are sizes that depend on the batch, as in shapes (rows · B, …).
 MAX_MULTIPLE = 4096
 # Operations that return their first argument unchanged if shape and dtype stay.
 SAME = (
@@ -160,7 +160,7 @@ class Recorder(TorchDispatchMode):
                 "a value is read while the step is traced (.item(), float(), bool(), or `if` on a tensor): a file "
                 "would hold the branch of one sample for all; write it as torch.where"
             )
-        # An operation in place is recorded before it runs: afterwards its argument has the new numbers.
+        # An operation in place is recorded before the operation runs: afterwards its argument has the new numbers.
         node = self._written(func, args, kwargs) if func._schema.is_mutable else None
         result = func(*args, **kwargs)
         self.alive += [args, result]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Diagonal blocks, those to the right and those to the left: (..., K, m, m) each. The last upper and the first lower
-# block are not used.
+# Diagonal, upper and lower blocks, (..., K, m, m) each. The last upper and the first lower block are not used.
 Blocks = tuple[Tensor, Tensor, Tensor]
 
 
@@ -68,6 +67,7 @@ def multiply(blocks: Blocks, u: Tensor) -> Tensor:
 
 
 def _assemble(blocks: Blocks) -> Tensor:
+    """The dense matrix (..., K m, K m)."""
     diagonal, upper, lower = blocks
     count, m = diagonal.shape[-3:-1]
     matrix = diagonal.new_zeros(*diagonal.shape[:-3], count, m, count, m)

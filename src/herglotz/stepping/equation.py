@@ -1,4 +1,4 @@
-"""The step equation F(q1) = D1 L_d + c p0 + F⁻ = 0 of one step: of any L_d through its partials, of a model directly.
+"""The step equation F(q1) = D1 L_d + c p0 + F⁻ = 0 of a model, by its terms.
 
 A model's L_d = (c − 1) A + √c K − h/2 (V0 + V1) + N with A = s0 − h/2 V0 and c = e^g has
 

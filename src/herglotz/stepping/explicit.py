@@ -51,14 +51,15 @@ class _Constants(NamedTuple):
     c_1: Tensor  # (..., 1)
     half_c: Tensor  # (...) c/2
     c_minus_1: Tensor  # (...)
-    inverse: Tensor  # (n, n) or (..., n, n) of m + √c h/2 b, and times h √c where h is one number
+    inverse: Tensor  # (n, n) or (..., n, n) of m + √c h/2 b, and times h √c for a scalar h
     stretch: Tensor | None  # (..., 1) h √c where h is not
 
 
 class Leapfrog:
-    """The explicit step of one model at its present parameters; differentiable by plain autograd.
+    """The explicit step of a model at its present parameters; differentiable by plain autograd.
 
-    `invert` inverts a batch of matrices where `torch.linalg` cannot go; `field` gives V and V′ in place of `FieldOf`.
+    `invert` replaces `torch.linalg` for the inverse of a batch of matrices, and `field` replaces `FieldOf` for V and
+    V′.
     """
 
     def __init__(

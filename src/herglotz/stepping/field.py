@@ -23,7 +23,7 @@ class Field(NamedTuple):
 
 
 class FieldOf:
-    """V and V′ of one potential at its present parameters; plain torch operations, so autograd goes through."""
+    """V and V′ of a potential at its present parameters, by plain torch operations that autograd differentiates."""
 
     def __init__(self, potential: Potential):
         self.stiffness, self.tilt = potential.stiffness, potential.tilt

@@ -1,4 +1,4 @@
-"""The derivative of one step, by the implicit-function theorem on the solved step equation.
+"""The derivative of a step, by the implicit-function theorem on the solved step equation.
 
 A step solves F(Δ; q0, p0, s0, h, u) = 0 and returns q1 = q0 + Δ, p1 and s1 = s0 + L, all functions of Δ and of the
 arguments w = (q0, p0, s0, h, u) of the step. Hence
@@ -169,7 +169,7 @@ def forward_slopes(values: Callable[..., Tensor], *points: Tensor) -> Tensor:
     """The Jacobian (..., m, k) of `values`(..., x) → (..., m) by its last point, (..., k) or (k,), in forward mode."""
     *first, point = points
     directions = torch.eye(point.shape[-1], dtype=point.dtype, device=point.device)
-    # torch 2.x ends the process in `addcmul` where only one of its arguments has a tangent: the others get zeros.
+    # torch 2.x ends the process in `addcmul` if a single argument has a tangent: the other arguments get zero tangents.
     still = [torch.zeros_like(x) for x in first]
     along = lambda t: torch.func.jvp(values, points, (*still, t.expand_as(point)))[1]  # noqa: E731
     # torch itself uses torch.jit when forward-mode derivatives are first loaded.
@@ -179,7 +179,7 @@ def forward_slopes(values: Callable[..., Tensor], *points: Tensor) -> Tensor:
 
 
 def eliminate(A: Tensor, b: Tensor) -> Tensor:
-    """A⁻¹ b by elimination with row exchanges, written out: ONNX has no solve, AOTInductor calls it slowly.
+    """A⁻¹ b by elimination with row exchanges, written out: ONNX has no solve, and AOTInductor's is slow.
 
     A is (..., n, n), with a small n, and b (..., n, k); inf or nan where A is singular.
     """

@@ -102,7 +102,7 @@ def _least(limits: torch.finfo) -> float:
 
 
 def status_of(found: Found, end: End) -> tuple[Tensor, bool]:
-    """The status of each sample, and whether all of them have converged."""
+    """The status of each sample, and whether all samples have converged."""
     merit, residual, done, L, c = found.merit, found.residual, found.done, end.L, end.c
     if found.healthy:
         good = isfinite(L.item()) and c.item() != 0

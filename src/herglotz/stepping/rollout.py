@@ -193,7 +193,7 @@ def _segment(carry: Carry, ks: range, drive: Drive, progress: ProgressBar | None
 
 
 def _buffers(first: Block, entries: int) -> Block:
-    """Room for a whole rollout; the state and σ have the start in front, as they have in the first block."""
+    """Room for a whole rollout; state and σ have the start in front, like those of the first block."""
     return tuple(x.new_empty(entries + len(x) - len(first[-1]), *x.shape[1:]) for x in first)
 
 

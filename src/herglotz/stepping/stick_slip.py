@@ -1,4 +1,4 @@
-"""The step equation with set-valued dry friction, as one single-valued equation that Newton's iteration solves.
+"""The step equation with set-valued dry friction, as a single-valued equation that Newton's iteration solves.
 
 F(Δ) + λ = 0 with λ ∈ −w Sgn(Δ), w = c h (τ + ε) the impulse that friction can hold, is an inclusion. Each point (Δ, λ)
 of the graph of Sgn is given by a single number z = Δ − λ/K for any K > 0 (Minty's parametrisation):

@@ -154,7 +154,7 @@ class _AtVelocity:
 
 
 def _velocity(transform: Transform, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
-    """`velocity` of one chunk (B, n)."""
+    """`velocity` of a chunk (B, n)."""
     equation = _AtVelocity(transform, state, h)
     with torch.no_grad():
         tol = TOL * torch.finfo(state.q.dtype).eps

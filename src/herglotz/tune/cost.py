@@ -1,4 +1,4 @@
-"""Wall time of a step, one motion at a time; all settings take turns, so that a slow minute hits them alike.
+"""Wall time of a step, one motion at a time; settings take turns, so that a slow minute slows all settings.
 
 Only steps inside the horizon are timed: a damped motion comes to rest, and a step at rest costs next to nothing.
 """

@@ -35,7 +35,7 @@ Residual = Callable[[Tensor, State, State], Tensor]
 
 
 class FlowProblem:
-    """½ Σ |r/σ|² + prior for the residuals r of T pairs of states; σ is a number () or one for each residual (m,)."""
+    """½ Σ |r/σ|² + prior for the residuals r of T pairs of states, with σ () or (m,), a value for each residual."""
 
     def __init__(self, residual: Residual, before: State, after: State, sigma: Tensor, prior: Prior | None = None):
         self.residual, self.before, self.after = residual, before, after
@@ -81,7 +81,7 @@ def distillation(model: ContactLagrangian, before: State, after: State, h: float
 
 
 def widened(model: ContactLagrangian, width: int, depth: int = 2) -> ContactLagrangian:
-    """Return the model with a correction of this size: its own correction if the size is the same, else a zero one."""
+    """Return the model with a correction of this size: the model's if the size is the same, else a correction of 0."""
     config = replace(model.config, correction_width=width, correction_depth=depth)
     new = ContactLagrangian(config)
     same = config == model.config
@@ -101,7 +101,7 @@ def pairs_of(states: State, stride: int, count: int, seed: int) -> tuple[State, 
 def distil(
     model: ContactLagrangian, before: State, after: State, h: float, *, iterations: int = 80
 ) -> tuple[ContactLagrangian, float]:
-    """Fit the parameters of a copy of the model to a flow map over h; return the copy and its one-step RMS, as q is."""
+    """Fit a copy of the model to a flow map over h; return the copy and the RMS of its residuals, in units of q."""
     problem, first = distillation(model, before, after, h), ParameterVector(model).get()
     result = levenberg_marquardt(problem, first, max_iterations=iterations, rtol=1e-3)
     new = ContactLagrangian(model.config).to(next(model.parameters()).dtype)

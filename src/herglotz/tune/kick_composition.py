@@ -73,7 +73,7 @@ class KickStepper(OneStepMethod):
         if not self.angle:
             x = (q - self.middle) / self.half
             return x * _polynomial(a, x), _polynomial(n * a, x) / self.half
-        # One cosine and one sine a kick, which are most of the work in C.
+        # A kick takes a single cosine and sine, which are most of the work in C.
         c, sine = torch.cos(q), torch.sin(q)
         T, U = (x.to(q) for x in _multiple_angles(len(a)))
         V = _polynomial(a @ T, c) + sine * _polynomial(b @ U, c)

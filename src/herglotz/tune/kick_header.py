@@ -1,4 +1,4 @@
-"""The C form of a `KickStepper`: its map, traced like the step of a model, as one short header."""
+"""The C form of a `KickStepper`: its map, traced like the step of a model, as a short header."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`tune`: an error or a budget in, the setting that meets it out, with the front it was chosen from."""
+"""`tune`: an error or a budget in; out come the setting that meets the demand, and the front it was chosen from."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from herglotz.tune.kick_header import CompiledKicks
 from herglotz.tune.reference import Motions, draw_starts, frozen_double, record
 from herglotz.tune.result import Candidate, Setting, Tuning
 
-# A width whose distilled model exceeds the limit this many times is tried at no larger step: errors grow with the step.
+# If the error of a distilled model is above this many limits, larger steps of its width are not tried.
 HOPELESS = 10.0
 # Number of steps of the run in the default horizon, at most: longer motions cost more and choose the same settings.
 MAX_HORIZON_STEPS = 200
@@ -116,7 +116,7 @@ def _horizon(run: Run, config: TuneConfig, horizon: float | None) -> float:
 
 @dataclass(frozen=True)
 class _Search:
-    """The settings of a search, tried one after another; `own` is the run's model in float64."""
+    """The search over all settings; `own` is the run's model in float64."""
 
     run: Run
     own: ContactLagrangian
