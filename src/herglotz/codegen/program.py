@@ -21,7 +21,7 @@ from herglotz.errors import InputError
 LOOP = 8
 # Sine and cosine of a row are computed in the same loop, which compilers turn into a single call: networks read both.
 SINE_AND_COSINE = ("FN_sin({0})", "FN_cos({0})")
-# Number of inputs up to which a matrix product is a single loop: the compiler keeps a few inputs in registers.
+# Number of inputs up to which a matrix product is a single loop over the outputs, without a call.
 FEW = 4
 # Number of nonzero weights from which a matrix product is a call of a kernel.
 DENSE = 64
@@ -48,28 +48,30 @@ NAME = re.compile(r"@(\d+)")
 
 @dataclass
 class Statement:
-    """A line or a loop; `@7` in the text is the result of statement 7, which may be this statement itself."""
+    """A line or a loop; `@7` in the text is the result of statement 7, which may be this statement itself.
+
+    `size` is the length of the row, 0 for a scalar; `name` is the name of an input in C, empty for a result.
+    """
 
     text: str
-    # Length of the row; 0: a scalar.
     size: int
     reads: set[int]
-    # Name in C of an input; empty for a result.
     name: str = ""
 
 
 @dataclass
 class Program:
-    """Statements in order, and tables of their results for reuse."""
+    """Statements in order, and tables of their results for reuse.
+
+    `operations` has the form and the operands of every scalar. A loop is written for `loop` results or more; infinity
+    writes no loops. `angles`, an `herglotz.codegen.angles.Angles`, expands sines and cosines of sums.
+    """
 
     statements: list[Statement] = field(default_factory=list)
     tables: dict[tuple[float, ...], str] = field(default_factory=dict)
     known: dict[Any, Atom] = field(default_factory=dict)
-    # Scalar → its form and operands.
     operations: dict[Ref, tuple[Any, ...]] = field(default_factory=dict)
-    # Number of results from which a loop is written; infinite: no loops.
     loop: float = LOOP
-    # `herglotz.codegen.angles.Angles`, if sines and cosines of sums are expanded.
     angles: Any = None
 
     def given(self, name: str, size: int) -> list[Ref]:

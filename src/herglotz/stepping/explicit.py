@@ -29,16 +29,14 @@ from herglotz.stepping.state import State, Status
 
 
 class Move(NamedTuple):
-    """The result of an explicit step."""
+    """The result of an explicit step; `there` is the potential at q1."""
 
     delta: Tensor  # (..., n) q1 − q0
     q1: Tensor  # (..., n)
     p1: Tensor  # (..., n)
-    # (..., n) p1 − p0, computed without that difference, if `increments`.
-    dp: Tensor | None
+    dp: Tensor | None  # (..., n) p1 − p0, computed without that difference, if `increments`
     L: Tensor  # (...) s1 − s0
     c: Tensor  # (...)
-    # The potential at q1.
     there: Field
 
 

@@ -16,11 +16,12 @@ from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, 
 
 
 class OneStepMethod(ABC):
-    """A stepper of states (q, p, s). A concrete stepper implements `step`; rollouts are the same for all steppers."""
+    """A stepper of states (q, p, s). A concrete stepper implements `step`; rollouts are the same for all steppers.
 
-    # Raise `StepError` at the first sample that fails.
+    With `throw` the first sample that fails raises `StepError`; `iterates` says whether steps want a guess.
+    """
+
     throw: bool = False
-    # Whether steps want a guess.
     iterates: bool = False
 
     @abstractmethod

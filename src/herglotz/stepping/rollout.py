@@ -28,14 +28,15 @@ PROGRESS_AFTER = 2.0
 
 
 class Carry(NamedTuple):
-    """The data that a step hands to the next step."""
+    """The data that a step hands to the next step.
 
-    # `State`, or another named tuple of tensors whose first entry is the position.
+    `state` is a `State`, or another named tuple of tensors with the position first; `trail` has the last positions, for
+    the guess; `low` is the rounding that the state has lost so far (compensated sums), if increments are known.
+    """
+
     state: Any
-    # The last positions, for the guess.
     trail: tuple[Tensor, ...]
     sigma: Tensor  # (...)
-    # Rounding lost by the state so far (compensated sums), if increments are known.
     low: Any
 
 
@@ -88,15 +89,17 @@ class Plan:
 
 @dataclass(frozen=True)
 class Drive:
-    """The arguments of a rollout."""
+    """The arguments of a rollout.
 
-    # Makes the function that takes a step; called once for each segment, so that its steps may share work.
+    `single_step` makes the function that takes a step; a segment calls it once, so that its steps may share work.
+    `extrapolate` says whether the steps want a guess.
+    """
+
     single_step: Callable[[], OneStep]
     h: Tensor  # (..., K) all steps
     plan: Plan
     inputs: Tensor | None = None  # (..., K, m)
     watch: Watch | None = None
-    # Whether the steps want a guess.
     extrapolate: bool = True
     check: Check | None = None
 

@@ -38,13 +38,11 @@ class PartialsAtHand(StepEquation, Protocol):
 
 
 class Rest(NamedTuple):
-    """The terms of the equation of a step at Δ = 0, (..., n) each."""
+    """The start z, of the equation that is linear in Δ, K = `stiffness`, and w/K = `bound` on |z| of sticking."""
 
-    # z of the equation that is linear in Δ.
-    start: Tensor
-    # K, and w/K, the |z| up to which a coordinate sticks.
-    stiffness: Tensor
-    bound: Tensor
+    start: Tensor  # (..., n)
+    stiffness: Tensor  # (..., n)
+    bound: Tensor  # (..., n)
 
 
 def at_rest(equation: PartialsAtHand) -> Rest:

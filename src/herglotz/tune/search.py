@@ -27,7 +27,7 @@ from herglotz.tune.result import Candidate, Setting, Tuning
 
 # If the error of a distilled model is above this many limits, larger steps of its width are not tried.
 HOPELESS = 10.0
-# Number of steps of the run in the default horizon, at most: longer motions cost more and choose the same settings.
+# Number of steps of the run in the default horizon, at most.
 MAX_HORIZON_STEPS = 200
 UNTIMED = Cost(math.nan, math.nan)
 
