@@ -37,22 +37,7 @@ typedef struct {{ herglotz_real q, p, s; }} herglotz_kicks_state;
 {step}
 #endif
 """
-# The loop over motions and steps. A motion has steps + 1 states, its start first, and ends before a step that is not
-# finite.
-ROLLOUTS = """#include "stepper.h"
-void herglotz_kicks_rollouts(long batch, long steps, herglotz_kicks_state *states, unsigned char *status) {
-  long b, k;
-  for (b = 0; b < batch; b++) {
-    herglotz_kicks_state *now = states + b * (steps + 1), x = *now;
-    for (k = 0; k < steps; k++) {
-      herglotz_kicks_step(&x);
-      if (!isfinite((x.q + x.p) + x.s)) break;
-      *++now = x;
-      status[b * steps + k] = 0;
-    }
-  }
-}
-"""
+LOOPS = Path(__file__).with_name("kicks.c")
 
 
 def kicks_c(stepper: KickStepper, dtype: str = "float64") -> str:
@@ -83,7 +68,7 @@ class CompiledKicks:
 
     def __init__(self, stepper: KickStepper, dtype: str = "float64"):
         self.stepper, self.dtype = stepper, getattr(torch, dtype)
-        self.library = build(kicks_c(stepper, dtype), ROLLOUTS)
+        self.library = build(kicks_c(stepper, dtype), LOOPS.read_text(encoding="utf-8"))
 
     def rollout(self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int) -> Rollout:
         """K equal steps from (q, p, s) with shapes (B, 1), (B, 1), (B)."""
