@@ -42,7 +42,7 @@ def test_a_singular_leading_block_is_solved_densely_and_alone():
 
 
 def test_the_diagonal_of_the_inverse():
-    # fails if the elimination from one of the two ends is wrong, or the diagonal is subtracted twice
+    # fails if the elimination from either end is wrong, or the diagonal is subtracted twice
     system = blocks()
     expected = torch.linalg.inv(dense(*system)).diagonal(dim1=-2, dim2=-1).unflatten(1, (4, 2))
     torch.testing.assert_close(diagonal_of_inverse(system), expected, rtol=1e-11, atol=1e-11)

@@ -72,7 +72,7 @@ def test_the_change_of_momentum(config):
 
 
 def test_a_rollout_reuses_the_force_of_the_last_step(config):
-    # fails if the kept field belongs to another position, or a segment starts with a stale one
+    # fails if the kept field belongs to another position, or a segment starts with a stale field
     model, start = random_model(config), states(config)
     inputs = torch.linspace(-1, 1, 12, dtype=torch.float64)[:, None] if config.inputs else None
     with torch.no_grad():
@@ -83,7 +83,7 @@ def test_a_rollout_reuses_the_force_of_the_last_step(config):
 
 
 def test_an_event_leaves_the_kept_force_of_its_neighbours_alone():
-    # fails if the field of a step tried for an event's time is taken for that of the state
+    # fails if a step that is tried for the time of an event leaves its field for the next step
     model, start = random_model(ModelConfig()), states(ModelConfig())
     wall = float(start.q.max()) + 0.1
     with torch.no_grad():
@@ -108,7 +108,8 @@ def test_one_potential_evaluation_per_step(monkeypatch):
 
 def test_the_field_equals_its_jet_twin(config):
     # fails if the reverse sweep differs from the jets of the model in value or slope
-    model, q = random_model(config), 20 * states(config).q  # far out: softplus has no shortcut there
+    # Far from 0, where softplus has no shortcut.
+    model, q = random_model(config), 20 * states(config).q
     V, slope = FieldOf(model.potential)(q)
     twin = model.potential(q, 1)
     torch.testing.assert_close(V, twin.value, rtol=1e-13, atol=1e-13)
@@ -154,5 +155,6 @@ def test_its_failures_have_a_status():
     assert bool(out.q[[1, 3], 1:].isnan().all())
     alone = Stepper(model).rollout(q[[0, 2]], torch.ones(2, 1).double(), h=0.1, steps=3)
     torch.testing.assert_close(out.q[[0, 2]], alone.q, rtol=1e-14, atol=1e-14)
-    gone = Stepper(model).step(states(ModelConfig()), 1e5)  # c = e^{−γh} = 0
+    # c = e^{−γh} = 0
+    gone = Stepper(model).step(states(ModelConfig()), 1e5)
     assert set(gone.status.tolist()) == {int(Status.SINGULAR)}

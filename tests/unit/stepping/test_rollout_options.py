@@ -52,7 +52,7 @@ def saved_bytes(make):
 
 
 def test_inputs_reach_their_own_step():
-    # fails if inputs are shifted by a step, shared by the batch when they are not, or ignored
+    # fails if inputs are ignored, shifted by a step, or shared by a batch that has different inputs
     inputs = torch.randn(3, 6, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     stepper, state = Stepper(Motor()), start()
     out = stepper.rollout(*state, h=0.1, inputs=inputs)
@@ -78,7 +78,7 @@ def test_gradients_with_respect_to_inputs():
 
 @pytest.mark.parametrize("explicit", [True, False])
 def test_every_and_chunk_keep_the_same_states(explicit):
-    # fails if a kept state is off by one, a segment loses its trail, or statuses are those of the last step only
+    # fails if a kept state is off by one, a segment loses its trail, or a status is that of the last step only
     stepper, h = Stepper(model(), explicit=explicit), torch.linspace(0.05, 0.3, 12, dtype=torch.float64)
     with torch.no_grad():
         full = stepper.rollout(*start(), h=h)
@@ -99,7 +99,8 @@ def test_every_and_chunk_keep_the_same_states(explicit):
 def test_a_failure_between_kept_states_is_reported():
     # fails if `every` hides the status of a step that is not kept
     def cliff(q0, q1, s0, h):
-        return torch.where(q0 < 0.35, (q1 - q0) ** 2 / (2 * h), q0 * 0).sum(-1) + 0 * s0  # no inertia beyond the cliff
+        # No inertia beyond the cliff.
+        return torch.where(q0 < 0.35, (q1 - q0) ** 2 / (2 * h), q0 * 0).sum(-1) + 0 * s0
 
     q = torch.tensor([[0.0], [-5.0]], dtype=torch.float64)
     out = Stepper(cliff).rollout(q, torch.ones_like(q), h=0.1, steps=6, every=3)

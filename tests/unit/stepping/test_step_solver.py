@@ -22,7 +22,8 @@ LEVELS = {
         **{k: (1.0, 1.0) for k in ("scale", "speed", "stiffness", "tilt")},  # pyright: ignore[reportArgumentType]
     ),
 }
-SHARP = {  # of a measured arm with two motors
+# Friction of a measured arm with two motors.
+SHARP = {
     "kinetic.log_diagonal": [-0.7], "kinetic.off_diagonal": [0.5], "friction.coulomb": [1.0, 2.0],
     "friction.breakaway": [1.2, -1.0], "friction.log_smooth": [-0.3, -6.8], "friction.log_stribeck": [0.2, 1.7],
 }  # fmt: skip
@@ -84,7 +85,8 @@ def test_a_good_guess_costs_one_second_derivative():
     with torch.no_grad():
         Stepper(counted).rollout(*states(1), h=0.02, steps=40)
     second, first = counted.orders.count(2), counted.orders.count(1)
-    assert second <= 40 + 12  # more than one only at the start, where the guess is poor
+    # More than one a step only at the start, where the guess is poor.
+    assert second <= 40 + 12
     assert second + first <= 40 * 3
 
 
@@ -160,7 +162,7 @@ def test_the_solution_of_two_equations():
     assert not bool(torch.isfinite(solve(singular, torch.ones(2, 2, dtype=torch.float64))).all(-1).any())
 
 
-# The explicit step is compensated in p as well: no growth. The implicit one rounds p1 = D2 L_d at every step.
+# The explicit step is compensated in p as well: no growth. The implicit step rounds p1 = D2 L_d at every step.
 @pytest.mark.parametrize(("level", "bound"), [("correction", 100 * 4 * 1.2e-7 * 3), ("linear", 2.5e-7)])
 def test_small_steps_in_float32_keep_the_velocity(level, bound):
     # fails if a small step is solved for q1: then (q1 − q0)/h is rounding (trap 6)
@@ -179,7 +181,8 @@ def test_small_steps_in_float32_keep_the_velocity(level, bound):
     assert not float(before) < 1e4 * float(error)
     moved = (exact.q[:, -1] - exact.q[:, 0]).abs().max()
     drift = (out.q.double()[:, -1] - exact.q[:, -1]).abs().max()
-    assert float(drift) < 1.5e-7  # half a unit in the last place of the position, however many steps
+    # Half a unit in the last place of the position, for any number of steps.
+    assert float(drift) < 1.5e-7
     assert float(drift) < 1e-2 * float(moved)
 
 

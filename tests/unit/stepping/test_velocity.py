@@ -104,7 +104,7 @@ def test_a_velocity_has_the_order_of_the_integrator(model, motion, order):
 
 @pytest.mark.parametrize("name", ["parachute", "duffing", "van_der_pol", "double_pendulum"])
 def test_any_L_d_has_velocities_of_order_2(name):
-    # fails if s is that of the start of the step, not of its middle, or one transform stands for both
+    # fails if s is that of the start of the step, not of its middle, or a single transform replaces the mean
     true = scene(name)
     stepper, errors = Stepper(true.L_d), []
     make = torch.Generator().manual_seed(1)
@@ -118,7 +118,7 @@ def test_any_L_d_has_velocities_of_order_2(name):
 
 
 def test_a_velocity_is_the_slope_of_the_motion_of_coupled_coordinates():
-    # fails if L_vv is another one's, or the mass is that of q = 0
+    # fails if L_vv or the mass is that of q = 0
     stepper = Stepper(coupled())
     q, v = torch.tensor([[0.5, -0.2]], dtype=F64), torch.tensor([[0.7, -1.1]], dtype=F64)
     h = 1e-4
@@ -131,7 +131,7 @@ def test_a_velocity_is_the_slope_of_the_motion_of_coupled_coordinates():
 
 
 def test_the_inverse_with_friction_is_exact():
-    # fails if the inclusion is solved for another force than the one that the start has, Stribeck's slope included
+    # fails if the inclusion has another friction force than the start, or lacks Stribeck's slope
     stepper, v = Stepper(sticking(0.4)), torch.linspace(-1.0, 1.0, 21, dtype=F64)[:, None]
     state = stepper.init_qv(0 * v + 0.3, v, None, 0.1)
     assert float((state.p - v).abs().max()) > 0.03
@@ -139,7 +139,7 @@ def test_the_inverse_with_friction_is_exact():
 
 
 def test_what_friction_holds_stands_still():
-    # fails if a joint that sticks has the velocity of its momentum, or one that slides stops
+    # fails if a joint that sticks has the velocity of its momentum, or a joint that slides stops
     stepper, h = Stepper(sticking(0.4)), 0.05
     out = stepper.rollout(*stepper.init_qv(one(0.2), one(0.3), None, h), h=h, steps=40)
     v = stepper.velocity(out.states, h)[:, 0]
@@ -151,7 +151,7 @@ def test_what_friction_holds_stands_still():
 
 
 def test_batches_floats_and_slopes():
-    # fails if a sample depends on another one, float32 overflows in 1/h², or the slope is that of the iteration
+    # fails if a sample depends on another sample, float32 overflows in 1/h², or the slope is that of the iteration
     stepper, make = Stepper(falling()), torch.Generator().manual_seed(0)
     q, v = (torch.randn(3, 5, 1, generator=make, dtype=F64) for _ in range(2))
     s = torch.randn(3, 5, generator=make, dtype=F64)

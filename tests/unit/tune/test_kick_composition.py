@@ -139,7 +139,8 @@ def test_c_is_the_same_step(angle, dtype, tolerance):
     b = CompiledKicks(stepper, dtype).rollout(*x, h=H, steps=1)
     assert b.q.dtype == number
     # A rounded angle of two turns, 1e-6 in float32, times the slopes of three random kicks, about 4 each.
-    good = a.q.abs().amax((1, 2)) < 20  # what a polynomial throws far out is rounding
+    # A polynomial far from its data is rounding.
+    good = a.q.abs().amax((1, 2)) < 20
     assert int(good.sum()) > 20
     for name in ("q", "p", "s"):
         one, two = getattr(a, name)[good], getattr(b, name)[good].double()
@@ -149,14 +150,14 @@ def test_c_is_the_same_step(angle, dtype, tolerance):
 
 @needs_c
 def test_a_kick_in_c_takes_one_sine_and_one_cosine():
-    # fails if multiple angles are functions of their own: they are most of the work of a step
+    # fails if multiple angles call sines of their own, which are most of the work of a step
     text = kicks_c(random_kicks(True))
     assert [text.count(f" {name}(") for name in ("sin", "cos")] == [3, 3]
 
 
 @needs_c
 def test_what_is_not_finite_says_so():
-    # fails if a motion that overflows is reported as converged, has a σ, or poisons the next one of its batch
+    # fails if a motion that overflows is reported as converged, has a σ, or poisons the next motion of its batch
     d = torch.full((2,), 0.5, dtype=torch.float64)
     wild = KickStepper(H, 0.0, False, 0.0, 1.0, d, torch.full((1, 4), 1.0, dtype=torch.float64), torch.zeros(1, 0))
     x = State(*(torch.tensor(y, dtype=torch.float64) for y in ([[50.0], [1e-3]], [[0.0], [0.0]], [0.0, 0.0])))
@@ -186,7 +187,8 @@ def test_the_first_guess_is_leapfrog_of_the_potential(angle):
     # fails if a kick of the guess has another sign or size than the force: the fit would have to find that, too.
     # Measured with 20 kicks: 1.9e-4 (angle), 2.9e-4 (length); with 40 a quarter of it.
     model = ContactLagrangian(ModelConfig(level="conservative", angles=(angle,), potential_width=0))
-    q = torch.linspace(-1, 1, 11, dtype=torch.float64)[:, None]  # a length's middle is where the force is 0
+    # The force of a length is 0 at the middle.
+    q = torch.linspace(-1, 1, 11, dtype=torch.float64)[:, None]
     start = State(q, torch.cos(3 * q), 0 * q[:, 0])
     with torch.no_grad():
         end = Stepper(model).rollout(*start, h=H / 1000, steps=1000).q[:, -1]
@@ -197,7 +199,7 @@ def test_the_first_guess_is_leapfrog_of_the_potential(angle):
 
 @needs_c
 def test_kicks_step_at_their_own_h_only():
-    # fails if one right step among several lets the others pass, or the bound is not relative to h
+    # fails if a right step among several lets the other steps pass, or the bound is not relative to h
     start = states(2)
     stepper = replace(random_kicks(True), h=0.1)
     with pytest.raises(InputError, match=r"fitted to h = 0\.1, got 0\.2"):
