@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from herglotz.models import TERMS, ContactLagrangian, ModelConfig, Term
+from herglotz.models import TERMS, ModelConfig, Term
 from herglotz.stepping import State, Status, Stepper
 from herglotz.stepping.explicit import leapfrog
 from herglotz.stepping.field import FieldOf
@@ -129,20 +129,6 @@ def test_gradients_equal_those_of_the_implicit_step(config):
 
     for a, b in zip(gradients(True), gradients(False), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
-
-
-def test_models_that_need_an_iteration_do_not_get_it():
-    # fails if a correction, a drag network or dry friction is silently left out
-    for config in (
-        ModelConfig(correction_width=4),
-        ModelConfig(level="affine"),
-        ModelConfig(level="full"),
-        ModelConfig(level="forced", coulomb=True),
-        ModelConfig(mass_width=4),
-        ModelConfig(baseline=False, correction_width=4),
-    ):
-        assert leapfrog(ContactLagrangian(config)) is None
-    assert leapfrog(lambda q0, q1, s0, h: (q0 * q1).sum(-1) + 0 * s0 * h) is None
 
 
 def test_its_failures_have_a_status():
