@@ -23,7 +23,8 @@ def solve_blocks(blocks: Blocks, rhs: Tensor) -> Tensor:
         diagonal, upper, lower = (x[bad] for x in blocks)
         matrix = _assemble((diagonal, upper, lower))
         fixed = torch.linalg.solve_ex(matrix, rhs[bad].flatten(-2)[..., None])[0][..., 0]
-        u = u.index_put((bad,), fixed.unflatten(-1, rhs.shape[-2:]))
+        u = u.clone()
+        u[bad] = fixed.unflatten(-1, rhs.shape[-2:])
     return u
 
 
