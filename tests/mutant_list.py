@@ -327,7 +327,6 @@ ALIKE: list[tuple[str, str, int, str, str]] = [
     ("plots/hamilton_jacobi.py", "size = S1.S.abs() + S0.S.abs() + (S1.D2 * S1.q).sum(-1).abs() + H_plus.detach().abs()", 52, "", "the last axis of (F, n) is the first after F"),
     ("plots/hamilton_jacobi.py", "distances.append((off[k].q - S1.q).norm(dim=-1).reshape(count, -1).nanmedian(1).values)", 44, "", "the last axis of (F, n) is the first after F"),
     ("codegen/program.py", "if value is None and -1.0 in (a, b):", 21, "", "C then says -1.0 * x, the same number as -x"),
-    ("tune/kick_composition.py", "c = torch.exp(-self.rate * self.h + nan)", 34, "-", "nan is 0 or not a number"),
     ("tune/reference.py", "moved.append((x + JITTER * (high - low) * kick).clamp(low, high))", 16, "-", "kick is drawn from both sides alike"),
     ("mechanics/partials.py", "a, b, s = q0 * 1, q1 * 1, s0 * 1", 13, "/", "x / 1 is x * 1"),
     ("mechanics/partials.py", "a, b, s = q0 * 1, q1 * 1, s0 * 1", 21, "/", "x / 1 is x * 1"),

@@ -24,7 +24,7 @@ from herglotz.errors import InputError
 NATIVE = "-march=native"
 FLAGS = ("-std=c99", "-O3", NATIVE, "-fno-math-errno", "-ffp-contract=fast")
 SOURCE = "loops.c"
-# By the variable that names a compiler: its language, the names that are looked for, and the one to install.
+# Variable that names a compiler → its language, the names that are looked for, and the package to install.
 COMPILERS = {"CC": ("C", ("cc", "gcc", "clang"), "gcc"), "CXX": ("C++", ("g++", "clang++", "c++"), "g++")}
 
 
@@ -46,16 +46,15 @@ def compiler(variable: str = "CC") -> list[str]:
 
 
 def build(header: str, loops: str) -> ctypes.CDLL:
-    """`built` of C that includes the header as "stepper.h"."""
+    """The loaded library of C code `loops` that includes the header as "stepper.h"; errors as of `built`."""
     return built("\0".join([header, loops]), lambda: {"stepper.h": header, SOURCE: loops})
 
 
 def built(key: str, sources: Callable[[], Mapping[str, str]], level: str | None = None) -> ctypes.CDLL:
-    """The library of these files, of which `SOURCE` is compiled, loaded: from the cache where it is there.
+    """The loaded library of these files, of which `SOURCE` is compiled; from the cache if the cache has the library.
 
-    `key` says what is compiled, and `level`, in place of that of `FLAGS`, how much the compiler optimises; the
-    compiler, its flags and the processor join the key. Raise InputError if there is no compiler, or it does not compile
-    the files.
+    `key` identifies the files in the cache, together with the compiler, its flags and the processor. `level` replaces
+    the optimisation level of `FLAGS`. Raise InputError if there is no compiler, or the compiler refuses the files.
     """
     words, flags = compiler(), tuple(level if level and flag.startswith("-O") else flag for flag in FLAGS)
     digest = hashlib.sha256("\0".join([key, *words, *flags, sys.platform, _processor()]).encode()).hexdigest()[:32]
@@ -71,13 +70,13 @@ def built(key: str, sources: Callable[[], Mapping[str, str]], level: str | None 
 def portable_library(sources: Mapping[str, str]) -> bytes:
     """The library of these files, of which `SOURCE` is compiled, for every processor of this kind.
 
-    Raise InputError if there is no compiler, or it does not compile the files.
+    Raise InputError if there is no compiler, or the compiler refuses the files.
     """
     return _compile(compiler(), sources, [flag for flag in FLAGS if flag != NATIVE])
 
 
 def _is_whole(library: Path) -> bool:
-    """Whether a library is whole: loading half a library would end the process."""
+    """Whether the file is complete: loading half a library would end the process."""
     try:
         check_seal(library.read_bytes(), library)
     except (OSError, InputError):
@@ -100,8 +99,9 @@ def _compile(words: list[str], sources: Mapping[str, str], flags: Sequence[str])
                 raise InputError(f"{words[0]}: cannot be run ({error}); set CC to a C compiler") from None
             if done.returncode == 0:
                 return library.read_bytes()
+            # The first line only names the files.
             lines = done.stderr.strip().splitlines() or ["no message"]
-            message = next((x.strip() for x in lines if "error" in x.lower()), lines[0])  # the first names the files
+            message = next((x.strip() for x in lines if "error" in x.lower()), lines[0])
     raise InputError(f"{words[0]}: does not compile the header ({message[:200]}); export the model again")
 
 

@@ -1,4 +1,4 @@
-"""One C function of statements of a `Program`: locals, statements in order, outputs in their places."""
+"""A C function of statements of a `Program`: locals, statements in order, outputs in their places."""
 
 from __future__ import annotations
 
@@ -7,19 +7,42 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from herglotz.codegen.fuse import fused
-from herglotz.codegen.program import NAME, Program, Ref
+from herglotz.codegen.program import NAME, Atom, Program, Ref
 
+# The declaration of a scalar that a structure holds.
 HANDED = re.compile(r"^const REAL (@(\d+) =)")
 # The place written to → its number, or the list of its numbers.
 Outputs = Mapping[str, Any]
 
 
+def places(outputs: Outputs) -> Iterator[tuple[str, int, str, Atom]]:
+    """Every number of the outputs: (output, index, place in C, number)."""
+    for name, row in outputs.items():
+        for i, atom in enumerate(row_of(row)):
+            yield name, i, name if row is atom else f"{name}[{i}]", atom
+
+
+def row_of(numbers: Any) -> list[Any]:
+    """The numbers of an output; a `Ref` is a single number."""
+    return numbers if type(numbers) is list else [numbers]
+
+
+def results(outputs: Outputs) -> set[int]:
+    """The statements whose results are outputs."""
+    return {atom.statement for *_, atom in places(outputs) if isinstance(atom, Ref)}
+
+
+def named(program: Program, lines: Iterable[str], names: Mapping[int, str] = {}) -> str:
+    """Lines with the names of results: of inputs, then of `names`, else the number of the statement."""
+    name = lambda i: program.statements[i].name or names.get(i) or f"t{i}"  # noqa: E731
+    return NAME.sub(lambda match: name(int(match[1])), "\n".join(lines))
+
+
 def function(
     program: Program, head: str, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
 ) -> str:
-    """One C function of statements and outputs."""
-    lines = [*_computed(program, numbers, outputs, handed_on), *_written(program, outputs)]
-    text = NAME.sub(lambda m: _name(program, int(m[1]), handed_on), "\n".join(lines))
+    """A C function of statements and outputs; `handed_on` names results that a structure holds."""
+    text = named(program, [*_computed(program, numbers, outputs, handed_on), *_written(program, outputs)], handed_on)
     body = "".join(f"  {line}\n" for line in text.splitlines())
     unused = "".join(f"  (void){x};\n" for x in re.findall(r"(\w+)(?:\[\w+\])?(?=[,)])", head.rsplit("static", 1)[1])
                      if not re.search(rf"\b{x}\b", body))  # fmt: skip
@@ -30,10 +53,9 @@ def function(
 def _computed(
     program: Program, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
 ) -> Iterator[str]:
-    """Rows as variables, unless a structure holds them or no one but their loop reads them, and all statements."""
+    """Declarations of rows, unless a structure holds a row or only its own loop reads the row, and all statements."""
     computed = [i for i in sorted(numbers) if not program.statements[i].name]
-    read = {x.statement for row in outputs.values() for x in row_of(row) if isinstance(x, Ref)}
-    texts, inner = fused(program, computed, read | set(handed_on))
+    texts, inner = fused(program, computed, results(outputs) | set(handed_on))
     for i in computed:
         if (size := program.statements[i].size) and i not in handed_on and i not in inner:
             yield f"REAL t{i}[{size}];"
@@ -43,34 +65,24 @@ def _computed(
 
 def _written(program: Program, outputs: Outputs) -> Iterator[str]:
     """The outputs, put in their places."""
-    for place, row in outputs.items():
-        for i, atom in enumerate(row_of(row)):
-            right = program.read(atom) if isinstance(atom, Ref) else f"SPREAD({program.read(atom)})"
-            yield f"{place if row is atom else f'{place}[{i}]'} = {right};"
-
-
-def row_of(numbers: Any) -> list[Any]:
-    """The numbers of an output; a `Ref` is one number."""
-    return numbers if type(numbers) is list else [numbers]
-
-
-def _name(program: Program, number: int, handed_on: Mapping[int, str]) -> str:
-    return program.statements[number].name or handed_on.get(number) or f"t{number}"
+    for _, _, place, atom in places(outputs):
+        right = program.read(atom)
+        yield f"{place} = {right if isinstance(atom, Ref) else f'SPREAD({right})'};"
 
 
 def as_scalars(text: str) -> str:
-    """A text of `REAL` and `FN_` for one sample."""
+    """A C text of `REAL` and `FN_` as code for a single sample."""
     return text.replace("SPREAD(", "(").replace("FN_", "hz_").replace("REAL", "hz_real")
 
 
 def whole(program: Program, head: str, outputs: Outputs) -> str:
-    """A function that is one piece."""
+    """The C function of all statements that the outputs need."""
     return function(program, head, needed_by(program, outputs), outputs, {})
 
 
 def needed_by(program: Program, outputs: Outputs) -> set[int]:
     """The statements that outputs need, down to the inputs."""
-    todo = [x.statement for row in outputs.values() for x in row_of(row) if isinstance(x, Ref)]
+    todo = list(results(outputs))
     needed: set[int] = set()
     while todo:
         i = todo.pop()

@@ -1,4 +1,4 @@
-"""Folders of this user alone, for what is compiled and what is known of files."""
+"""Folders that no other user can write to: a cache of compiled libraries and of checked files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 def private_folder(name: str) -> Path:
     """A folder of ~/.cache/herglotz (or $XDG_CACHE_HOME) that no other user can write to.
 
-    Where there can be none (no home, another owner, writable for others), it is one of this process alone.
+    A temporary folder of this process replaces a folder that cannot be made or is not private.
     """
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     folder = Path(base, "herglotz", name)
@@ -28,7 +28,7 @@ def private_folder(name: str) -> Path:
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether this user owns the folder, which is no link, and no other can write to it."""
+    """Whether the path is a folder, not a link, that this user owns and no other user can write to."""
     if not hasattr(os, "getuid"):
         return True
     found = folder.lstat()

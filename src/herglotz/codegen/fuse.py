@@ -49,7 +49,8 @@ def fused(program: Program, numbers: Iterable[int], kept: Collection[int]) -> tu
 def _parts(program: Program, order: list[int]) -> list[list[int]]:
     """Groups of statements: single statements, and loops to be fused. A group ends where one of its rows is needed."""
     parts: list[list[int]] = []
-    waiting: dict[int, set[int]] = {}  # loop → the waiting loops that must run with this loop, itself included
+    # Loop → the waiting loops that must run with this loop, itself included.
+    waiting: dict[int, set[int]] = {}
     length = 0
     for i in order:
         reads, loop = program.statements[i].reads, _loop(program, i)
@@ -63,7 +64,7 @@ def _parts(program: Program, order: list[int]) -> list[list[int]]:
 
 
 def _run(waiting: dict[int, set[int]], needed: set[int]) -> list[list[int]]:
-    """The waiting loops whose rows are needed, with the loops that these need, as a group; the group waits no more."""
+    """Take from `waiting` the loops whose rows are needed, with the loops that these need; return them as a group."""
     done = set().union(*(needs for i, needs in waiting.items() if i in needed))
     for i in done:
         del waiting[i]

@@ -10,31 +10,36 @@ many calls.
 from __future__ import annotations
 
 import heapq
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from herglotz.codegen.c_function import Outputs, needed_by, row_of
-from herglotz.codegen.program import NAME, Program, Ref
+from herglotz.codegen.c_function import Outputs, named, needed_by, places
+from herglotz.codegen.program import Program, Ref
 
 SUMS = ("{0} + {1}", "{0} - {1}", "{0} + {1} * {2}", "{0} - {1} * {2}")
-# Operations whose results on finite numbers are finite, and which cost next to nothing.
+# Operations with finite results for finite operands, each cheaper than a branch.
 PLAIN = (*SUMS, "{0} * {1}", "-{0}")
-CONSTANT = ("theta", "sharpest")  # arguments that do not change from step to step
+# Arguments that do not change from step to step.
+CONSTANT = ("theta", "sharpest")
 # Number of plain operations from which a branch is cheaper than the operations.
 WORTH_A_BRANCH = 3
 
-Gate = frozenset[int] | None  # None: always open
+# Parameters of which at least one must be on for the gate to open; None: always open.
+Gate = frozenset[int] | None
 
 
 @dataclass
 class Prepared:
-    """Arguments that all functions of a library share: gates, and numbers that depend on parameters alone."""
+    """Arguments that all functions of a library share: gates, and numbers that depend on parameters alone.
 
-    gates: dict[frozenset[int], int] = field(default_factory=dict)  # gate → index in the array of flags
-    fixed: int = 0  # how many numbers depend on parameters alone
-    parts: list[str] = field(default_factory=list)  # blocks of C that compute the fixed numbers
+    `gates` has the index of each gate in the array of flags, `fixed` the count of numbers that depend on parameters
+    alone, and `parts` the blocks of C that compute these numbers.
+    """
+
+    gates: dict[frozenset[int], int] = field(default_factory=dict)
+    fixed: int = 0
+    parts: list[str] = field(default_factory=list)
 
     def flag(self, gate: frozenset[int]) -> str:
         """The C expression of a gate's flag."""
@@ -44,7 +49,7 @@ class Prepared:
         """Names in C of the fixed numbers that other statements `read`, by statement."""
         names = {i: f"fixed[{self.fixed + at}]" for at, i in enumerate(read)}
         lines = [program.statements[i].text for i in statements] + [f"{name} = @{i};" for i, name in names.items()]
-        self.parts.append(f"  {{\n{_named(program, [f'    {line}' for line in lines])}\n  }}\n")
+        self.parts.append(f"  {{\n{named(program, [f'    {line}' for line in lines])}\n  }}\n")
         self.fixed += len(read)
         return names
 
@@ -57,14 +62,12 @@ class Prepared:
         return "".join([sizes, head, *flags, *self.parts, "}\n"])
 
 
-def gated(
-    program: Program,
-    head: str,
-    outputs: Outputs,
-    prepared: Prepared,
-    columns: Mapping[str, int] = {},
-) -> str:
-    """The C function of these outputs; the column of a parameter that is off is not written."""
+def gated(program: Program, head: str, outputs: Outputs, prepared: Prepared, columns: Mapping[str, int] = {}) -> str:
+    """The C function of these outputs.
+
+    `columns` has the number of parameters of outputs that are derivatives, row by row; the column of a parameter that
+    is off is not written.
+    """
     numbers = sorted(i for i in needed_by(program, outputs) if not program.statements[i].name)
     wanted = _wanted(outputs, columns)
     gate = _gates(program, numbers, wanted)
@@ -73,17 +76,7 @@ def gated(
     read = set(wanted).union(*(program.statements[i].reads for i in moving)) & fixed
     names = prepared.fix(program, [i for i in numbers if i in fixed], sorted(read))
     lines = [*_statements(program, moving, gate, wanted, prepared), *_written(program, outputs, columns, prepared)]
-    return f"{head} {{\n{_named(program, lines, names)}\n}}\n"
-
-
-def _named(program: Program, lines: list[str], names: Mapping[int, str] = {}) -> str:
-    """Lines with the names of numbers, `names` before others."""
-
-    def name(match: re.Match[str]) -> str:
-        i = int(match[1])
-        return program.statements[i].name or names.get(i) or f"t{i}"
-
-    return NAME.sub(name, "\n".join(lines))
+    return f"{head} {{\n{named(program, lines, names)}\n}}\n"
 
 
 def _fixed(program: Program, numbers: list[int]) -> set[int]:
@@ -98,11 +91,10 @@ def _fixed(program: Program, numbers: list[int]) -> set[int]:
 def _wanted(outputs: Outputs, columns: Mapping[str, int]) -> dict[int, Gate]:
     """The statements whose results are outputs, and the gate of each output."""
     found: dict[int, Gate] = {}
-    for name, row in outputs.items():
-        for i, atom in enumerate(row_of(row)):
-            if isinstance(atom, Ref):
-                gate = frozenset([i % columns[name]]) if name in columns else None
-                found[atom.statement] = _either(found.get(atom.statement, frozenset()), gate)
+    for name, i, _, atom in places(outputs):
+        if isinstance(atom, Ref):
+            gate = frozenset([i % columns[name]]) if name in columns else None
+            found[atom.statement] = _either(found.get(atom.statement, frozenset()), gate)
     return found
 
 
@@ -173,11 +165,10 @@ def _statements(
             yield f"  REAL @{i}{' = 0' if i in zeros else ''};"
     for own, statements in blocks:
         lines = [program.statements[i].text.removeprefix("const REAL " if i in shared else "") for i in statements]
-        yield from [f"  {line}" for line in lines] if own is None else _behind(prepared.flag(own), lines)
-
-
-def _behind(flag: str, lines: list[str]) -> list[str]:
-    return [f"  if ({flag}) {{", *(f"    {line}" for line in lines), "  }"]
+        if own is None:
+            yield from (f"  {line}" for line in lines)
+        else:
+            yield from (f"  if ({prepared.flag(own)}) {{", *(f"    {line}" for line in lines), "  }")
 
 
 def _read_outside(
@@ -225,13 +216,11 @@ def _blocks(program: Program, numbers: list[int], gate: Mapping[int, Gate]) -> I
 def _written(program: Program, outputs: Outputs, columns: Mapping[str, int], prepared: Prepared) -> Iterator[str]:
     """The outputs, put in their places; columns of parameters behind their gates."""
     behind: dict[int, list[str]] = {}
-    for place, row in outputs.items():
-        for i, atom in enumerate(row_of(row)):
-            right = program.read(atom)
-            line = f"{place if row is atom else f'{place}[{i}]'} = {right};"
-            if place in columns:
-                behind.setdefault(i % columns[place], []).append(line)
-            else:
-                yield f"  {line}"
+    for name, i, text, atom in places(outputs):
+        line = f"{text} = {program.read(atom)};"
+        if name in columns:
+            behind.setdefault(i % columns[name], []).append(line)
+        else:
+            yield f"  {line}"
     for k, lines in behind.items():
         yield f"  if ({prepared.flag(frozenset([k]))}) {{ {' '.join(lines)} }}"

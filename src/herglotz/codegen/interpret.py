@@ -22,14 +22,15 @@ MATHEMATICS: dict[str, Callable[[float], float]] = {
     "softplus": lambda x: max(x, 0.0) + math.log1p(math.exp(-abs(x))),
 }  # fmt: skip
 WHERE = (aten.where.self, aten.where.ScalarOther, aten.where.ScalarSelf, aten.where.Scalar)
-ROWS = ("tanh", "sigmoid", "softplus")  # functions with a kernel for a whole row
+# Functions with a kernel for a whole row.
+ROWS = ("tanh", "sigmoid", "softplus")
 
 
 def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -> list[np.ndarray]:
     """The outputs of a graph as arrays of atoms, for one sample: the batch axis has size 1.
 
-    `program` takes the statements; `inputs` are the numbers of each argument, in its order. An argument without the
-    batch axis, as parameters are, has its own shape.
+    The statements are appended to `program`; `inputs` are the numbers of each argument, in row-major order. An argument
+    without the batch axis, such as parameters, keeps its shape.
     """
     nodes = list(graph.code.nodes)
     places = [node for node in nodes if node.op == "placeholder"]
@@ -49,11 +50,12 @@ def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -
         options = {k: x for k, x in node.kwargs.items() if k in ("value", "alpha")}
         arguments = _squeezed(node) if node.target == aten.squeeze.dims else node.args
         values[node] = table[node.target](*known(arguments), **known(options))
-    return list(known(nodes[-1].args[0]))  # the output
+    output = nodes[-1]
+    return list(known(output.args[0]))
 
 
 def _squeezed(node: fx.Node) -> tuple[fx.Node, tuple[int, ...]]:
-    """The arguments of a squeeze with the axes that had size 1 in the trace: here the batch has size 1, too."""
+    """The arguments of a squeeze with the axes that had size 1 in the trace: the batch, of size 1 here, stays."""
     x, axes = node.args
     assert isinstance(x, fx.Node)
     shape = x.meta["example"].shape
@@ -205,13 +207,12 @@ class _Numbers:
         return out if whole >= 0 else self.divide(1.0, out)
 
     def powers(self, x: np.ndarray, exponents: np.ndarray) -> np.ndarray:
-        """Powers that are constants, one for each entry of the last axis."""
-        x = np.broadcast_to(x, np.broadcast_shapes(x.shape, exponents.shape))
-        by = np.broadcast_to(exponents, x.shape).reshape(-1, x.shape[-1])
+        """Powers with constant exponents, an exponent for each entry of the last axis."""
+        x, by = np.broadcast_arrays(x, exponents)
+        by = by.reshape(-1, x.shape[-1])
         if any(isinstance(e, Ref) for e in by.flat) or bool((by != by[:1]).any()):
             raise InputError("a power whose exponent is no constant cannot be written as C; export as .pt2 instead")
-        by = by[0]
-        return np.stack([self.power(x[..., k], float(by[k])) for k in range(x.shape[-1])], -1)
+        return np.stack([self.power(x[..., k], float(e)) for k, e in enumerate(by[0])], -1)
 
     def function(self, name: str, x: np.ndarray) -> np.ndarray:
         fold = lambda a: None if isinstance(a, Ref) else MATHEMATICS[name](a)  # noqa: E731
@@ -251,13 +252,10 @@ class _Numbers:
         out = np.empty((*outer, x.shape[-2], w.shape[-1]), object)
         b = None if bias is None else list(bias)
         for i in np.ndindex(*outer, x.shape[-2]):
-            row = self.program.product(list(x[i]), w[i[:-1]], b)
-            for k, value in enumerate(row):
-                out[(*i, k)] = value
+            out[i] = _array(self.program.product(list(x[i]), w[i[:-1]], b))
         return out
 
-    def sum(self, x: np.ndarray, axes: Any, keep: bool = False) -> np.ndarray:
-        axes = [axes] if isinstance(axes, int) else axes
+    def sum(self, x: np.ndarray, axes: Sequence[int], keep: bool = False) -> np.ndarray:
         for axis in sorted((a % x.ndim for a in axes), reverse=True):
             moved = np.moveaxis(x, axis, -1)
             total = np.empty(moved.shape[:-1], object)
@@ -291,7 +289,8 @@ class _Numbers:
 def _put_slice(g: np.ndarray, shape: Sequence[int], dim: int, where: int | slice) -> np.ndarray:
     """Zeros of this shape with g at `where` of an axis."""
     out = _full(shape, 0)
-    out[(*(slice(None),) * (dim % len(shape)), where)] = g if g.ndim else g[()]  # an array would be kept as one
+    # numpy would store an array without axes as an array, not as its number.
+    out[(*(slice(None),) * (dim % len(shape)), where)] = g if g.ndim else g[()]
     return out
 
 

@@ -19,8 +19,10 @@ from herglotz.errors import InputError
 
 # Number of results from which a loop is written: shorter rows are faster as scalars, and take no more lines.
 LOOP = 8
-# Both are computed in the same loop, which compilers turn into a single call: networks read both side by side.
+# Sine and cosine of a row are computed in the same loop, which compilers turn into a single call: networks read both.
 SINE_AND_COSINE = ("FN_sin({0})", "FN_cos({0})")
+# Number of inputs up to which a matrix product is a single loop over the outputs, without a call.
+FEW = 4
 # Number of nonzero weights from which a matrix product is a call of a kernel.
 DENSE = 64
 
@@ -39,30 +41,38 @@ class Compared(NamedTuple):
     b: Any
 
 
-Atom = Any  # float | Ref
+# A float or a `Ref`.
+Atom = Any
 NAME = re.compile(r"@(\d+)")
 
 
 @dataclass
 class Statement:
-    """A line or a loop; `@7` in the text is the result of statement 7, which may be this statement itself."""
+    """A line or a loop; `@7` in the text is the result of statement 7, which may be this statement itself.
+
+    `size` is the length of the row, 0 for a scalar; `name` is the name of an input in C, empty for a result.
+    """
 
     text: str
-    size: int  # 0: a scalar
+    size: int
     reads: set[int]
-    name: str = ""  # of an input
+    name: str = ""
 
 
 @dataclass
 class Program:
-    """Statements in order, and tables of their results for reuse."""
+    """Statements in order, and tables of their results for reuse.
+
+    `operations` has the form and the operands of every scalar. A loop is written for `loop` results or more; infinity
+    writes no loops. `angles`, an `herglotz.codegen.angles.Angles`, expands sines and cosines of sums.
+    """
 
     statements: list[Statement] = field(default_factory=list)
     tables: dict[tuple[float, ...], str] = field(default_factory=dict)
     known: dict[Any, Atom] = field(default_factory=dict)
-    operations: dict[Ref, tuple[Any, ...]] = field(default_factory=dict)  # scalar → its form and operands
-    loop: float = LOOP  # number of results from which a loop is written; infinite: no loops
-    angles: Any = None  # `herglotz.codegen.angles.Angles`, if sines and cosines of sums are expanded
+    operations: dict[Ref, tuple[Any, ...]] = field(default_factory=dict)
+    loop: float = LOOP
+    angles: Any = None
 
     def given(self, name: str, size: int) -> list[Ref]:
         """An input of the function: a row of `size` numbers, or a scalar for size 0."""
@@ -121,9 +131,8 @@ class Program:
         columns, forms = list(zip(*entries, strict=True)), (form,)
         if form in SINE_AND_COSINE:
             forms = SINE_AND_COSINE
-            lines = [f"@@[k{at}] = {f.format(self._in_loop(columns[0]))};" for f, at in
-                     zip(forms, ("", f" + {count}"), strict=True)]  # fmt: skip
-            text = f"for (k = 0; k < {count}; k++) {{ {' '.join(lines)} }}"
+            sine, cosine = (f.format(self._in_loop(columns[0])) for f in forms)
+            text = f"for (k = 0; k < {count}; k++) {{ @@[k] = {sine}; @@[k + {count}] = {cosine}; }}"
         elif kernel is not None:
             text = f"{kernel}({count}, {self.pointer(columns[0])}, @@);"
         else:
@@ -158,27 +167,24 @@ class Program:
             wanted = [Ref(first.statement, first.index + i) for i in range(len(atoms))]
             if list(atoms) == wanted:
                 return f"@{first.statement}" + (f" + {first.index}" if first.index else "")
-        key = ("packed", *atoms)
-        if key not in self.known:
-            lines, start = [], 0
-            while start < len(atoms):
-                count = _run([(x,) for x in atoms], start)
-                if count < self.loop:
-                    lines += [f"@@[{i}] = {self._spread(atoms[i])};" for i in range(start, start + count)]
-                else:
-                    right = self._in_loop(atoms[start : start + count])
-                    right = right if isinstance(atoms[start], Ref) else f"SPREAD({right})"
-                    at = f"k + {start}" if start else "k"
-                    lines.append(f"for (k = 0; k < {count}; k++) @@[{at}] = {right};")
-                start += count
-            self.known[key] = self._append("\n".join(lines), len(atoms))
-        return f"@{self.known[key].statement}"
+        return f"@{self._once(('packed', *atoms), lambda: self._packed(atoms), len(atoms)).statement}"
 
-    def _spread(self, atom: Atom) -> str:
-        return self.read(atom) if isinstance(atom, Ref) else f"SPREAD({literal(atom)})"
+    def _packed(self, atoms: Sequence[Atom]) -> str:
+        """The statements that copy numbers into a row."""
+        lines, start = [], 0
+        while start < len(atoms):
+            count = _run([(x,) for x in atoms], start)
+            spread = "{}" if isinstance(atoms[start], Ref) else "SPREAD({})"
+            if count < self.loop:
+                lines += [f"@@[{i}] = {spread.format(self.read(atoms[i]))};" for i in range(start, start + count)]
+            else:
+                right = spread.format(self._in_loop(atoms[start : start + count]))
+                lines.append(f"for (k = 0; k < {count}; k++) @@[{f'k + {start}' if start else 'k'}] = {right};")
+            start += count
+        return "\n".join(lines)
 
     def product(self, x: Sequence[Atom], weight: np.ndarray, bias: Sequence[Atom] | None) -> list[Atom]:
-        """Σ_j x_j w_jk + b_k for one row x (k,), w (k, m) and b (m,)."""
+        """Σ_j x_j w_jk + b_k for a row x (k,), w (k, m) and b (m,)."""
         kept = [j for j, value in enumerate(x) if value != 0.0 and np.any(weight[j] != 0.0)]
         x, weight = [x[j] for j in kept], weight[kept]
         size = weight.shape[1]
@@ -186,40 +192,38 @@ class Program:
         if not kept:
             return start
         if not _varies([*weight.flat, *start]) and _varies(x):
-            if size >= self.loop and len(kept) <= 4:
-                return self._few_inputs(x, weight, start)
-            if max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size):
-                return self._call_product(x, weight, start)
+            form = None
+            if size >= self.loop and len(kept) <= FEW:
+                form = self._few_inputs
+            elif max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size):
+                form = self._call_product
+            if form is not None:
+                key = (form.__name__, tuple(x), tuple(weight.flat), tuple(start))
+                row = self._once(key, lambda: form(x, weight, start), size).statement
+                return [Ref(row, i) for i in range(size)]
         return [self.sum([start[k], *(multiply(self, v, w) for v, w in zip(x, weight[:, k], strict=True))])
                 for k in range(size)]  # fmt: skip
 
-    def _few_inputs(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> list[Atom]:
-        key = ("few", tuple(x), tuple(weight.flat), tuple(start))
-        if key not in self.known:
-            terms = [f"{self.read(v)} * {self._in_loop(list(row))}" for v, row in zip(x, weight, strict=True)]
-            terms = [self._in_loop(list(start)), *terms] if any(start) else terms
-            text = f"for (k = 0; k < {len(start)}; k++) @@[k] = {' + '.join(terms)};"
-            self.known[key] = self._append(text, len(start))
-        return [Ref(self.known[key].statement, i) for i in range(len(start))]
+    def _few_inputs(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> str:
+        """The loop over the outputs of a matrix product, with the products of all inputs in its body."""
+        terms = [f"{self.read(v)} * {self._in_loop(list(row))}" for v, row in zip(x, weight, strict=True)]
+        terms = [self._in_loop(list(start)), *terms] if any(start) else terms
+        return f"for (k = 0; k < {len(start)}; k++) @@[k] = {' + '.join(terms)};"
 
-    def _call_product(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> list[Atom]:
-        key = ("product", tuple(x), tuple(weight.flat), tuple(start))
-        if key not in self.known:
-            where, size = self.pointer(x), len(start)
-            tables = f"{self.table(weight.flat)}, {self.table(weight.T.flat)}"
-            text = f"for (k = 0; k < {size}; k++) @@[k] = SPREAD({self._in_loop(list(start))});\n"
-            self.known[key] = self._append(f"{text}FN_product({len(x)}, {size}, {tables}, {where}, @@);", size)
-        return [Ref(self.known[key].statement, i) for i in range(len(start))]
+    def _call_product(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> str:
+        """The call of the kernel that adds a matrix product to the start."""
+        where, size = self.pointer(x), len(start)
+        tables = f"{self.table(weight.flat)}, {self.table(weight.T.flat)}"
+        text = f"for (k = 0; k < {size}; k++) @@[k] = SPREAD({self._in_loop(list(start))});\n"
+        return f"{text}FN_product({len(x)}, {size}, {tables}, {where}, @@);"
 
     def sum(self, atoms: Iterable[Atom]) -> Atom:
         """The sum; of numbers in a long row by a call of a kernel."""
         terms = [x for x in atoms if x != 0.0]
         if len(terms) >= self.loop and _run([(x,) for x in terms], 0) == len(terms) and isinstance(terms[0], Ref):
             where = self.pointer(terms)
-            key = ("sum", where, len(terms))
-            if key not in self.known:
-                self.known[key] = self._append(f"const REAL @@ = FN_sum({len(terms)}, {where});", 0)
-            return self.known[key]
+            text = f"const REAL @@ = FN_sum({len(terms)}, {where});"
+            return self._once(("sum", where, len(terms)), lambda: text, 0)
         total: Atom = 0.0
         for x in terms:
             total = add(self, total, x)
@@ -230,6 +234,12 @@ class Program:
         where, n = self.pointer(list(matrix.flat)), len(matrix)
         number = self._append(f"FN_inverse({n}, {where}, @@);", n * n).statement
         return [Ref(number, i) for i in range(n * n)]
+
+    def _once(self, key: Any, text: Callable[[], str], size: int) -> Ref:
+        """The result of the statement with this key, which is written on first use."""
+        if key not in self.known:
+            self.known[key] = self._append(text(), size)
+        return self.known[key]
 
     def _append(self, text: str, size: int) -> Ref:
         """The result of a new statement; `@@` in the text is the result of this statement."""

@@ -14,8 +14,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from herglotz.errors import InputError
 
 aten = torch.ops.aten
-PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)  # larger than any layer: a multiple of one in a shape is the batch
-LARGEST = 4096  # multiples of the batch looked for in shapes: (rows · B, …)
+# Batch sizes of examples, larger than any layer: a multiple of the batch size in a shape is the batch.
+PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)
+# Multiples of the batch size up to this one are sizes that depend on the batch, as in shapes (rows · B, …).
+MAX_MULTIPLE = 4096
 # Operations that return their first argument unchanged if shape and dtype stay.
 SAME = (
     aten.alias.default, aten.to.device, aten.to.dtype, aten.to.dtype_layout, aten.expand.default, aten.reshape.default,
@@ -48,7 +50,8 @@ class Graph(nn.Module):
         super().__init__()
         self.code = code
         self.batch = batch
-        self.operator: Callable[..., Any] | None = None  # the replacement by `herglotz.export.inline`
+        # The replacement of `code` by `herglotz.export.inline`.
+        self.operator: Callable[..., Any] | None = None
         for i, value in enumerate(constants):
             self.register_buffer(f"constant_{i}", value)
 
@@ -121,14 +124,18 @@ class Recorder(TorchDispatchMode):
     def __init__(self, inputs: Sequence[Tensor]):
         super().__init__()
         self.graph = fx.Graph()
-        self.calls: dict[tuple[Any, str], fx.Node] = {}  # nodes by operation and arguments
-        self.nodes: dict[int, fx.Node] = {}  # nodes by the id of their tensor, which `alive` keeps
+        # Nodes by operation and arguments.
+        self.calls: dict[tuple[Any, str], fx.Node] = {}
+        # Nodes, and operations left out, by the id of their result, which `alive` keeps.
+        self.nodes: dict[int, fx.Node] = {}
+        self.unchanged: dict[int, tuple[Any, Any, Any]] = {}
         self.alive: list[Any] = []
-        self.unchanged: dict[int, tuple[Any, Any, Any]] = {}  # operations left out, by the id of their result
         self.constants: dict[Any, tuple[fx.Node, Tensor]] = {}
-        self.current: dict[int, set[int]] = {}  # written storage → tensors whose nodes have the written numbers
+        # Written storage → ids of the tensors whose nodes have the written numbers.
+        self.current: dict[int, set[int]] = {}
         self.size: fx.Node | None = None
-        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]  # inputs, then constants
+        # Inputs, then constants.
+        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]
         for x, place in zip(inputs, self.places, strict=True):
             place.meta["example"] = _described(x)
             self._name(x, place)
@@ -144,24 +151,24 @@ class Recorder(TorchDispatchMode):
         """Run an operation, and record the operation."""
         kwargs = kwargs or {}
         fixed = self._is_fixed((*args, *kwargs.values()))
-        if not fixed and func in READS:
-            raise InputError(
-                "a value is read while the step is traced (.item(), float(), bool(), or `if` on a tensor): a file "
-                "would hold the branch of one sample for all; write it as torch.where"
-            )
         if fixed:
             result = func(*args, **kwargs)
             self.alive += [args, result]
             return result
-        # An operation in place is recorded before it runs: afterwards its argument has the new numbers.
+        if func in READS:
+            raise InputError(
+                "a value is read while the step is traced (.item(), float(), bool(), or `if` on a tensor): a file "
+                "would hold the branch of one sample for all; write it as torch.where"
+            )
+        # An operation in place is recorded before the operation runs: afterwards its argument has the new numbers.
         node = self._written(func, args, kwargs) if func._schema.is_mutable else None
         result = func(*args, **kwargs)
         self.alive += [args, result]
-        same = self._same(func, args, kwargs, result) if node is None else None
-        if same is not None:
-            self.unchanged[id(result)] = (func, args, kwargs)
         if node is None:
-            node = self._moved(same) if same is not None else self._written(func, args, kwargs)
+            same = self._same(func, args, kwargs, result)
+            if same is not None:
+                self.unchanged[id(result)] = (func, args, kwargs)
+            node = self._written(func, args, kwargs) if same is None else self._moved(same)
         elif func._schema.name.removeprefix("aten::") not in SHAPE_ONLY:
             self.current[_storage(result)] = set()
         self._name(result, node)
@@ -252,8 +259,8 @@ class Recorder(TorchDispatchMode):
     def _moved(self, value: Tensor) -> fx.Node:
         """The node of a tensor; a constant gets its node on first use.
 
-        Raise InputError for a tensor whose numbers were written through another view of the same memory: the tensor's
-        node still has the old numbers.
+        Raise InputError for a tensor whose numbers were written through another view of the same memory: its node
+        still has the old numbers.
         """
         if id(value) not in self.current.get(_storage(value), {id(value)}):
             raise InputError(
@@ -262,7 +269,8 @@ class Recorder(TorchDispatchMode):
             )
         if id(value) in self.nodes:
             return self.nodes[id(value)]
-        if value.is_meta or value._is_zerotensor():  # torch.func keeps the derivative of a constant without numbers
+        # torch.func keeps the derivative of a constant without numbers.
+        if value.is_meta or value._is_zerotensor():
             value = torch.zeros(value.shape, dtype=value.dtype)
         key = (value.dtype, tuple(value.shape), value.detach().cpu().contiguous().numpy().tobytes())
         if key not in self.constants:
@@ -284,7 +292,12 @@ class Recorder(TorchDispatchMode):
 
     def _is_size(self, x: Any) -> bool:
         """Whether x is a multiple of the example's batch."""
-        return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * self.batch and x % self.batch == 0
+        return (
+            isinstance(x, int)
+            and not isinstance(x, bool)
+            and 0 < x <= MAX_MULTIPLE * self.batch
+            and x % self.batch == 0
+        )
 
 
 def _storage(x: Tensor) -> int:

@@ -1,32 +1,30 @@
-"""Block tridiagonal systems, batched: elimination in order, and a dense solve for the samples it does not serve."""
+"""Block tridiagonal systems, batched: elimination in order, and a dense solve for samples where elimination fails."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-# Diagonal blocks, those to the right and those to the left: (..., K, m, m) each. The last upper and the first lower
-# block are not used.
+# Diagonal, upper and lower blocks, (..., K, m, m) each. The last upper and the first lower block are not used.
 Blocks = tuple[Tensor, Tensor, Tensor]
 
 
 def solve_blocks(blocks: Blocks, rhs: Tensor) -> Tensor:
     """Solve the system for rhs (..., K, m).
 
-    Elimination takes pivots inside blocks only and fails where a leading part is singular though the whole is not
-    (a caustic that the curve has crossed exactly at a node): those samples are solved densely. Not finite where the
-    matrix is singular.
+    Elimination takes pivots inside blocks only and fails where a leading part is singular though the matrix is not (a
+    caustic that the curve crosses exactly at a node): such samples are solved densely. The result is not finite where
+    the matrix is singular.
     """
     u = eliminate(blocks, rhs[..., None])[..., 0]
     defect = (multiply(blocks, u) - rhs).abs().flatten(-2).amax(-1)
-    good = defect <= 1e-3 * torch.finfo(rhs.dtype).eps ** 0.25 * rhs.abs().flatten(-2).amax(-1)
-    if bool(good.all()):
-        return u
-    bad = ~good
-    matrix = _assemble(tuple(x[bad] for x in blocks))  # type: ignore[arg-type]
-    fixed = torch.linalg.solve_ex(matrix, rhs[bad].flatten(-2)[..., None])[0][..., 0]
-    u = u.clone()
-    u[bad] = fixed.unflatten(-1, rhs.shape[-2:])
+    bad = ~(defect <= 1e-3 * torch.finfo(rhs.dtype).eps ** 0.25 * rhs.abs().flatten(-2).amax(-1))
+    if bool(bad.any()):
+        diagonal, upper, lower = (x[bad] for x in blocks)
+        matrix = _assemble((diagonal, upper, lower))
+        fixed = torch.linalg.solve_ex(matrix, rhs[bad].flatten(-2)[..., None])[0][..., 0]
+        u = u.clone()
+        u[bad] = fixed.unflatten(-1, rhs.shape[-2:])
     return u
 
 
@@ -70,6 +68,7 @@ def multiply(blocks: Blocks, u: Tensor) -> Tensor:
 
 
 def _assemble(blocks: Blocks) -> Tensor:
+    """The dense matrix (..., K m, K m)."""
     diagonal, upper, lower = blocks
     count, m = diagonal.shape[-3:-1]
     matrix = diagonal.new_zeros(*diagonal.shape[:-3], count, m, count, m)

@@ -1,11 +1,11 @@
-"""The step equation F(q1) = D1 L_d + c p0 + F⁻ = 0 of one step: of any L_d through its partials, of a model directly.
+"""The step equation F(q1) = D1 L_d + c p0 + F⁻ = 0 of a model, by its terms.
 
 A model's L_d = (c − 1) A + √c K − h/2 (V0 + V1) + N with A = s0 − h/2 V0 and c = e^g has
 
     F = a c + α D1 g − √c m v + D1 N + F⁻,    a = p0 − h/2 V0′,    α = c A + √c K / 2,
     J = ∂F/∂q1 = (c a − √c m v / 2) ⊗ D2 g + α D12 g + D1 g ⊗ ∂α/∂q1 − √c m / h + D12 N + ∂F⁻/∂q1,
 
-so V is evaluated once a step (V at q0 is left from the step before) and an iteration costs only the networks of
+so V is evaluated once a step (V at q0 is known from the step before) and an iteration costs only the networks of
 (q̄, v), by sweeps of n tangents.
 """
 
@@ -31,7 +31,7 @@ class _Frame(NamedTuple):
     """Constant matrices between features (s, c, v) and (q0, q1); the velocity's rate is left to `ModelEquation`."""
 
     to_q0: Tensor  # (3n, n) ½ on every row of a coordinate: D1 = (g · w) to_q0 with w = (ds, −sin, −2/h)
-    to_q1: Tensor  # (3n, n) the same with the velocity's sign turned: D2
+    to_q1: Tensor  # (3n, n) to_q0 with the sign of the velocity turned: D2
     tangent: Tensor  # (n, 3n) features' tangents along q1 are w · tangent
     bend: Tensor  # (3n, n) −¼ on the rows s and c of angles
     eye: Tensor  # (n, n)
@@ -62,23 +62,25 @@ class _Constants(NamedTuple):
     half: Tensor  # (..., 1) h/2
     rate: Tensor  # (..., 1) 1/h
     minus_2_rate: Tensor  # (..., n)
-    c: Tensor  # (...) and √c, where constant
+    c: Tensor  # (...) c and √c are those of a constant damping, else 1
     c_minus_1: Tensor
     minus_root: Tensor  # (..., 1)
     J: Tensor  # (..., n, n) −m/h, times √c where that is constant
-    N: Sweep | None  # times h
-    G: Sweep | None  # times −h
+    # The networks, times h and −h if folded.
+    N: Sweep | None
+    G: Sweep | None
     times: Tensor | None  # (...) h, if not folded into the networks
 
 
 class ModelEquation:
-    """Makes the step equations of a model at the present parameters; keeps shared factors.
+    """Makes the step equations of a model at its present parameters; keeps factors that steps share.
 
-    `fold` puts h into the networks' last layers: fewer operations where h is one number for all samples.
+    `fold` multiplies the last layers of the networks by h, which takes fewer operations if all samples have the same h.
     """
 
     def __init__(self, model: ContactLagrangian, fold: bool = True):
-        assert isinstance(model.kinetic, Kinetic)  # the capabilities say so
+        # The capability `by_terms` has a constant mass.
+        assert isinstance(model.kinetic, Kinetic)
         self.model, self.fold = model, fold
         self.config = model.config
         self.field = FieldOf(model.potential)
@@ -89,7 +91,7 @@ class ModelEquation:
         self._key: tuple[Tensor, torch.Size] | None = None
 
     def at(self, state: State, h: Tensor, u: Tensor | None, increments: bool, here: Field | None = None) -> StepOfModel:
-        """The equation of a step; `here` is the potential at q0, if known."""
+        """The equation of a step; `here` is the potential at q0, where known."""
         return StepOfModel(self, state, self._at(h, state.q), u, increments, here)
 
     def _at(self, h: Tensor, q0: Tensor) -> _Constants:
@@ -131,8 +133,10 @@ class StepOfModel:
         self.q0, self.p0, self.s0 = q0, p0, s0 = state
         self.maker, self.constants, self.u, self.increments = maker, constants, u, increments
         self.here = maker.field(q0) if here is None else here
-        self.there: Field | None = None  # the potential at q1, after `end`
-        a = torch.addcmul(p0, constants.half, self.here.slope, value=-1)  # p0 − h/2 V0′
+        # The potential at q1, after `end`.
+        self.there: Field | None = None
+        # a = p0 − h/2 V0′, times c where c is constant.
+        a = torch.addcmul(p0, constants.half, self.here.slope, value=-1)
         self.a = a if maker.affine is not None else constants.c[..., None] * a
         self.A = s0 - constants.half[..., 0] * self.here.V
 
@@ -140,7 +144,8 @@ class StepOfModel:
         """See `StepEquation`."""
         k, maker = self.constants, self.maker
         v = (x if self.increments else x - self.q0) * k.rate
-        mv = v if v.shape[-1] == 1 else v @ maker.mass  # C₁₁ = 1
+        # A model's first mass is 1.
+        mv = v if v.shape[-1] == 1 else v @ maker.mass
         features = self._features(x, v) if k.N is not None or k.G is not None else None
         N = None if k.N is None or features is None else self._slopes(k.N, *features, second)
         if maker.affine is not None:
@@ -176,7 +181,7 @@ class StepOfModel:
         return self.maker.model.typical_increment(self.constants.h).expand(self.s0.shape)
 
     def _gained(self, point: Point, there: Field) -> Tensor | None:
-        """(c − 1) p0 + (D1 + D2) L_d + F⁻ + F⁺, p1 − p0 as F = 0: large terms of D1 and D2 have cancelled."""
+        """p1 − p0 = (c − 1) p0 + (D1 + D2) L_d + F⁻ + F⁺ at F = 0, without the large terms that D1 and D2 cancel."""
         k, (_, _, N, damping, force) = self.constants, point.rest
         if damping is not None:
             return None
@@ -187,14 +192,13 @@ class StepOfModel:
         return dp if force is None else dp + (k.half * (1.0 + c)) * force
 
     def leap(self) -> Tensor:
-        """Δ without networks of (q̄, v), forces and drag, (..., n): near the solution if these terms are weak."""
-        a = self.a if self.maker.affine is None else self.a * -self.constants.minus_root
-        return -self.over_kinetic(a)
+        """Δ without networks of (q̄, v), forces and drag, (..., n): near the solution if these terms are weak.
 
-    def over_kinetic(self, x: Tensor) -> Tensor:
-        """J⁻¹ x with the kinetic part of J alone, −√c m/h; c of the constant damping."""
+        −J⁻¹a with the kinetic part −√c m/h of J alone.
+        """
         k = self.constants
-        return (x @ torch.linalg.inv_ex(self.maker.mass)[0]) * (k.h[..., None] / k.minus_root)
+        a = self.a if self.maker.affine is None else self.a * -k.minus_root
+        return -((a @ torch.linalg.inv_ex(self.maker.mass)[0]) * (k.h[..., None] / k.minus_root))
 
     def at(self, x: Tensor, point: Point) -> Point:
         """Return the point with the velocity and momentum of x, and the other entries unchanged."""
@@ -209,7 +213,8 @@ class StepOfModel:
         half = k.half[..., 0]
         if damping is None:
             c, L, p1 = k.c.expand(self.s0.shape), k.c_minus_1 * self.A, -k.minus_root * mv
-            K = (mv * v).sum(-1) * -(k.minus_root[..., 0] * half)  # √c h/2 v·mv
+            # √c K = √c h/2 v·mv
+            K = (mv * v).sum(-1) * -(k.minus_root[..., 0] * half)
         else:
             c, c_minus_1, root, alpha, D2g = damping
             L, p1 = c_minus_1 * self.A, torch.addcmul(alpha[..., None] * D2g(), root, mv)

@@ -1,13 +1,13 @@
 """Events: where a function g(q, p, s) of the state changes sign within a step.
 
-Every step size is allowed, so the time of an event is a root of τ ↦ g(step from x_k by τ) on (0, h): the state at the
-event is a state of the stepper, not an interpolation.
+A stepper takes steps of any size, so the time of an event is a root of τ ↦ g(step from x_k by τ) on (0, h): the state
+at the event is a state of the stepper, not an interpolation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,7 +16,8 @@ from herglotz.errors import InputError
 from herglotz.mechanics.newton import select
 from herglotz.stepping.state import Crossings, State, Status, Step
 
-MAX_TRIALS = 80  # bisection alone, every eighth trial, halves the bracket ten times
+# Every eighth trial is a bisection, so the trials halve the bracket at least ten times.
+MAX_TRIALS = 80
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,12 @@ class Event:
             raise InputError(f"direction must be -1, 0 or 1, got {self.direction}")
 
 
-StepBy = Callable[[Tensor, Tensor], Step]  # (τ (...), guess (..., n)) → the step by τ from the present state
+# (τ (...), guess (..., n)) → the step by τ from the present state
+StepBy = Callable[[Tensor, Tensor], Step]
 
 
 class Watch:
-    """Looks after the events of one rollout: which samples have stopped, and every crossing so far."""
+    """The events of a rollout: the samples that have stopped, and every crossing so far."""
 
     def __init__(self, events: Sequence[Event | Callable[[State], Tensor]], start: State):
         self.events = [e if isinstance(e, Event) else Event(e) for e in events]
@@ -61,7 +63,7 @@ class Watch:
         return Step(state, zero + 1, torch.full_like(zero, Status.STOPPED, dtype=torch.uint8), zero, 0)
 
     def after(self, k: int, old: State, step: Step, h: Tensor, step_by: StepBy) -> Step:
-        """The step as the events leave it."""
+        """Step k after its events: a sample ends at its first terminal event."""
         if bool(self.stopped.any()):
             step = _select(self.stopped, self.hold(old), step)
         h = h.detach().expand(old.s.shape)
@@ -80,7 +82,8 @@ class Watch:
                 if bool(here.any()):
                     found.append(self._record(k, here, self.t + tau, at.state))
                 stops = here & (tau == first)
-                stop = Step(at.state, at.c, _stopped(at.status), at.residual, at.iterations)
+                ended = torch.where(at.status == Status.CONVERGED, int(Status.STOPPED), at.status.int())
+                stop = replace(at, status=ended.to(torch.uint8))
                 step = _select(stops, stop, step)
         self.t = self.t + torch.where(self.stopped, 0.0, torch.minimum(first, h))
         self.stopped = self.stopped | torch.isfinite(first)
@@ -88,9 +91,9 @@ class Watch:
         return step
 
     def crossings(self, like: State) -> tuple[Crossings, ...]:
-        """All that was found, event by event; `like` gives the shapes."""
+        """All crossings, event by event; `like` is a state of the right shapes."""
         nothing = self._record(0, torch.zeros_like(self.stopped), self.t, like)
-        return tuple(_join([*found, nothing]) for found in self.found)
+        return tuple(_joined([*found, nothing]) for found in self.found)
 
     def _value(self, event: Event, state: State) -> Tensor:
         with torch.no_grad():
@@ -103,7 +106,7 @@ class Watch:
     def _locate(
         self, event: Event, ends: list[Tensor], mask: Tensor, known: tuple[State, Step], h: Tensor, step_by: StepBy
     ) -> tuple[Tensor, Step]:
-        """τ (inf where there is no crossing) and the step by it; `ends` are the values before and after `known`."""
+        """The time τ of a crossing, inf without one, and the step by τ; `ends` are g before and after `known`."""
         (g0, g1), (old, step) = ends, known
         if not bool(mask.any()):
             return torch.full_like(h, torch.inf), step
@@ -122,13 +125,9 @@ class Watch:
         return Crossings(index, step, t[mask], State(*(x[mask] for x in state)))
 
 
-def _join(found: list[Crossings]) -> Crossings:
-    return Crossings(
-        torch.cat([x.sample for x in found]),
-        torch.cat([x.step for x in found]),
-        torch.cat([x.t for x in found]),
-        State(*(torch.cat(x) for x in zip(*(y.state for y in found), strict=True))),
-    )
+def _joined(found: list[Crossings]) -> Crossings:
+    sample, step, t = (torch.cat([getattr(x, name) for x in found]) for name in ("sample", "step", "t"))
+    return Crossings(sample, step, t, State(*map(torch.cat, zip(*(x.state for x in found), strict=True))))
 
 
 def _crosses(event: Event, g0: Tensor, g1: Tensor) -> Tensor:
@@ -137,9 +136,10 @@ def _crosses(event: Event, g0: Tensor, g1: Tensor) -> Tensor:
 
 
 def _root(g: Callable[[Tensor], Tensor], g0: Tensor, g1: Tensor, h: Tensor, mask: Tensor) -> Tensor:
-    """τ in (0, h] with g(τ) = 0 between values of opposite sign: false position (Illinois), bisection now and then."""
+    """τ in (0, h] with g(τ) = 0, by false position (Illinois) and bisection; g0 and g1 have opposite signs."""
     a, fa, b, fb = torch.zeros_like(h), g0, h, g1
-    side = torch.zeros_like(h)  # which end moved last: −1 the left one, +1 the right one
+    # The end that moved last: −1 left, +1 right.
+    side = torch.zeros_like(h)
     width = 2 * torch.finfo(h.dtype).eps * h
     tau, done = b, ~mask | (fb == 0)
     for trial in range(MAX_TRIALS):
@@ -149,7 +149,7 @@ def _root(g: Callable[[Tensor], Tensor], g0: Tensor, g1: Tensor, h: Tensor, mask
         guess = torch.where((guess > a) & (guess < b) & (trial % 8 != 7), guess, (a + b) / 2)
         value = g(torch.where(done, tau, guess))
         left = torch.sign(value) == torch.sign(fa)
-        # Illinois: an end that stays for a second time has its value halved, which draws the next guess towards it.
+        # Illinois: the value of an end that stays twice is halved, which draws the next guess towards that end.
         fa, fb = (
             torch.where(left, value, torch.where(side > 0, fa / 2, fa)),
             torch.where(left, torch.where(side < 0, fb / 2, fb), value),
@@ -158,10 +158,6 @@ def _root(g: Callable[[Tensor], Tensor], g0: Tensor, g1: Tensor, h: Tensor, mask
         settled = ((guess - tau).abs() <= width) | (value == 0) | (b - a <= width)
         tau, done = torch.where(done, tau, guess), done | settled
     return tau
-
-
-def _stopped(status: Tensor) -> Tensor:
-    return torch.where(status == Status.CONVERGED, int(Status.STOPPED), status.int()).to(torch.uint8)
 
 
 def _select(mask: Tensor, a: Step, b: Step) -> Step:

@@ -11,19 +11,24 @@ from herglotz.mechanics.regularity import CONDITIONS, Regularity, regularity
 from herglotz.stepping.newton import solve_step
 from herglotz.stepping.state import State, Status
 
-ATTEMPTS, ESCAPE = 60, 4.0
-CORRECTIONS = 15  # Newton iterations of an extrapolated start; one that needs more took too long a stride
-STEPPING = ("finite", "c", "M", "pole")  # quantities that a step needs; H⁺ and H⁻ may be lost
+# Strides of the continuation in h: each failure halves the stride, and 1e-9 of h is reached after 28 halvings.
+MAX_STRIDES = 60
+# Ratio of the ways in the second and the first half of a step above which a motion escapes; a fold has 2.4.
+ESCAPE = 4.0
+# Newton iterations from an extrapolated start: a start that needs more came from too long a stride.
+MAX_CORRECTIONS = 15
+# Quantities that a step needs; H⁺ and H⁻ may be lost.
+STEPPING = ("finite", "c", "M", "pole")
 
 
 def explain_step(
     L_d: DiscreteLagrangian, state: State, h: torch.Tensor | float, *, max_iterations: int = 30
 ) -> list[str]:
-    """One line for every sample whose step fails or cannot be trusted, naming the condition; empty if all is well.
+    """Return a line for every sample whose step fails or cannot be trusted, with the condition that does not hold.
 
-    The step is solved again and the conditions c ≠ 0, det M ≠ 0 and no pole of L_d are looked at where Newton ended.
+    The step is solved again, and the conditions c ≠ 0, det M ≠ 0 and no pole of L_d are tested where Newton ended.
     A step can converge and still be lost: at a conjugate point q1 is right and p1 is rounding. Where Newton fails, the
-    longest step that exists is looked for, which tells a motion that runs off to infinity before h from one that ends.
+    longest step that exists is sought, which tells a motion that reaches infinity before h from a motion that ends.
     A line is, for example, `sample (3,), h = 5: SINGULAR: c = 0: FL⁻ is not defined`.
 
     Source: erratum E4 and the critical steps of section 4 of `docs/mathematics.md`.
@@ -49,7 +54,9 @@ def explain_step(
             status = Status.SINGULAR
         if status != Status.CONVERGED:
             size, residual = float(solution.q1[i].abs().max()), float(solution.residual[i])
-            reasons = _with_the_end(instead or reasons, _no_solution(at, i, size, residual), size)
+            reasons = instead or reasons
+            ended = f"Newton ended at |q1| = {size:.3g}"
+            reasons = [*reasons, ended] if reasons else [_no_solution(at, i, ended, residual)]
         if reasons:
             where = f"sample {i}, " if i else ""
             lines.append(f"{where}h = {float(at.h[i])!r}: {status.name}: {'; '.join(reasons)}")
@@ -62,11 +69,11 @@ def longest_step(
     h: Tensor,  # (...)
     max_iterations: int = 30,
 ) -> tuple[Tensor, Tensor]:
-    """The longest step h' ≤ h that can be taken from here, (...), and whether the motion escapes there, (...).
+    """The longest step h' ≤ h that can be taken from a state, (...), and whether the motion escapes there, (...).
 
-    It escapes where h' < h and q1 goes ESCAPE times as far between h'/2 and h' as before, and a fifth of that in the
-    last thousandth of h'. Towards a logarithmic pole, q1 = −ln(1 − h/h*)/λ, both ratios grow without bound; towards a
-    fold, q1 = q* − a√(h* − h), they are 2.4 and 0.04.
+    The motion escapes if h' < h, and q1 goes `ESCAPE` times as far between h'/2 and h' as before, and a fifth of that
+    way in the last thousandth of h'. Towards a logarithmic pole, q1 = −ln(1 − h/h*)/λ, both ratios grow without bound;
+    towards a fold, q1 = q* − a√(h* − h), the ratios are 2.4 and 0.04.
     """
     reach, end = _continued(L_d, state, h, max_iterations)
     half, late = (_continued(L_d, state, part * reach, max_iterations)[1] for part in (0.5, 0.999))
@@ -75,13 +82,13 @@ def longest_step(
 
 
 def _continued(L_d: DiscreteLagrangian, state: State, h: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:
-    """The largest h' ≤ h to which q1(h') can be continued from q1(0) = q0, and that q1; strides in h, extrapolated."""
+    """The largest h' ≤ h to which q1(h') can be continued from q1(0) = q0, and q1(h'); each start is extrapolated."""
     state = State(*(x.detach() for x in state))
     q = state.q
-    tol, most = 64 * torch.finfo(q.dtype).eps, min(max_iterations, CORRECTIONS)
+    tol, most = 64 * torch.finfo(q.dtype).eps, min(max_iterations, MAX_CORRECTIONS)
     at, stride = torch.zeros_like(h), h / 4
     q1, slope = q.expand(*h.shape, q.shape[-1]), torch.zeros_like(q)
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_STRIDES):
         trial = torch.minimum(at + stride, h)
         moved = (trial - at)[..., None]
         solution = solve_step(L_d, state, trial, q1 + slope * moved, tol, most)
@@ -95,21 +102,17 @@ def _continued(L_d: DiscreteLagrangian, state: State, h: Tensor, max_iterations:
 
 
 def _not_reached(at: Regularity, i: tuple[int, ...], reach: Tensor, escapes: Tensor) -> list[str]:
-    """Why Newton did not find q1 although all shorter steps exist; nothing where that is not so."""
+    """Why Newton did not find q1 although all shorter steps exist; empty if a shorter step does not exist."""
     if bool(escapes[i]):
         return [f"the motion escapes: q1 grows without bound as h → {float(reach[i])!r}"]
     known = "a solution exists, continued from smaller h, but Newton does not reach it from q0"
     return [known] if bool(reach[i] >= at.h[i]) else []
 
 
-def _with_the_end(reasons: list[str], otherwise: str, size: float) -> list[str]:
-    return [*reasons, f"Newton ended at |q1| = {size:.3g}"] if reasons else [otherwise]
-
-
-def _no_solution(at: Regularity, i: tuple[int, ...], size: float, residual: float) -> str:
+def _no_solution(at: Regularity, i: tuple[int, ...], ended: str, residual: float) -> str:
     margins = {"c": float(at.c[i]), "det M": float(at.M[i])}
     name = min(margins, key=lambda key: margins[key] if margins[key] == margins[key] else 0.0)
     return (
-        f"no q1 was found with FL⁻(q0, q1, s0) = p0: Newton ended at |q1| = {size:.3g}, |J⁻¹F| = {residual:.3g}, "
+        f"no q1 was found with FL⁻(q0, q1, s0) = p0: {ended}, |J⁻¹F| = {residual:.3g}, "
         f"where the margin of {name} ≠ 0 is {margins[name]:.2g}"
     )

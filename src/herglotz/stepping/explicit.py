@@ -1,14 +1,14 @@
 """The step in closed form where the terms of a model allow it: damped leapfrog, no iteration.
 
-With a constant mass m, a potential V, one damping rate (c = e^{−γh}, or 1) and, at the forced level, viscous friction
-b and inputs w = G u, the step equation D1 + c p0 + F⁻ = 0 is linear in Δ = q1 − q0:
+With a constant mass m, a potential V, a single damping rate (c = e^{−γh}, or 1) and, at the forced level, viscous
+friction b and inputs w = G u, the step equation D1 + c p0 + F⁻ = 0 is linear in Δ = q1 − q0:
 
     r  = p0 − h/2 (V′(q0) − w),       (m + √c h/2 b) Δ  =  h √c r,       q1 = q0 + Δ,
     p1 = c r − (1 + c)/2 b Δ − h/2 (V′(q1) − w),
     s1 = s0 + (c − 1) s0 + c/2 Δ·(r − b Δ/2) − h/2 (c V(q0) + V(q1)).
 
-V(q1) and V′(q1) start the next step, so a rollout evaluates the potential once per step; Δ is made without a
-difference of positions, so nothing cancels when h is small.
+V(q1) and V′(q1) start the next step, so a rollout evaluates the potential once per step. Δ is computed without a
+difference of positions, so no digits cancel when h is small.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from herglotz.stepping.state import State, Status
 
 
 class Move(NamedTuple):
-    """The result of an explicit step."""
+    """The result of an explicit step; `there` is the potential at q1."""
 
     delta: Tensor  # (..., n) q1 − q0
     q1: Tensor  # (..., n)
     p1: Tensor  # (..., n)
-    dp: Tensor | None  # (..., n) p1 − p0, made without that difference, where it was asked for
+    dp: Tensor | None  # (..., n) p1 − p0, computed without that difference, if `increments`
     L: Tensor  # (...) s1 − s0
     c: Tensor  # (...)
-    there: Field  # the potential at q1
+    there: Field
 
 
 class _Constants(NamedTuple):
@@ -49,14 +49,15 @@ class _Constants(NamedTuple):
     c_1: Tensor  # (..., 1)
     half_c: Tensor  # (...) c/2
     c_minus_1: Tensor  # (...)
-    inverse: Tensor  # (n, n) or (..., n, n) of m + √c h/2 b, and times h √c where h is one number
+    inverse: Tensor  # (n, n) or (..., n, n) of m + √c h/2 b, and times h √c for a scalar h
     stretch: Tensor | None  # (..., 1) h √c where h is not
 
 
 class Leapfrog:
-    """The explicit step of one model at its present parameters; differentiable by plain autograd.
+    """The explicit step of a model at its present parameters; differentiable by plain autograd.
 
-    `invert` inverts a batch of matrices where `torch.linalg` cannot go; `field` gives V and V′ in place of `FieldOf`.
+    `invert` replaces `torch.linalg` for the inverse of a batch of matrices, and `field` replaces `FieldOf` for V and
+    V′.
     """
 
     def __init__(
@@ -65,7 +66,8 @@ class Leapfrog:
         invert: Callable[[Tensor], Tensor] | None = None,
         field: Callable[[Tensor], Field] | None = None,
     ):
-        assert isinstance(model.kinetic, Kinetic)  # the capabilities say so
+        # The capability `explicit` has a constant mass.
+        assert isinstance(model.kinetic, Kinetic)
         self.model = model
         self.field = FieldOf(model.potential) if field is None else field
         self.mass = model.kinetic.mass()
@@ -78,11 +80,15 @@ class Leapfrog:
     def __call__(
         self, state: State, h: Tensor, here: Field | None = None, u: Tensor | None = None, increments: bool = False
     ) -> Move:
-        """One step; `here` is the field at q0, where the step before has left it; `increments` asks for p1 − p0."""
+        """A step; `here` is the field at q0, if the step before has computed it; `increments` asks for p1 − p0."""
         q0, p0, s0 = state
         k = self.constants(h)
         V0, slope0 = self.field(q0) if here is None else here
-        w = self._applied(u)
+        w = None
+        if u is not None:
+            # A model with inputs has forces.
+            assert self.model.friction is not None
+            w = self.model.friction.applied(u)
         push0 = slope0 if w is None else slope0 - w
         r = torch.addcmul(p0, k.half, push0, value=-1)
         delta = r @ k.inverse if k.inverse.ndim == 2 else (k.inverse * r[..., None, :]).sum(-1)
@@ -129,13 +135,6 @@ class Leapfrog:
             self._regular = bool((self.constants(h).c != 0).all())
         return self._regular
 
-    def _applied(self, u: Tensor | None) -> Tensor | None:
-        """G u, (..., n)."""
-        if u is None:
-            return None
-        assert self.model.friction is not None  # a model with inputs is a forced one
-        return self.model.friction.applied(u)
-
 
 def leapfrog(L_d: DiscreteLagrangian) -> Leapfrog | None:
     """The explicit step of L_d, or None where its terms ask for an iteration."""
@@ -148,8 +147,8 @@ def explicit_status(q1: Tensor, p1: Tensor, s1: Tensor, c: Tensor, regular: bool
         numbers = (*q1.flatten().tolist(), *p1.flatten().tolist(), s1.item())
         if all(map(isfinite, numbers)):
             return None
-    total = (join(q1, p1, s1) * 0).sum(-1)  # 0 where all are finite, else NaN
-    good = total == 0
+    # The sum is 0 where all numbers are finite, else NaN.
+    good = (join(q1, p1, s1) * 0).sum(-1) == 0
     if regular and bool(good.all()):
         return None
     status = torch.where(c == 0, int(Status.SINGULAR), int(Status.CONVERGED))

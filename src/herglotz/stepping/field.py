@@ -1,6 +1,6 @@
-"""V(q) and V′(q) by one forward and one reverse sweep: what an explicit step needs, at a third of a jet's cost.
+"""V(q) and V′(q) of an explicit step by a forward and a reverse sweep, at a third of the cost of a jet.
 
-The jets of `herglotz.models` carry every derivative forward and are the twin that this is tested against.
+The jets of `herglotz.models` carry every derivative forward; a test compares `FieldOf` with them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Field(NamedTuple):
 
 
 class FieldOf:
-    """V and V′ of one potential at its present parameters; plain torch operations, so autograd goes through."""
+    """V and V′ of a potential at its present parameters, by plain torch operations that autograd differentiates."""
 
     def __init__(self, potential: Potential):
         self.stiffness, self.tilt = potential.stiffness, potential.tilt
@@ -36,7 +36,8 @@ class FieldOf:
 
     def __call__(self, q: Tensor) -> Field:
         """At q, (..., n)."""
-        V, slope = self._own(q) if self.across is None else self._own(q @ self.across)  # nothing sees more of q
+        # Springs and network see q only across the translations.
+        V, slope = self._own(q if self.across is None else q @ self.across)
         slope = slope if self.across is None else slope @ self.across
         if self.features is not None:
             more, bend = self.features.value_and_slope(q)
@@ -50,7 +51,8 @@ class FieldOf:
         """Springs and network."""
         k, b = self.stiffness, self.tilt
         x = trigonometry(q, self.angles)
-        rise = numbers(q.dtype, q.device)[1] - x.c  # 1 − cos q, or q²/2
+        # 1 − cos q of an angle, q²/2 of a length.
+        rise = numbers(q.dtype, q.device)[1] - x.c
         if not self.all_angles:
             rise = torch.where(torch.tensor(self.angles, device=q.device), rise, q * q / 2)
         V = rise @ k + x.s @ b

@@ -1,12 +1,12 @@
 """An extended Kalman filter on the step of a model: measured positions in; state, velocity and covariance out.
 
-The twin of `export/runtime/filter.h`, operation by operation. The filter's state x is (q, p), s if the motion
-depends on s, and chosen numbers θ of the model as slow states. Over a step h whose derivative by x is A, forces that
-the model does not know add w²h to the variance of p, half before the step and half after,
+`export/runtime/filter.h` does the same operations in C. The filter's state x is (q, p), s if the motion depends on s,
+and chosen numbers θ of the model as slow states. Over a step h whose derivative by x is A, forces that the model does
+not have add w²h to the variance of p, half before the step and half after,
 
     P ← A (P + W/2) Aᵀ + W/2,        W = diag(0, w² h, 0, w_θ² h),
 
-so that q and p are correlated. Positions y = q + e are taken in singly, as the components of e are independent:
+so that q and p are correlated. The update uses the components of y = q + e one by one, as those of e are independent:
 
     S = P_ii + σ_i²,    x ← x + P_i (y_i − q_i)/S,    P ← P − P_i P_iᵀ/S.
 
@@ -15,7 +15,7 @@ The error of a model differs from motion to motion: the common scale κ of all v
     w ← (1 − a) w + 1,    κ ← κ + (r − 1) κ/w,        r = Σ (y_i − q_i)²/(κ S_i n),
 
 which changes no estimate (a = 0: κ is not learned). A fixed-lag smoother is the same filter of a longer state: x and
-copies of x at the last samples, which steps leave as they are and positions move by their covariance.
+copies of x at the last samples. A step does not change the copies, and an update moves them by their covariance with q.
 `export/runtime/smoother.h` keeps only the blocks of P that change.
 
 Source: A. Gelb (ed.), Applied optimal estimation (1974), sections 4.2 and 6.1; B. D. O. Anderson & J. B. Moore, Optimal
@@ -40,12 +40,13 @@ from herglotz.stepping.stepper import Stepper
 
 
 class Noise(NamedTuple):
-    """Standard deviations, in the units of q, of p a root of time, and of θ a root of time; the last two grow so."""
+    """Standard deviations in the units of q, and of p and θ a root of time: variances of p and θ grow with time."""
 
     position: Sequence[float]  # (n,) of a measured position
     momentum: Sequence[float]  # (n,) of the change of p by unknown forces
-    theta: Sequence[float] = ()  # (K,) of how far the numbers wander
-    adaptation: float = 0.0  # of the common scale of all variances, of which 1/adaptation updates tell; 0: as given
+    theta: Sequence[float] = ()  # (K,) of the drift of the numbers
+    # a of the common scale κ, an average over 1/a updates; 0: variances are as given.
+    adaptation: float = 0.0
 
 
 class Belief(NamedTuple):
@@ -56,8 +57,9 @@ class Belief(NamedTuple):
     # (F, F) of q, p, s if the motion depends on s, and θ, over the scale; (F + FL, F + FL) with earlier samples
     covariance: Tensor
     earlier: Tensor | None = None  # (L, F) the same numbers at the earlier samples, the newest first
-    scale: Tensor | float = 1.0  # of all variances, () or (B,)
-    weight: float = 1.0  # updates that have told the scale
+    scale: Tensor | float = 1.0  # () or (B,) κ, of all variances
+    # w, the number of updates behind the scale.
+    weight: float = 1.0
 
 
 class KalmanFilter:
@@ -70,11 +72,11 @@ class KalmanFilter:
     noise
         Standard deviations.
     parameters
-        Names of numbers of the model, as of `chosen`, that are estimated too.
+        Names of numbers of the model that are estimated too, as `chosen` reads names.
     bounds
         (low, high) of some parameters, by name; the estimates stay within.
     stepper
-        Steps and differentiates the model, with numbers set by `with_parameters`; by default `Stepper`.
+        An `ExportedStepper` of the model with `with_parameters`; by default the model is stepped by `Stepper`.
     """
 
     def __init__(
@@ -83,13 +85,14 @@ class KalmanFilter:
         noise: Noise,
         parameters: Sequence[str] = (),
         bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
-        stepper: Any = None,  # an `ExportedStepper`: this package cannot import `export`
+        stepper: Any = None,
     ):
         self.stepper = stepper
         self.model, self.noise, self.n = model, noise, model.dof
         self.names = chosen(model, parameters)
-        self.kept = 2 * self.n + model.s_enters_motion  # of q, p[, s] in the filter's state
-        self.size = self.kept + len(self.names)  # F
+        # Sizes of q, p[, s] in the filter's state, and F of the whole state.
+        self.kept = 2 * self.n + model.s_enters_motion
+        self.size = self.kept + len(self.names)
         sizes = {"position": self.n, "momentum": self.n, "theta": len(self.names)}
         for name, size in sizes.items():
             row = getattr(noise, name)
@@ -129,7 +132,7 @@ class KalmanFilter:
         return belief._replace(state=found.step.state, covariance=(P + P.T) / 2 + torch.diag(W))
 
     def remember(self, belief: Belief, lag: int) -> Belief:
-        """The belief with the present sample among the earlier ones, of which the last `lag` are kept."""
+        """The belief with the present sample added to the earlier samples, of which the last `lag` are kept."""
         now, size = self._row(belief)[None], self.size
         earlier = now if belief.earlier is None else torch.cat([now, belief.earlier])[:lag]
         every = torch.arange(len(belief.covariance))
@@ -149,7 +152,7 @@ class KalmanFilter:
         return Belief(*self._parts(x, belief.state.s), belief.covariance[own, own], scale=belief.scale)
 
     def update(self, belief: Belief, y: Tensor) -> tuple[Belief, float]:
-        """The belief with measured positions y (n,) taken in, and the squared innovation over its variance, summed.
+        """The belief after measured positions y (n,), and the sum of squared innovations over their variances.
 
         Angles count modulo a turn; θ stays within its bounds. Raise InputError if y is not finite.
         """
@@ -165,7 +168,8 @@ class KalmanFilter:
             surprise += miss * miss / variance
             gain = P[:, i] / variance
             x, P = x + gain * miss, P - torch.outer(gain, gain) * variance
-            P[i] = P[:, i] = gain * own  # without cancellation
+            # P_i − gain P_ii = gain σ², without cancellation.
+            P[i] = P[:, i] = gain * own
         rows = x.reshape(-1, self.size)
         rows[:, self.kept :] = torch.minimum(torch.maximum(rows[:, self.kept :], self.low), self.high)
         earlier, scale, weight = None if belief.earlier is None else rows[1:], float(belief.scale), belief.weight
@@ -181,7 +185,7 @@ class KalmanFilter:
         return torch.cat([torch.cat([q, p, s[None]])[: self.kept], belief.theta])
 
     def _parts(self, x: Tensor, s: Tensor) -> tuple[State, Tensor]:
-        """State and θ of these numbers; s is given if the motion does not depend on s."""
+        """State and θ of the numbers x (F,); `s` is used if the motion does not depend on s."""
         n, kept = self.n, self.kept
         return State(x[:n], x[n : 2 * n], x[2 * n] if kept > 2 * n else s), x[kept:]
 

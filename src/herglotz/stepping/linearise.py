@@ -1,12 +1,12 @@
-"""The derivative of one step, by the implicit-function theorem on the solved step equation.
+"""The derivative of a step, by the implicit-function theorem on the solved step equation.
 
-A step solves F(Δ; q0, p0, s0, h, u) = 0 and hands on q1 = q0 + Δ, p1 and s1 = s0 + L, all functions of Δ and of what
-the step starts from, w = (q0, p0, s0, h, u). Hence
+A step solves F(Δ; q0, p0, s0, h, u) = 0 and returns q1 = q0 + Δ, p1 and s1 = s0 + L, all functions of Δ and of the
+arguments w = (q0, p0, s0, h, u) of the step. Hence
 
     dΔ/dw = −F_Δ⁻¹ F_w,    dp1/dw = p1_w + p1_Δ dΔ/dw,    ds1/dw = ds0/dw + L_w + L_Δ dΔ/dw.
 
-The partial derivatives of F, p1 and L are automatic derivatives of the first-order step equation, forward-mode for a
-model: no model has a line of its own.
+The partial derivatives of F, p1 and L are automatic derivatives of the first-order step equation, in forward mode for a
+model, so that no model needs code of its own.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def linearise(
 ) -> Linearised:
     """The derivatives of a solved step of L_d from `state`; h is a scalar or (...), u is (m,) or (..., m).
 
-    By `numbers` of a model too, K names of `chosen`. Raise InputError if L_d is no model that has them.
+    `numbers` names K numbers of a model, as `chosen` reads names, for the derivatives by these numbers. Raise
+    InputError if L_d is no model with such numbers.
     """
     functions, theta = step_functions(L_d), None
     if numbers:
@@ -73,7 +74,7 @@ def linearise(
 
 
 def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
-    """F, p1 and L of L_d as one pure function of tensors: by terms where the model's terms are known, else by jets."""
+    """F, p1 and L of L_d as a pure function of tensors: by the terms of a model where known, else by jets."""
 
     def functions(
         q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, u: Tensor | None
@@ -89,7 +90,8 @@ def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
         point = form(x, False)
         end, F = form.end(x, point), point.F
         if isinstance(form, PartialsEquation) and point.rest.force is not None and point.rest.force.held is not None:
-            F = torch.where(point.rest.force.held > 0, delta, F)  # a sticking coordinate has Δ = 0
+            # A sticking coordinate has Δ = 0.
+            F = torch.where(point.rest.force.held > 0, delta, F)
         return F, end.p1, end.L
 
     return functions
@@ -101,10 +103,13 @@ def step_jacobian(
     h: Tensor,  # (...)
     delta: Tensor,  # (..., n) the solution of F = 0
     u: Tensor | None,  # (..., m)
-    slopes: Slopes | None = None,  # how to differentiate; default `forward_slopes`
+    slopes: Slopes | None = None,
     theta: Tensor | None = None,  # (K,) shared by all samples: the last argument of `functions`
 ) -> Tensor:
-    """d(q, p, s)′ / d(q, p, s, h, u, θ) at a solved step, (..., 2n+1, 2n+2+m+K): a pure function of tensors."""
+    """d(q, p, s)′ / d(q, p, s, h, u, θ) at a solved step, (..., 2n+1, 2n+2+m+K): a pure function of tensors.
+
+    `slopes` differentiates; default `forward_slopes`.
+    """
     q, p, s = state
     n = q.shape[-1]
     sizes = [n, n, 1, 1, *(() if u is None else (u.shape[-1],)), n]
@@ -122,7 +127,8 @@ def step_jacobian(
         by_start = torch.cat([by_start, forward_slopes(values, point, theta)], -1)
     ddelta = -eliminate(by_delta[..., :n, :], by_start[..., :n, :])
     ends = by_start[..., n:, :] + by_delta[..., n:, :] @ ddelta
-    start = torch.eye(2 * n + 1, by_start.shape[-1], dtype=q.dtype, device=q.device)  # of (q, p, s) itself
+    # The derivative of (q, p, s) itself.
+    start = torch.eye(2 * n + 1, by_start.shape[-1], dtype=q.dtype, device=q.device)
     return torch.cat([ddelta + start[:n], ends[..., :n, :], ends[..., n:, :] + start[2 * n :]], -2)
 
 
@@ -132,12 +138,13 @@ def step_pull(
     h: Tensor,  # (...)
     delta: Tensor,  # (..., n) the solution of F = 0
     u: Tensor | None,  # (..., m)
-    after: Tensor,  # (..., 2n+1) derivatives of a number by (q, p, s) after the step
+    after: Tensor,  # (..., 2n+1) derivatives of a scalar by (q, p, s) after the step
     theta: Tensor | None = None,  # (K,) shared by all samples: the last argument of `functions`
 ) -> tuple[Tensor, Tensor | None]:
-    """Its derivatives by (q, p, s, h, u), (..., 2n+2+m), and by θ, (K,) summed over samples: `step_jacobian`ᵀ times it.
+    """The derivatives of the scalar by (q, p, s, h, u), (..., 2n+2+m), and by θ, (K,) summed over samples.
 
-    Reverse mode: with r = ∂/∂q1 + p1_Δᵀ ∂/∂p1 + L_Δ ∂/∂s1 and F_Δᵀ λ = r, they are those of p1ᵀ∂/∂p1 + L ∂/∂s1 − Fᵀλ.
+    They are `step_jacobian`ᵀ `after`, in reverse mode: with r = ∂/∂q1 + p1_Δᵀ ∂/∂p1 + L_Δ ∂/∂s1 and F_Δᵀ λ = r, they
+    are the derivatives of p1ᵀ∂/∂p1 + L ∂/∂s1 − Fᵀλ.
     """
     q, p, s = state
     n, more = q.shape[-1], () if theta is None else (theta,)
@@ -162,23 +169,25 @@ def forward_slopes(values: Callable[..., Tensor], *points: Tensor) -> Tensor:
     """The Jacobian (..., m, k) of `values`(..., x) → (..., m) by its last point, (..., k) or (k,), in forward mode."""
     *first, point = points
     directions = torch.eye(point.shape[-1], dtype=point.dtype, device=point.device)
-    # torch 2.x ends the process in `addcmul` where only one of its arguments has a tangent: the others get zeros.
+    # torch 2.x ends the process in `addcmul` if a single argument has a tangent: the other arguments get zero tangents.
     still = [torch.zeros_like(x) for x in first]
     along = lambda t: torch.func.jvp(values, points, (*still, t.expand_as(point)))[1]  # noqa: E731
-    with warnings.catch_warnings():  # torch's own use of torch.jit, when it first loads forward-mode derivatives
+    # torch itself uses torch.jit when forward-mode derivatives are first loaded.
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`torch.jit.script` is", DeprecationWarning)
         return torch.func.vmap(along)(directions).movedim(0, -1)
 
 
 def eliminate(A: Tensor, b: Tensor) -> Tensor:
-    """A⁻¹ b by elimination with row exchanges, written out: ONNX has no solve, AOTInductor calls it slowly.
+    """A⁻¹ b by elimination with row exchanges, written out: ONNX has no solve, and AOTInductor's is slow.
 
     A is (..., n, n), with a small n, and b (..., n, k); inf or nan where A is singular.
     """
     n = b.shape[-2]
     if n == 1:
         return b / A
-    if n == 2:  # Cramer's rule: half of the operations
+    if n == 2:
+        # Cramer's rule: half of the operations.
         (a, c), (d, e) = ((A[..., i, :1], A[..., i, 1:]) for i in range(2))
         (f, g), rate = b.unbind(-2), 1 / (a * e - c * d)
         return torch.stack([(e * f - c * g) * rate, (a * g - d * f) * rate], -2)

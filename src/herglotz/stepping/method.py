@@ -16,10 +16,13 @@ from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, 
 
 
 class OneStepMethod(ABC):
-    """A stepper of states (q, p, s). A concrete stepper implements `step`; rollouts are the same for all steppers."""
+    """A stepper of states (q, p, s). A concrete stepper implements `step`; rollouts are the same for all steppers.
 
-    throw: bool = False  # raise `StepError` at the first sample that fails
-    iterates: bool = False  # whether steps want a guess
+    With `throw` the first sample that fails raises `StepError`; `iterates` says whether steps want a guess.
+    """
+
+    throw: bool = False
+    iterates: bool = False
 
     @abstractmethod
     def step(self, state: Any, h: Tensor | float, guess: Tensor | None = None) -> Step:
@@ -54,13 +57,13 @@ class OneStepMethod(ABC):
         inputs
             (K, m) or (..., K, m): u_k of each step, for an L_d with `at(u)`.
         every
-            Keep each m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
+            m: keep every m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
         events
             `Event`s, or functions of the state; a sample stops where a function changes sign. A stopped sample keeps
             its state at the event, with `Status.STOPPED`. The time of an event is a constant for the gradient.
         checkpoint
-            Length of the segments whose inner steps the backward pass computes again: with K steps, memory for about
-            K / length + length steps instead of K. Without gradients `checkpoint` has no effect.
+            Length of the segments whose inner steps the backward pass computes again: K steps then need memory for
+            about K / length + length steps. Without gradients `checkpoint` has no effect.
         chunk
             Number of steps that are gathered before writing into the result.
 
@@ -94,7 +97,7 @@ class OneStepMethod(ABC):
         watch: Watch | None = None,
         **plan: Any,
     ) -> Track:
-        """The rollout of a named tuple of tensors, the last of shape (...); exported files have a loop of their own."""
+        """The rollout of a named tuple of tensors, the last of shape (...); exported files replace this loop."""
         h_all = step_sizes(check_h(h, start[-1]), steps)
         if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
             raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
@@ -110,7 +113,7 @@ class OneStepMethod(ABC):
         raise InputError(f"{type(self).__name__} takes no inputs, got {tuple(inputs.shape)}; leave them out")
 
     def _single_step(self) -> OneStep:
-        """The function that a rollout's steps are taken by."""
+        """The function that takes the steps of a rollout."""
         return lambda state, h, guess, u, low: (self.step(state, h, guess), None)  # noqa: ARG005  same signature for all
 
     def _check_step(self, step: Step, state: Any, h: Tensor, u: Tensor | None) -> None:  # noqa: ARG002

@@ -15,15 +15,16 @@ from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquat
 from herglotz.stepping.state import State, Status
 from herglotz.stepping.stick_slip import StickSlip, at_rest, sticks
 
-ROUNDING = 1e3  # machine epsilons of the size: below that a move is rounding
+# Machine epsilons of the size of a sample below which a Newton step is rounding.
+ROUNDING = 1e3
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The solved step; `P` is evaluated at q1, so nothing has to be computed again."""
+    """The solved step; `P`, of order 2, is evaluated at q1, so a caller computes no partial derivative again."""
 
     q1: Tensor  # (..., n)
-    P: Partials  # of order 2
+    P: Partials
     status: Tensor  # (...) Status values, uint8
     residual: Tensor  # (...) |J⁻¹F|, the error left in q1, in units of q
     iterations: int
@@ -39,8 +40,8 @@ def solve_step(
 ) -> Solution:
     """Solve F(q1) = D1 L_d(q0, q1, s0) + c p0 = 0 for q1 (FL⁻ inverted; never through H⁺, erratum E4).
 
-    A sample has converged when its next Newton step is below `tol` times the size of its positions. Samples do not
-    influence one another: each has its own Jacobian, its own step length and its own status.
+    A sample has converged when its next Newton step is below `tol` times the size of its positions. Samples are
+    independent: each has its own Jacobian, its own step length and its own status.
     """
     found = find_root(PartialsEquation(L_d, state, h, 2, False), guess, tol, max_iterations, 2)
     P = found.point.rest
@@ -49,10 +50,10 @@ def solve_step(
 
 
 def find_root(equation: StepEquation, guess: Tensor, tol: float, max_iterations: int, order: int) -> Found:
-    """The iteration of a step for its equation.
+    """Solve a step equation by Newton's iteration.
 
-    With `order` 2 every Jacobian is fresh, the last one too. With `order` 1, an iteration that starts close to the
-    solution keeps its Jacobian and costs first derivatives only; the answer is the same to `tol`.
+    With `order` 2 every Jacobian is fresh, the last Jacobian too. With `order` 1, an iteration that starts close to the
+    solution keeps its Jacobian and costs first derivatives only; the solution is the same to `tol`.
     """
     sizes = _Sizes(equation)
     if sticks(equation):
@@ -71,12 +72,12 @@ def find_root(equation: StepEquation, guess: Tensor, tol: float, max_iterations:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """The size that steps are compared with: of the positions or, in increments, of the increment; and of rounding."""
+    """The scale of the tolerance (the size of the positions or, in increments, of the increment), and of rounding."""
 
     equation: StepEquation
 
     def tensors(self, x: Tensor, point: Point, left: Tensor) -> tuple[Tensor, Tensor]:
-        """(...) each; see `herglotz.mechanics.newton`."""
+        """Both scales, (...) each; see `herglotz.mechanics.newton`."""
         own = self.equation.increments
         size = largest(x) + largest(solve(point.J, self.equation.push(point))) if own else largest(self.equation.q0)
         scale = torch.maximum(size, torch.maximum(largest(x), left))
@@ -85,7 +86,7 @@ class _Sizes:
         return scale, ROUNDING * limits.eps * torch.maximum(scale, self.equation.typical_increment())
 
     def numbers(self, x: Tensor, point: Point, left: float) -> tuple[float, float]:
-        """The same of one sample."""
+        """Both scales of a single sample."""
         size = norm(x.flatten().tolist())
         if self.equation.increments:
             other = newton_step(point.J, self.equation.push(point))[2] + size
@@ -97,12 +98,12 @@ class _Sizes:
 
 
 def _least(limits: torch.finfo) -> float:
-    """The smallest size: tolerances of denormal size would keep a motion from coming to rest."""
+    """The smallest scale: a tolerance of denormal size would keep a motion from coming to rest."""
     return limits.tiny / limits.eps
 
 
 def status_of(found: Found, end: End) -> tuple[Tensor, bool]:
-    """The status of each sample, and whether all of them have converged."""
+    """The status of each sample, and whether all samples have converged."""
     merit, residual, done, L, c = found.merit, found.residual, found.done, end.L, end.c
     if found.healthy:
         good = isfinite(L.item()) and c.item() != 0

@@ -26,7 +26,7 @@ class End(NamedTuple):
     p1: Tensor  # (..., n)
     L: Tensor  # (...) s1 − s0
     c: Tensor  # (...)
-    dp: Tensor | None = None  # (..., n) p1 − p0, made without that difference, where it is known
+    dp: Tensor | None = None  # (..., n) p1 − p0 if computed without that difference
 
 
 class StepEquation(Protocol):
@@ -48,8 +48,13 @@ class StepEquation(Protocol):
         ...
 
     def typical_increment(self) -> Tensor:
-        """The size that the rounding of F, over J, is relative to even at rest, (...); 0 where nothing is known."""
+        """The size (...) to which the rounding of J⁻¹F is relative even at rest; 0 if unknown."""
         ...
+
+
+def partials_at(L_d: Any, q0: Tensor, x: Tensor, s0: Tensor, h: Tensor, order: int, increments: bool) -> Partials:
+    """The partials of L_d at (q0, x) or, in increments, at (q0, q0 + x), which L_d then has to offer."""
+    return L_d.partials_increment(q0, x, s0, h, order) if increments else partials(L_d, q0, x, s0, h, order)
 
 
 class PartialsEquation:
@@ -58,17 +63,14 @@ class PartialsEquation:
     def __init__(self, L_d: DiscreteLagrangian, state: State, h: Tensor, order: int, increments: bool):
         self.L_d, self.h, self.order, self.increments = L_d, h, order, increments
         self.q0, self.p0, self.s0 = state
+        # Whether dry friction can hold a coordinate.
         made_of = capabilities(L_d)
-        self.sticking = made_of is not None and made_of.sticking  # dry friction can hold a coordinate
+        self.sticking = made_of is not None and made_of.sticking
 
     def __call__(self, x: Tensor, second: bool) -> Point:
         """See `StepEquation`."""
         order = 2 if second else self.order
-        if self.increments:
-            form: Any = self.L_d  # whoever asks for increments has checked
-            P: Partials = form.partials_increment(self.q0, x, self.s0, self.h, order)
-        else:
-            P = partials(self.L_d, self.q0, x, self.s0, self.h, order)
+        P = partials_at(self.L_d, self.q0, x, self.s0, self.h, order, self.increments)
         return Point(momentum_residual(P, self.p0), momentum_jacobian(P, self.p0) if order == 2 else None, P)
 
     def push(self, point: Point) -> Tensor:

@@ -1,6 +1,6 @@
 """Many steps: inputs, decimation, events, and memory that does not grow with the number of steps.
 
-A rollout is a chain of segments. A segment steps `Carry` to `Carry` and returns a block of kept states. Without
+A rollout is a chain of segments. A segment steps `Carry` to `Carry` and returns a block of kept entries. Without
 gradients a block is written into buffers made beforehand; with `checkpoint` a segment saves its start only, and the
 backward pass runs the segment again.
 """
@@ -23,25 +23,26 @@ from herglotz.stepping.events import Watch
 from herglotz.stepping.guess import LENGTH, Extrapolation
 from herglotz.stepping.state import Crossings, Status, Step, StepError
 
-PROGRESS_AFTER = 2.0  # seconds of a rollout before a progress bar appears
+# Seconds of a rollout before a progress bar appears: a shorter wait needs none.
+PROGRESS_AFTER = 2.0
 
 
 class Carry(NamedTuple):
-    """The data that a step hands to the next step."""
+    """The data that a step hands to the next step.
 
-    state: Any  # `State`, or another named tuple of tensors whose first entry is the position
-    trail: tuple[Tensor, ...]  # the last positions, for the guess
+    `state` is a `State`, or another named tuple of tensors with the position first; `trail` has the last positions, for
+    the guess; `low` is the rounding that the state has lost so far (compensated sums), if increments are known.
+    """
+
+    state: Any
+    trail: tuple[Tensor, ...]
     sigma: Tensor  # (...)
-    low: Any  # rounding lost by the state so far (compensated sums), if increments are known
+    low: Any
 
 
-class Block(NamedTuple):
-    """The kept entries of a segment of steps, time first: the entries of a step are contiguous in a buffer."""
-
-    states: tuple[Tensor, ...]  # (N, ..., *) each
-    sigma: Tensor  # (N, ...)
-    status: Tensor  # (N, ...)
-    residual: Tensor  # (N, ...)
+# The kept entries of N steps: the parts of the state, σ, status and residual, (N, ..., *) each. Time is first, so that
+# the entries of a step are contiguous in a buffer.
+Block = tuple[Tensor, ...]
 
 
 class Track(NamedTuple):
@@ -57,7 +58,8 @@ class Track(NamedTuple):
 
 # (state, h, guess, u, low) → the step and its `low`; a guess of None is the step's own.
 OneStep = Callable[[Any, Tensor, Tensor | None, Tensor | None, Any], tuple[Step, Any]]
-Check = Callable[[Step, Any, Tensor, Tensor | None], None]  # (step, state, h, u), raises `StepError`
+# (step, state, h, u) → nothing, or `StepError`
+Check = Callable[[Step, Any, Tensor, Tensor | None], None]
 
 
 @dataclass(frozen=True)
@@ -87,16 +89,19 @@ class Plan:
 
 @dataclass(frozen=True)
 class Drive:
-    """The arguments of a rollout."""
+    """The arguments of a rollout.
 
-    # Makes the function that takes a step; called once for each segment, so that its steps may share work.
+    `single_step` makes the function that takes a step; a segment calls it once, so that its steps may share work.
+    `extrapolate` says whether the steps want a guess.
+    """
+
     single_step: Callable[[], OneStep]
     h: Tensor  # (..., K) all steps
     plan: Plan
     inputs: Tensor | None = None  # (..., K, m)
     watch: Watch | None = None
-    extrapolate: bool = True  # whether the steps want a guess
-    check: Check | None = None  # looks at every step and raises
+    extrapolate: bool = True
+    check: Check | None = None
 
     @cached_property
     def guess(self) -> Extrapolation:
@@ -145,13 +150,11 @@ def roll_out(start: Any, drive: Drive) -> Track:
             _write(blocks[0], block, ks.start // plan.every)
     if progress is not None:
         progress.close()
-    parts = [_flat(block) for block in blocks]
-    *states, sigma, status, residual = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
-    axis = sigma.ndim - 1  # the time's axis, behind the batch's
+    whole = blocks[0] if len(blocks) == 1 else map(torch.cat, zip(*blocks, strict=True))
+    # Time moves behind the axes of the batch.
+    *states, sigma, status, residual = (x.movedim(0, carry.sigma.ndim) for x in whole)
     events = () if drive.watch is None else drive.watch.crossings(carry.state)
-    move = lambda x: x.movedim(0, axis)  # noqa: E731
-    track = Track(tuple(map(move, states)), move(sigma), move(status), move(residual), events)
-    return without_lost_factors(track)
+    return without_lost_factors(Track(tuple(states), sigma, status, residual, events))
 
 
 def without_lost_factors(track: Track) -> Track:
@@ -168,7 +171,7 @@ def without_lost_factors(track: Track) -> Track:
 def _segment(carry: Carry, ks: range, drive: Drive, progress: ProgressBar | None = None) -> tuple[Carry, Block]:
     """Take the steps `ks`."""
     single, every, watch = drive.single_step(), drive.plan.every, drive.watch
-    kept = [(*carry.state, carry.sigma)] if ks.start == 0 else []
+    kept = [] if ks.start else [(*carry.state, carry.sigma)]
     results: list[tuple[Tensor, Tensor]] = []
     for k in ks:
         state, trail, sigma, low = carry
@@ -189,23 +192,16 @@ def _segment(carry: Carry, ks: range, drive: Drive, progress: ProgressBar | None
             kept.append((*state, sigma))
         if progress is not None:
             progress.update()
-    *states, sigma = (torch.stack(x) for x in zip(*kept, strict=True))
-    return carry, Block(tuple(states), sigma, *(torch.stack(x) for x in zip(*results, strict=True)))
+    return carry, tuple(torch.stack(x) for entries in (kept, results) for x in zip(*entries, strict=True))
 
 
-def _flat(block: Block) -> tuple[Tensor, ...]:
-    return (*block.states, *block[1:])
-
-
-def _buffers(block: Block, entries: int) -> Block:
-    """Room for a whole rollout."""
-    room = lambda x, count: x.new_empty(count, *x.shape[1:])  # noqa: E731
-    states = tuple(room(x, entries + 1) for x in block.states)
-    return Block(states, room(block.sigma, entries + 1), room(block.status, entries), room(block.residual, entries))
+def _buffers(first: Block, entries: int) -> Block:
+    """Room for a whole rollout; state and σ have the start in front, like those of the first block."""
+    return tuple(x.new_empty(entries + len(x) - len(first[-1]), *x.shape[1:]) for x in first)
 
 
 def _write(buffers: Block, block: Block, start: int) -> None:
-    ahead = len(block.states) + 1  # states and σ have the start in front
-    for i, (buffer, values) in enumerate(zip(_flat(buffers), _flat(block), strict=True)):
-        offset = start + (i < ahead and start > 0)
+    """Write the block of the steps from entry `start` on."""
+    for buffer, values in zip(buffers, block, strict=True):
+        offset = start + (start > 0 and len(buffer) > len(buffers[-1]))
         buffer[offset : offset + len(values)] = values

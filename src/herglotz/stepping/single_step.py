@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian, Driven, Partials, momentum_plus, momentum_residual, partials
+from herglotz.mechanics import DiscreteLagrangian, Driven, momentum_plus, momentum_residual
 from herglotz.mechanics.newton import Found, attached
 from herglotz.mechanics.regularity import regularity
 from herglotz.stepping.equation import ModelEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.field import Field
 from herglotz.stepping.newton import find_root, status_of
-from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
+from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation, partials_at
 from herglotz.stepping.state import State, Status, Step
 
-# Steps below this part of a model's time, typical q over typical v, are solved for Δ: p ~ mΔ/h then would have a
-# relative error of eps/SHORT = 2e-10 (7e-13 were measured at h = 1e-3 times, 1e-9 at 1e-6, 1e-3 at 1e-12).
+# Steps shorter than this part of a model's time, typical q over typical v, are solved for Δ. Solved for q1, p ~ mΔ/h
+# has a relative error of eps/h: measured were 7e-13 at h = 1e-3, 1e-9 at 1e-6 and 1e-3 at 1e-12 of that time.
 SHORT = 1e-6
 
 
 class SingleStep:
-    """Steps whose inputs are already checked; keeps the force at the point that consecutive steps share.
+    """Steps whose arguments are already checked; keeps the force at the position that consecutive steps share.
 
     In float32, and at very short h, the unknown is the increment Δ = q1 − q0 if L_d offers increments, and rollouts
     add Δ by compensated summation: q1 − q0 and q0 + Δ would round away a small step.
@@ -33,17 +33,23 @@ class SingleStep:
     def __init__(self, L_d: DiscreteLagrangian, tol: float | None, max_iterations: int, explicit: bool):
         self.L_d, self.tol, self.max_iterations = L_d, tol, max_iterations
         self.leapfrog: Leapfrog | None = leapfrog(L_d) if explicit else None
-        self._field: Field | None = None  # the potential at self._at
+        # A position, and the potential there.
         self._at: Tensor | None = None
-        self._terms: ModelEquation | None = None  # made at the first step that iterates
-        self._tried = False
-        self._short: tuple[Tensor, bool] | None = None  # the last h, and whether that h is short
-        self._fine: tuple[Tensor, Tensor] | None = None  # the status and the residual of explicit steps
+        self._field: Field | None = None
+        # The last h, and whether that h is short.
+        self._short: tuple[Tensor, bool] | None = None
+        # The status and the residual of explicit steps that succeed.
+        self._fine: tuple[Tensor, Tensor] | None = None
+
+    @cached_property
+    def _terms(self) -> ModelEquation | None:
+        """The step equations by terms, for an L_d with known terms."""
+        return model_equation(self.L_d)
 
     def __call__(
         self, state: State, h: Tensor, guess: Tensor | None = None, u: Tensor | None = None, low: State | None = None
     ) -> tuple[Step, State | None]:
-        """The step with input u, and the rounding errors to carry on; `low` has those of the step before."""
+        """The step with input u, and its rounding errors; `low` are the rounding errors of the step before."""
         if self.leapfrog is not None:
             return self._explicit(self.leapfrog, state, h, u, low)
         return self._implicit(state, h, state.q if guess is None else guess, u, low)
@@ -77,11 +83,15 @@ class SingleStep:
         tol = self.tol if self.tol is not None else 4 * torch.finfo(q0.dtype).eps
         order = 2 if torch.is_grad_enabled() else 1
         with torch.no_grad():
-            equation = self._equation(L_d, state, h, u, increments, order)
+            if self._terms is None:
+                equation: StepEquation = PartialsEquation(L_d, state, h, order, increments)
+            else:
+                equation = self._terms.at(state, h, u, increments, self._field if self._at is state.q else None)
             found = find_root(equation, guess, tol, self.max_iterations, order)
             end = equation.end(found.x, found.point)
             status, good = status_of(found, end)
-            if isinstance(equation, PartialsEquation):  # the terms of a model have no pole in h
+            # The terms of a model have no pole in h.
+            if isinstance(equation, PartialsEquation):
                 status = _at_pole(L_d, state, h, q0 + found.x if increments else found.x, found, status)
                 good = good and not bool(status.any())
         x = found.x
@@ -93,7 +103,8 @@ class SingleStep:
             new = new._replace(p=end.p1) if end.dp is None else new
         else:
             new = State(x, end.p1, s0 + end.L)
-        if good:  # the equation is solved; a number of the new state may still be too large, or s0 NaN
+        # The equation is solved, but a number of the new state may be too large, or s0 NaN.
+        if good:
             with torch.no_grad():
                 unseen = explicit_status(*new, end.c, True)
             status, good = (status, True) if unseen is None else (unseen, False)
@@ -110,16 +121,6 @@ class SingleStep:
             self._short = h, bool((h < SHORT * time).any())
         return q0.element_size() < 8 or self._short[1]
 
-    def _equation(
-        self, L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, increments: bool, order: int
-    ) -> StepEquation:
-        """The step equation: by terms for a model, else by the partials of L_d."""
-        if not self._tried:
-            self._tried, self._terms = True, model_equation(self.L_d)
-        if self._terms is None:
-            return PartialsEquation(L_d, state, h, order, increments)
-        return self._terms.at(state, h, u, increments, self._field if self._at is state.q else None)
-
 
 def driven_by(L_d: DiscreteLagrangian, u: Tensor | None) -> DiscreteLagrangian:
     """The discrete Lagrangian of a step with input u; raise InputError if there is an input and L_d takes none."""
@@ -133,8 +134,8 @@ def driven_by(L_d: DiscreteLagrangian, u: Tensor | None) -> DiscreteLagrangian:
 def _at_pole(L_d: DiscreteLagrangian, state: State, h: Tensor, q1: Tensor, found: Found, status: Tensor) -> Tensor:
     """The status of every sample, SINGULAR where L_d has a pole at this h: q1 is right there, p1 and s1 are rounding.
 
-    |F| / |J⁻¹F| estimates |J| at no cost, and eps |J| |q| the rounding of p1. Only if that rounding leaves p1 less than
-    a third of its digits, as also for a body almost at rest, L_d is evaluated at neighbours of h.
+    |F| / |J⁻¹F| estimates |J| at no cost, and eps |J| |q| estimates the rounding of p1. L_d is evaluated at neighbours
+    of h only if that rounding leaves p1 less than a third of its digits, which also happens for a body almost at rest.
     """
     q0, p0, s0 = state
     size = torch.maximum(q0.abs(), q1.abs()).amax(-1)
@@ -153,26 +154,19 @@ def _attach(
 ) -> tuple[Tensor, End]:
     """Attach the derivative to the solved x: a Newton step of value zero and slope dx = −J⁻¹ dF."""
     q0, p0, s0 = state
-    P = _evaluate(L_d, q0, x, s0, h, increments)
+    P = partials_at(L_d, q0, x, s0, h, 1, increments)
     F = momentum_residual(P, p0)
-    if P.force is not None and P.force.held is not None and not increments:  # a sticking coordinate has q1 = q0
+    # A sticking coordinate has q1 = q0.
+    if P.force is not None and P.force.held is not None and not increments:
         F = F + torch.where(P.force.held > 0, J.diagonal(0, -2, -1) * (x - q0), 0.0)
-    if F.requires_grad:  # an argument, or a parameter of L_d
+    if F.requires_grad:
         x = attached(x, J, F)
-        P = _evaluate(L_d, q0, x, s0, h, increments)
+        P = partials_at(L_d, q0, x, s0, h, 1, increments)
     return x, End(momentum_plus(P), P.L, P.c)
 
 
-def _evaluate(L_d: DiscreteLagrangian, q0: Tensor, x: Tensor, s0: Tensor, h: Tensor, increments: bool) -> Partials:
-    """First derivatives at (q0, x) or, in increments, at (q0, q0 + x)."""
-    if increments:
-        form: Any = L_d  # whoever asks for increments has checked
-        return form.partials_increment(q0, x, s0, h, 1)
-    return partials(L_d, q0, x, s0, h)
-
-
 def _compensated(state: State, change: State, low: State | None) -> tuple[State, State]:
-    """Kahan's sum: state + change, and the rounding error, to be added to the next change."""
+    """Kahan's sum state + change, and its rounding error, which is to be added to the next change."""
     wanted = change if low is None else State(*(a + b for a, b in zip(change, low, strict=True)))
     new = State(*(a + b for a, b in zip(state, wanted, strict=True)))
     with torch.no_grad():

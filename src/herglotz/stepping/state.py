@@ -19,12 +19,18 @@ class Status(IntEnum):
     """The end of the solve for a step."""
 
     CONVERGED = 0
-    MAX_ITERATIONS = 1  # no convergence within the allowed iterations
-    SINGULAR = 2  # det J = 0 (or c = 0): the step is not defined there, erratum E4
-    DIVERGED = 3  # an input, or a number of the state before or after the step, is not finite
-    STOPPED = 4  # no failure: a terminal event ended the trajectory in or before this step
-    BAD_INPUT = 5  # h is no step: of exported files by themselves, for a stepper raises
-    UNRESOLVED = 6  # solved, but h does not see the motion: set by `tune.flag_unresolved`, never by a stepper
+    # No convergence within the allowed iterations.
+    MAX_ITERATIONS = 1
+    # det J = 0 or c = 0: the step is not defined there, erratum E4.
+    SINGULAR = 2
+    # An input, or a number of the state before or after the step, is not finite.
+    DIVERGED = 3
+    # No failure: a terminal event ended the trajectory in or before this step.
+    STOPPED = 4
+    # h is not positive and finite, in an exported file; a stepper raises an error instead.
+    BAD_INPUT = 5
+    # Solved, but h does not resolve the motion: set by `tune.flag_unresolved`, never by a stepper.
+    UNRESOLVED = 6
 
 
 class StepError(RuntimeError):
@@ -68,7 +74,8 @@ def state_of(x: Tensor) -> State:
 class Step:
     """A step: the new state, its status and its residual."""
 
-    state: Any  # `State`, or `herglotz.theory.BodyState`
+    # `State`, or `herglotz.theory.BodyState`.
+    state: Any
     c: Tensor  # (...) conformal factor of the step
     status: Tensor  # (...) Status values
     residual: Tensor  # (...) |J⁻¹F| of the step equation, in units of q
@@ -101,9 +108,10 @@ class Crossings:
 
 @dataclass(frozen=True, repr=False)
 class Rollout:
-    """A trajectory of K steps; entry 0 is the start. Everything after a failed step is NaN, with its status.
+    """A trajectory of K steps; entry 0 is the start. All entries after a failed step are NaN, with its status.
 
-    With `every=m` an entry stands for m steps, and status and residual are the worst of the m steps.
+    With `every=m` an entry stands for m steps, and status and residual are the worst of the m steps. `events` has the
+    crossings of each event.
     """
 
     q: Tensor  # (..., K+1, n)
@@ -112,7 +120,7 @@ class Rollout:
     sigma: Tensor  # (..., K+1) accumulated conformal factor σ_k = ∏ c_j
     status: Tensor  # (..., K)
     residual: Tensor  # (..., K)
-    events: tuple[Crossings, ...] = ()  # the crossings of each event
+    events: tuple[Crossings, ...] = ()
     outside: Tensor | None = None  # (..., K) of an exported file: 1 where a step leaves the box it was fitted in
 
     def __repr__(self) -> str:
@@ -148,14 +156,15 @@ def check_batch(states: tuple[Tensor, Tensor, Tensor]) -> State:
 def check_state(
     state: State, L_d: Any = None, names: tuple[str, str, str] = ("q", "p", "s"), finite: bool = False
 ) -> State:
-    """The same state.
+    """Return the state.
 
-    Raise InputError if shapes or dtypes fit neither each other nor the parameters of L_d (of an exported file: `dof`
+    Raise InputError if shapes or dtypes do not fit one another and the parameters of L_d (of an exported file: `dof`
     and `dtype`); with `finite`, also if a number is not finite.
     """
     q, p, s = state
     check_arguments(q, p, s, names)
-    if q.dtype not in (torch.float32, torch.float64):  # linear solves know no others, and 8 bits no increments
+    # Linear solves of torch have no other dtypes.
+    if q.dtype not in (torch.float32, torch.float64):
         raise InputError(
             f"{names[0]} must be floating point of 32 or 64 bits, got {q.dtype}; convert it with .double()"
         )
@@ -177,7 +186,7 @@ def check_state(
 
 
 def check_started(state: State) -> State:
-    """The same state, made by `init`; raise StepError if any of its numbers is not finite."""
+    """Return a state that `init` made; raise StepError if any of its numbers is not finite."""
     good = torch.isfinite(state.p).all(-1) & torch.isfinite(state.s)
     if not bool(good.all()):
         sample = tuple(int(i) for i in (~good).nonzero()[0])
@@ -186,7 +195,7 @@ def check_started(state: State) -> State:
 
 
 def check_moving(v: Tensor, status: Tensor) -> Tensor:
-    """The same velocities; raise StepError for the first sample that has none."""
+    """Return the velocities; raise StepError for the first sample without a velocity."""
     if bool((lost := status != Status.CONVERGED).any()):
         sample = tuple(int(i) for i in lost.nonzero()[0])
         raise StepError(

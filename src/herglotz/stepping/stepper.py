@@ -104,7 +104,7 @@ class Stepper(OneStepMethod):
     def init_qv(self, q: Tensor, v: Tensor, s: Tensor | None = None, h: Tensor | float = 1.0) -> State:
         """The state (q, p, s) of a position and a velocity: p = L_v(q, v, s) of the model's L = lim L_d/h, h → 0.
 
-        Source: section 9 of `docs/trajectory.md`; `herglotz.stepping.velocity` has what stands for it elsewhere.
+        Source: section 9 of `docs/trajectory.md`; `herglotz.stepping.velocity` defines p for an L_d that is no model.
 
         Parameters
         ----------
@@ -113,8 +113,8 @@ class Stepper(OneStepMethod):
         s
             (...) action, in the unit of L_d; left out: 0 (a choice of gauge).
         h
-            () or (...) step of the motion that starts here, in the unit of time. It matters where dry friction is
-            set-valued, and where L_d is no model.
+            () or (...) step of the motion that starts here, in the unit of time. h matters where dry friction
+            is set-valued, and where L_d is no model.
 
         Returns
         -------
@@ -162,7 +162,7 @@ class Stepper(OneStepMethod):
         return check_moving(v, status)
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
-        """One step: solve p = −D1 L_d / c for q1, then p1 = D2 L_d and s1 = s + L_d.
+        """Take a step: solve p = −D1 L_d / c for q1, then p1 = D2 L_d and s1 = s + L_d.
 
         Source: section 1 of `docs/mathematics.md`.
         Differentiable with respect to the state, h, u and the parameters of L_d by the implicit-function theorem,
@@ -198,9 +198,9 @@ class Stepper(OneStepMethod):
     def linearise(
         self, state: State, h: Tensor | float, u: Tensor | None = None, parameters: Sequence[str] = ()
     ) -> Linearised:
-        """One step with its derivative d(q, p, s)′ / d(q, p, s, h, u, θ), by the implicit-function theorem.
+        """Take a step with its derivative d(q, p, s)′ / d(q, p, s, h, u, θ), by the implicit-function theorem.
 
-        That is ∂q1/∂p = −c M⁻¹ and what follows from it (erratum E4 of `docs/mathematics.md`).
+        All derivatives follow from ∂q1/∂p = −c M⁻¹ (erratum E4 of `docs/mathematics.md`).
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class Stepper(OneStepMethod):
         Linearised
             `by_state` (..., 2n+1, 2n+1), `by_h` (..., 2n+1), `by_input` (..., 2n+1, m) or None, `by_parameters`
             (..., 2n+1, K), or None where none are named, and the step itself;
-            a derivative has the unit of what is derived over that of what it is derived by.
+            the unit of ∂a/∂b is the unit of a over the unit of b.
 
         Raises
         ------
@@ -263,7 +263,7 @@ class Stepper(OneStepMethod):
         return inputs
 
     def _check_step(self, step: Step, state: State, h: Tensor, u: Tensor | None) -> None:
-        """With `throw`, raise `StepError` if a sample failed, with the condition that it failed on."""
+        """With `throw`, raise `StepError` if a sample failed, with the condition that does not hold."""
         if not self.throw:
             return
         try:

@@ -1,12 +1,12 @@
-"""The step equation with set-valued dry friction, as one single-valued equation that Newton's iteration solves.
+"""The step equation with set-valued dry friction, as a single-valued equation that Newton's iteration solves.
 
 F(Δ) + λ = 0 with λ ∈ −w Sgn(Δ), w = c h (τ + ε) the impulse that friction can hold, is an inclusion. Each point (Δ, λ)
-of the graph of Sgn is given by one number z = Δ − λ/K for any K > 0 (Minty's parametrisation):
+of the graph of Sgn is given by a single number z = Δ − λ/K for any K > 0 (Minty's parametrisation):
 
     Δ = z − clamp(z, −w/K, w/K),    λ = −K (z − Δ).
 
-A coordinate that slides has Δ ≠ 0 and λ = ∓w, which the forces at Δ hold already; one that sticks has Δ = 0 and
-λ = −K z. So z solves
+A coordinate that slides has Δ ≠ 0 and λ = ∓w, which the forces at Δ contain already; a coordinate that sticks has Δ = 0
+and λ = −K z. So z solves
 
     G(z) = F(Δ(z)) − K z [sticks] = 0,    ∂G/∂z = ∂F/∂Δ [slides] − K [sticks],
 
@@ -26,23 +26,23 @@ from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_
 from herglotz.mechanics.newton import Point
 from herglotz.stepping.partials_equation import StepEquation
 
-SWEEPS = 8  # of Gauss–Seidel: they find which coordinates stick, Newton's iteration finds by how much the others move
+# Sweeps of Gauss–Seidel find which coordinates stick; Newton's iteration then finds how far the other coordinates move.
+SWEEPS = 8
 
 
 class PartialsAtHand(StepEquation, Protocol):
-    """A step equation whose `rest` is its partials, with the forces that hold."""
+    """A step equation whose `rest` is its partials, with set-valued forces."""
 
     p0: Tensor  # (..., n)
-    order: int  # of the derivatives, unless `second` are asked for
     sticking: bool
 
 
 class Rest(NamedTuple):
-    """The terms of the equation of a step at Δ = 0, (..., n) each."""
+    """The start z, of the equation that is linear in Δ, K = `stiffness`, and w/K = `bound` on |z| of sticking."""
 
-    start: Tensor  # z of the equation that is linear in Δ
-    stiffness: Tensor  # K
-    bound: Tensor  # w/K, the |z| up to which a coordinate sticks
+    start: Tensor  # (..., n)
+    stiffness: Tensor  # (..., n)
+    bound: Tensor  # (..., n)
 
 
 def at_rest(equation: PartialsAtHand) -> Rest:
@@ -67,7 +67,7 @@ def at_rest(equation: PartialsAtHand) -> Rest:
 
 
 class StickSlip:
-    """A step equation in the unknown z, for an equation in q1 or Δ whose forces hold; see the head of this module.
+    """The step equation in z of an equation in q1 or Δ with set-valued friction; see the head of this module.
 
     K = `stiffness` and w/K = `bound` are those of `at_rest`.
     """
@@ -81,21 +81,18 @@ class StickSlip:
         return delta if self.equation.increments else self.equation.q0 + delta
 
     def slides(self, z: Tensor) -> Tensor:
-        """Where Δ is not 0 as the forces see it: q0 + Δ may round to q0."""
+        """Where the forces are evaluated at Δ ≠ 0: q0 + Δ may round to q0."""
         unknown = self.unknown(z)
         return (unknown if self.equation.increments else unknown - self.equation.q0).abs() > 0
 
-    def __call__(self, x: Tensor, second: bool) -> Point:
-        """G at z = x, and ∂G/∂z if `second`."""
-        order = 2 if second else self.equation.order
-        P, slides = self.equation(self.unknown(x), second).rest, self.slides(x)
+    def __call__(self, x: Tensor, second: bool) -> Point:  # noqa: ARG002  one signature for all
+        """G and ∂G/∂z at z = x."""
+        P, slides = self.equation(self.unknown(x), True).rest, self.slides(x)
         G = unheld_residual(P, self.equation.p0) - torch.where(slides, 0.0, self.stiffness * x)
-        if order != 2:
-            return Point(G, None, P)
         J = torch.where(slides[..., None, :], unheld_jacobian(P, self.equation.p0), 0.0)
         return Point(G, J - torch.diag_embed(torch.where(slides, 0.0, self.stiffness)), P)
 
 
 def sticks(equation: StepEquation) -> TypeGuard[PartialsAtHand]:
-    """Whether dry friction can hold a coordinate of this step: its partials then are at hand."""
+    """Whether dry friction can hold a coordinate of this step; `rest` then is the partials."""
     return getattr(equation, "sticking", False)

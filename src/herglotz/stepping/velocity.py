@@ -1,13 +1,13 @@
 """Velocities in and out: the Legendre transform p = L_v(q, v, s) at a point of a motion, and its inverse.
 
-A model knows its own Lagrangian L = lim L_d(q, q + hv, s, h)/h, and L_v in closed form: p of a step of order 2 or 4 is
-L_v to that order, and so is v. The forces of a step act in halves and leave p = L_v. Set-valued dry friction alone acts
-in F⁻ as a whole (`herglotz.models.friction`), so p lacks half an impulse of it:
+A model has its Lagrangian L = lim L_d(q, q + hv, s, h)/h, and L_v in closed form: p of a step of order 2 or 4 is L_v to
+that order, and v has the same order. The forces of a step act in halves and leave p = L_v. Only set-valued dry friction
+acts in F⁻ as a whole (`herglotz.models.friction`), so p lacks half an impulse of friction:
 
     p ∈ L_v(q, v, s) + (h/2) r(q, v) Sgn(v),
 
-r its largest force. The inverse is an inclusion as a step is, and `herglotz.stepping.stick_slip` solves it: v = 0 where
-friction can hold what p is. Any other L_d is asked at its own step, where p is the mean of both discrete transforms
+with r the largest force. The inverse is an inclusion like a step, and `herglotz.stepping.stick_slip` solves the
+inclusion: v = 0 where friction can hold p. For any other L_d, p is the mean of both discrete transforms of a step,
 
     p = ½ (FL⁻p + FL⁺p) of (q − hv/2, q + hv/2, s − L_d/2),
 
@@ -33,9 +33,11 @@ from herglotz.stepping.newton import find_root, status_of
 from herglotz.stepping.partials_equation import End
 from herglotz.stepping.state import State, Status
 
-TOL = 4  # machine epsilons of v
-MAX_ITERATIONS = 30  # as of a step
-AT_ONCE = 4096  # samples: second derivatives of many coordinates fill the memory
+# Tolerance in machine epsilons of v, and bound on Newton iterations, both as those of a step.
+TOL = 4
+MAX_ITERATIONS = 30
+# Number of samples solved together: second derivatives of many coordinates fill the memory.
+CHUNK = 4096
 
 
 class Legendre(NamedTuple):
@@ -65,15 +67,15 @@ def velocity(transform: Transform, state: State, h: Tensor) -> tuple[Tensor, Ten
     batch, n = state.s.shape, state.q.shape[-1]
     flat = State(state.q.reshape(-1, n), state.p.reshape(-1, n), state.s.reshape(-1))
     h = h.expand(batch).reshape(-1)
-    parts = zip(*(x.split(AT_ONCE) for x in (*flat, h)), strict=True)
+    parts = zip(*(x.split(CHUNK) for x in (*flat, h)), strict=True)
     v, status = zip(*(_velocity(transform, State(*x), h) for *x, h in parts), strict=True)
     return torch.cat(v).reshape(state.q.shape), torch.cat(status).reshape(batch)
 
 
 def velocities(L_d: DiscreteLagrangian, state: State, h: Tensor) -> Tensor:
-    """The v (..., n) of states with steps h, () or (...); NaN where a rollout has not come, or there is none.
+    """The v (..., n) of states with steps h, () or (...), the step that led to each state.
 
-    A state that a step of h has made comes with that h.
+    NaN where a state is not finite or has no velocity.
     """
     reached = state.finite
     v = torch.full_like(state.q, torch.nan)
@@ -98,12 +100,13 @@ def legendre(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tensor
 
 
 def _symmetric(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Legendre:
-    """The mean of FL⁻ and FL⁺ over a step with q in its middle. by_v lacks what is O(h²) of it."""
+    """The mean of FL⁻ and FL⁺ over a step with q in its middle. `by_v` lacks terms of O(h²)."""
     half = (h / 2)[..., None] * v
     q0, q1 = q - half, q + half
     P = partials(L_d, q0, q1, s - partials(L_d, q0, q1, s, h).L / 2, h, 2)
     before, after, c = momentum_minus(P), momentum_plus(P), P.c[..., None]
-    by_s = -(h / 4)[..., None] * (P.D2 - P.D1)  # of s0 by v
+    # The derivative of s0 by v.
+    by_s = -(h / 4)[..., None] * (P.D2 - P.D1)
     minus, plus = P.D12 - P.D11, P.D22 - P.D12.mT
     if P.force is not None:
         minus, plus = minus + P.force.minus_2 - P.force.minus_1, plus + P.force.plus_2 - P.force.plus_1
@@ -115,9 +118,9 @@ def _symmetric(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tens
 
 
 class _AtVelocity:
-    """L_v(q, v, s) = p as a step equation in v: F = p − L_v, with dry friction's impulse as in a step."""
+    """L_v(q, v, s) = p as a step equation in v: F = p − L_v, with the impulse of dry friction as in a step."""
 
-    increments, order = True, 2
+    increments = True
 
     def __init__(self, transform: Transform, state: State, h: Tensor):
         self.transform, self.state, self.h = transform, state, h
@@ -146,12 +149,12 @@ class _AtVelocity:
         return End(self.p0, point.rest.L, point.rest.c)
 
     def typical_increment(self) -> Tensor:
-        """The rounding of positions over h, in epsilons: an L_d that is no model has v of their differences."""
+        """The size of positions over h: v of an L_d that is no model has the rounding of their difference."""
         return self.state.q.abs().amax(-1) / self.h
 
 
 def _velocity(transform: Transform, state: State, h: Tensor) -> tuple[Tensor, Tensor]:
-    """The same of one batch (B, n)."""
+    """`velocity` of a chunk (B, n)."""
     equation = _AtVelocity(transform, state, h)
     with torch.no_grad():
         tol = TOL * torch.finfo(state.q.dtype).eps

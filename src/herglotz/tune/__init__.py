@@ -1,4 +1,4 @@
-"""Speed against accuracy: `tune` finds the cheapest setting for an error, or the most accurate one for a budget."""
+"""Speed against accuracy: `tune` finds the cheapest setting within an error, or the most accurate within a budget."""
 
 from herglotz.tune.config import TuneConfig as TuneConfig
 from herglotz.tune.distil import distil as distil

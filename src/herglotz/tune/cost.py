@@ -1,4 +1,4 @@
-"""Wall time of a step, one motion at a time; all settings take turns, so that a slow minute hits them alike.
+"""Wall time of a step, one motion at a time; settings take turns, so that a slow minute slows all settings.
 
 Only steps inside the horizon are timed: a damped motion comes to rest, and a step at rest costs next to nothing.
 """
@@ -7,18 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any
 
 import torch
 
-from herglotz.export.c_stepper import CLibrary
 from herglotz.stepping import State
-from herglotz.tune.kick_header import CompiledKicks
 
-# One timing takes enough steps that the call around them is small beside them.
-EAGER_STEPS, EAGER_STARTS = 48, 2  # steps of each motion, and motions
-C_STARTS, C_STEPS = 16, 4096  # motions, and least number of steps of all motions together
+# A timing takes enough steps that the call around the steps is small beside them. Eager: steps of each motion, and
+# motions. C: motions, and least number of steps of all motions together.
+EAGER_STEPS, EAGER_STARTS = 48, 2
+C_STARTS, C_STEPS = 16, 4096
 
 
 @dataclass(frozen=True)
@@ -33,64 +33,56 @@ class Cost:
 class Timed:
     """A call that takes `steps` steps, and, where its overhead counts, the same call without a step."""
 
-    run: Callable[[], None]
+    run: Callable[[], object]
     steps: int
-    idle: Callable[[], None] | None = None
+    idle: Callable[[], object] | None = None
 
 
 def measure_costs(timed: Sequence[Timed], rounds: int) -> list[Cost]:
     """Time every entry `rounds` times, in turn, after one untimed round; the least idle time is subtracted."""
     times = torch.zeros(2, len(timed), rounds, dtype=torch.float64)
     for k in range(-1, rounds):
-        for i, one in enumerate(timed):
-            times[0, i, max(k, 0)] = _seconds(one.run)
-            times[1, i, max(k, 0)] = 0.0 if one.idle is None else _seconds(one.idle)
-    steps = torch.tensor([one.steps for one in timed], dtype=torch.float64)
+        for i, entry in enumerate(timed):
+            times[0, i, max(k, 0)] = _seconds(entry.run)
+            times[1, i, max(k, 0)] = 0.0 if entry.idle is None else _seconds(entry.idle)
+    steps = torch.tensor([entry.steps for entry in timed], dtype=torch.float64)
     best, middle = times[0].amin(1), times[0].median(1).values
-    idle = torch.minimum(times[1].amin(1), best / 2)  # on a busy machine an idle call may take longer than the run
+    # On a busy machine an idle call may take longer than the run.
+    idle = torch.minimum(times[1].amin(1), best / 2)
     costs = 1e6 * torch.stack([best - idle, middle - best]) / steps
     return [Cost(float(a), float(b)) for a, b in costs.T]
 
 
 def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
     """Return rollouts of `steps` steps, one start after the other; for C the overhead of the call is timed too."""
-    if isinstance(getattr(stepper, "loop", stepper), CLibrary | CompiledKicks):
-        few = State(*(x[:C_STARTS] for x in starts))
-        count = len(few.s)
-        repeats = max(1, C_STEPS // (count * steps))
-        run, idle = (_repeated(_native(stepper, few, h, k), repeats) for k in (steps, 0))
-        return Timed(run, count * steps * repeats, idle)
-    steps, count = min(steps, EAGER_STEPS), min(EAGER_STARTS, len(starts.s))
-    single = [State(*(x[i : i + 1] for x in starts)) for i in range(count)]
+    library = getattr(stepper, "loop", stepper)
+    if not hasattr(library, "prepared"):
+        steps, singles = min(steps, EAGER_STEPS), _singles(starts, EAGER_STARTS, starts.q.dtype)
+        calls = [partial(stepper.rollout, *start, h=h, steps=steps) for start in singles]
+        return Timed(partial(_run, calls), len(calls) * steps)
+    singles = _singles(starts, C_STARTS, library.dtype)
+    repeats = max(1, C_STEPS // (len(singles) * steps))
+    h_one = torch.full((1, 1), h, dtype=library.dtype)
 
-    def run() -> None:
-        with torch.no_grad():
-            for start in single:
-                stepper.rollout(*start, h=h, steps=steps)
+    def calls_of(count: int) -> Callable[[], None]:
+        # Arguments are made beforehand: checks in Python would take longer than the steps.
+        return partial(_run, [library.prepared(*start, h_one.expand(1, count))[0] for start in singles] * repeats)
 
-    return Timed(run, count * steps)
-
-
-def _repeated(calls: list[Callable[[], None]], times: int) -> Callable[[], None]:
-    def run() -> None:
-        for _ in range(times):
-            for call in calls:
-                call()
-
-    return run
+    return Timed(calls_of(steps), len(singles) * steps * repeats, calls_of(0))
 
 
-def _native(stepper: Any, few: State, h: float, steps: int) -> list[Callable[[], None]]:
-    """Return calls of the C loop with arguments made beforehand: checks in Python would take longer than the steps."""
-    library: CLibrary | CompiledKicks = getattr(stepper, "loop", stepper)
-    singles = [State(*(x[i : i + 1].to(library.dtype) for x in few)) for i in range(len(few.s))]
-    if isinstance(library, CompiledKicks):
-        return [library.prepared(start, steps)[0] for start in singles]
-    h_all = torch.full((1, 1), h, dtype=library.dtype).expand(1, steps)
-    return [library.prepared(*start, h=h_all)[0] for start in singles]
+def _singles(starts: State, count: int, dtype: torch.dtype) -> list[State]:
+    """The first starts, at most `count`, each as a batch of one motion."""
+    return [State(*(x[i : i + 1].to(dtype) for x in starts)) for i in range(min(count, len(starts.s)))]
 
 
-def _seconds(run: Callable[[], None]) -> float:
+@torch.no_grad()
+def _run(calls: Sequence[Callable[[], object]]) -> None:
+    for call in calls:
+        call()
+
+
+def _seconds(call: Callable[[], object]) -> float:
     started = perf_counter()
-    run()
+    call()
     return perf_counter() - started

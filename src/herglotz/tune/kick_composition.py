@@ -16,21 +16,22 @@ Source: D. Turaev, Nonlinearity 16 (2003) 123 (Hénon-like maps); S. Blanes, F. 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
 
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import OneStepMethod, State, Status, Step
 from herglotz.training import levenberg_marquardt
+from herglotz.tune.distil import FlowProblem
 
-LEVELS = ("conservative", "linear")  # the levels with a constant c and no force
-DEGREE = 4  # of the polynomials of a kick
+# The levels with a constant c and no force.
+LEVELS = ("conservative", "linear")
+# Degree of the polynomial of a kick. A length has one degree more: its force is not zero at the middle of the data.
+DEGREE = 4
 
 
 @dataclass(frozen=True)
@@ -38,18 +39,20 @@ class KickStepper(OneStepMethod):
     """A stepper of kicks and drifts, with `step` and `rollout` as `Stepper` has them, at its own h only.
 
     V_i = Σ_n a_in cos nq + b_in sin nq for an angle, Σ_n a_in x^n, n ≥ 1, with x = (q − middle)/half for a length.
+    `rate` is γ in c = e^{−γh}. `offset` is added to s after a step: the sum of the constants of the V_i, which move
+    neither q nor p. `error` is the RMS error of q after a step, in units of q.
     """
 
     h: float
-    rate: float  # γ, so that c = e^{−γh}
-    angle: bool  # whether q is an angle
+    rate: float
+    angle: bool
     middle: float
     half: float
     drifts: Tensor  # (K + 1,) d_0 … d_K, in time over mass
     cosines: Tensor  # (K, N) a_in
     sines: Tensor  # (K, N) b_in
-    offset: float = 0.0  # added to s after a step: the sum of the constants of the V_i, which do not move q or p
-    error: float = 0.0  # RMS error of q after one step, in units of q
+    offset: float = 0.0
+    error: float = 0.0
 
     dof = 1
 
@@ -70,7 +73,8 @@ class KickStepper(OneStepMethod):
         if not self.angle:
             x = (q - self.middle) / self.half
             return x * _polynomial(a, x), _polynomial(n * a, x) / self.half
-        c, sine = torch.cos(q), torch.sin(q)  # one of each, which is most of the work in C
+        # A kick takes a single cosine and sine, which are most of the work in C.
+        c, sine = torch.cos(q), torch.sin(q)
         T, U = (x.to(q) for x in _multiple_angles(len(a)))
         V = _polynomial(a @ T, c) + sine * _polynomial(b @ U, c)
         return V, _polynomial((n * b) @ T, c) - sine * _polynomial((n * a) @ U, c)
@@ -101,11 +105,9 @@ class KickStepper(OneStepMethod):
         if state.q.shape[-1] != 1:
             raise InputError(f"kicks step one coordinate, got {state.q.shape[-1]}")
         q, p, s = self.map(state.q[..., 0], state.p[..., 0], state.s)
-        bad = ~(torch.isfinite(q) & torch.isfinite(p) & torch.isfinite(s))
-        nan = torch.where(bad, torch.nan, torch.zeros_like(s))
-        c = torch.exp(-self.rate * self.h + nan)
-        status = torch.where(bad, Status.DIVERGED, Status.CONVERGED).to(torch.uint8)
-        return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
+        new = State(q[..., None], p[..., None], s)
+        status = torch.where(new.finite, Status.CONVERGED, Status.DIVERGED).to(torch.uint8)
+        return Step.of(new, torch.full_like(s, -self.rate * self.h).exp(), status, torch.zeros_like(s), 0)
 
 
 def _polynomial(coefficients: Tensor, x: Tensor) -> Tensor:
@@ -119,7 +121,8 @@ def _polynomial(coefficients: Tensor, x: Tensor) -> Tensor:
 @cache
 def _multiple_angles(count: int) -> tuple[Tensor, Tensor]:
     """T and U of cos nq = Σ_k T_nk cos^k q and sin nq = sin q Σ_k U_nk cos^k q for n = 1 … count (Chebyshev)."""
-    powers = torch.zeros(2, count + 2, count + 2, dtype=torch.float64)  # n = 0, 1, … of each kind
+    # (2, n, power) of both kinds for n = 0, 1, …
+    powers = torch.zeros(2, count + 2, count + 2, dtype=torch.float64)
     powers[:, 0, 0], powers[0, 1, 1], powers[1, 1, 1] = 1.0, 1.0, 2.0
     for n in range(2, count + 1):
         powers[:, n] = 2 * powers[:, n - 1].roll(1, -1) - powers[:, n - 2]
@@ -132,71 +135,59 @@ def can_kick(model: ContactLagrangian) -> bool:
 
 
 def fit_kicks(
-    model: ContactLagrangian,  # has γ, whether q is an angle, and the start: leapfrog with its stiffness
+    model: ContactLagrangian,
     before: State,  # (T, 1), (T, 1), (T)
-    after: State,  # the same a time h later
+    after: State,  # (T, 1), (T, 1), (T)
     h: float,
     *,
     kicks: int,
     iterations: int = 150,
 ) -> KickStepper:
-    """Fit kicks and drifts to a flow map over h by Levenberg–Marquardt on (q1, p1).
+    """Fit kicks and drifts to a flow map over h by Levenberg–Marquardt on (q1, p1), each in units of its own size.
 
-    Raise InputError if the model has several coordinates, a c that varies, or forces.
+    The fit starts from leapfrog with the stiffness of the model, and keeps the model's γ. Raise InputError if the
+    model has several coordinates, a c that varies, or forces.
     """
     if not can_kick(model):
         raise InputError(f"kicks need one coordinate at the {' or '.join(LEVELS)} level")
+    before, after = (State(*(x.double() for x in states)) for states in (before, after))
     start = _leapfrog(model, before, h, kicks)
-    sizes = [start.drifts.numel(), start.cosines.numel(), start.sines.numel()]
+    p_size = before.p.square().mean().sqrt()
+    sizes = torch.stack([torch.full_like(p_size, float(max(model.config.scale))), torch.where(p_size > 0, p_size, 1.0)])
+    problem = FlowProblem(partial(_misses, start), before, after, sizes)
     first = torch.cat([start.drifts, start.cosines.flatten(), start.sines.flatten()])
-
-    def unpacked(x: Tensor) -> KickStepper:
-        d, a, b = x.split(sizes)
-        return replace(start, drifts=d, cosines=a.reshape(start.cosines.shape), sines=b.reshape(start.sines.shape))
-
-    pairs = [y.double().reshape(-1) for y in (*before[:2], *after[:2])]
-    problem = _Flow(unpacked, float(max(model.config.scale)), pairs)
-    found = unpacked(levenberg_marquardt(problem, first, max_iterations=iterations, rtol=1e-5).x.detach())
-    q, _, s = found.map(*(y.double().reshape(-1) for y in before))
-    q1, _, s1 = (y.double().reshape(-1) for y in after)
-    return replace(found, offset=float((s1 - s).mean()), error=float((q - q1).square().mean().sqrt()))
+    found = _with_numbers(start, levenberg_marquardt(problem, first, max_iterations=iterations, rtol=1e-5).x.detach())
+    q, _, s = found.map(before.q[:, 0], before.p[:, 0], before.s)
+    error = (q - after.q[:, 0]).square().mean().sqrt()
+    return replace(found, offset=float((after.s - s).mean()), error=float(error))
 
 
-class _Flow:
-    """½|r|² of the states that kicks reach and those that they should, q and p each in units of their own size."""
+def _with_numbers(stepper: KickStepper, theta: Tensor) -> KickStepper:
+    """The stepper with the fitted numbers θ: drifts, cosines and sines."""
+    d, a, b = theta.split([x.numel() for x in (stepper.drifts, stepper.cosines, stepper.sines)])
+    cosines, sines = a.reshape(stepper.cosines.shape), b.reshape(stepper.sines.shape)
+    return replace(stepper, drifts=d, cosines=cosines, sines=sines)
 
-    def __init__(self, unpacked: Callable[[Tensor], KickStepper], scale: float, pairs: list[Tensor]):
-        self.unpacked, self.pairs = unpacked, pairs  # q0, p0, q1, p1, (T,) each
-        p = pairs[1].square().mean().sqrt()
-        self.sizes = torch.stack([torch.full_like(p, scale), torch.where(p > 0, p, 1.0)])
 
-    def _local(self, theta: Tensor, q0: Tensor, p0: Tensor, q1: Tensor, p1: Tensor) -> Tensor:
-        q, p, _ = self.unpacked(theta).map(q0, p0, torch.zeros_like(q0))
-        return torch.stack([q - q1, p - p1], -1) / self.sizes
-
-    def cost(self, x: Tensor) -> Tensor:
-        return self._local(x, *self.pairs).square().sum() / 2
-
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r = self._local(x, *self.pairs).reshape(-1)
-        J = vmap(jacrev(self._local), (None, 0, 0, 0, 0))(x, *self.pairs).reshape(-1, len(x))
-        return self.cost(x), J.T @ J, J.T @ r
+def _misses(stepper: KickStepper, theta: Tensor, before: State, after: State) -> Tensor:
+    """The errors (..., 2) of q and p after a step with the numbers θ."""
+    q, p, _ = _with_numbers(stepper, theta).map(before.q[..., 0], before.p[..., 0], before.s)
+    return torch.stack([q - after.q[..., 0], p - after.p[..., 0]], -1)
 
 
 def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int) -> KickStepper:
     """Return K steps of leapfrog with the model's stiffness: drifts h/K over the mass, kicks h/K times the force."""
-    config = model.config
-    low, high = float(before.q.min()), float(before.q.max())
-    middle, half = (0.0, 1.0) if config.angles[0] else ((low + high) / 2, (high - low) / 2)
+    angle, k = model.config.angles[0], float(model.config.stiffness[0])
     drifts = torch.full((kicks + 1,), h / kicks, dtype=torch.float64)
     drifts[0] = drifts[-1] = h / kicks / 2
-    # A length needs a linear term too: the force is not zero at the middle of the data.
-    a = torch.zeros(kicks, DEGREE if config.angles[0] else DEGREE + 1, dtype=torch.float64)
-    b = torch.zeros(kicks, DEGREE if config.angles[0] else 0, dtype=torch.float64)
-    k = float(config.stiffness[0])
-    if config.angles[0]:
+    a = torch.zeros(kicks, DEGREE if angle else DEGREE + 1, dtype=torch.float64)
+    b = torch.zeros(kicks, DEGREE if angle else 0, dtype=torch.float64)
+    if angle:
+        middle, half = 0.0, 1.0
         a[:, 0] = -k * h / kicks
     else:
+        low, high = float(before.q.min()), float(before.q.max())
+        middle, half = (low + high) / 2, (high - low) / 2
         a[:, 1] = 0.5 * k * half**2 * h / kicks
     rate = 0.0 if model.damping is None else float(model.damping.rate.detach())
-    return KickStepper(h, rate, config.angles[0], middle, half, drifts, a, b)
+    return KickStepper(h, rate, angle, middle, half, drifts, a, b)

@@ -1,4 +1,4 @@
-"""Local errors of a rollout: each step is compared with two steps of half its length. A status cannot know them."""
+"""Local errors of a rollout: each step is compared with two steps of half its length. No status shows these errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.stepping import OneStepMethod, Rollout, State, Status
-from herglotz.stepping.state import check_h, step_sizes
+from herglotz.stepping.state import check_h
 
 
 def local_errors(stepper: OneStepMethod, out: Rollout, h: Tensor | float) -> Tensor:
@@ -17,8 +17,8 @@ def local_errors(stepper: OneStepMethod, out: Rollout, h: Tensor | float) -> Ten
 
     Values near 1 and above mean that h does not resolve the motion, even where every step equation was solved: a step
     over the pericentre of a thin ellipse is as regular as any other. For a method of order p the value estimates the
-    error of the step times 1 − 2^{−p}. The estimate takes two steps for each one. It says nothing about a model with a
-    learned correction, which is right at its own step only.
+    error of the step times 1 − 2^{−p}. The estimate takes two steps for each step of the rollout. Values for a model
+    with a learned correction mean nothing, because a correction is right at its own step only.
 
     Parameters
     ----------
@@ -34,12 +34,13 @@ def local_errors(stepper: OneStepMethod, out: Rollout, h: Tensor | float) -> Ten
     InputError
         If h lists another number of steps than the rollout keeps.
     """
-    steps = out.status.shape[-1]
-    if torch.as_tensor(h).ndim and torch.as_tensor(h).shape[-1] != steps:
-        raise InputError(f"h lists {torch.as_tensor(h).shape[-1]} steps, but {steps} were kept; keep every step")
-    half = step_sizes(check_h(h, out.q), steps if torch.as_tensor(h).ndim == 0 else None).expand(out.status.shape) / 2
+    h, steps = check_h(h, out.q), out.status.shape[-1]
+    if h.ndim and h.shape[-1] != steps:
+        raise InputError(f"h lists {h.shape[-1]} steps, but {steps} were kept; keep every step")
+    half = h.expand(out.status.shape) / 2
     start, whole = State(out.q[..., :-1, :], out.p[..., :-1, :], out.s[..., :-1]), out.q[..., 1:, :]
-    with torch.no_grad():  # all steps are one batch
+    # All steps are one batch.
+    with torch.no_grad():
         end = stepper.step(stepper.step(start, half).state, half).state.q
     moved = torch.maximum((whole - start.q).abs().amax(-1), (end - start.q).abs().amax(-1))
     return (whole - end).abs().amax(-1) / moved.clamp(min=torch.finfo(end.dtype).tiny)

@@ -13,7 +13,8 @@ from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.training import Run
 
-JITTER = 0.05  # share of the box by which a start is moved away from a recorded state
+# Share of the box by which a start is moved away from a recorded state, at most.
+JITTER = 0.05
 
 
 @dataclass(frozen=True)
@@ -23,9 +24,13 @@ class Motions:
     base: float
     states: State  # (B, K+1, n), (B, K+1, n), (B, K+1)
 
-    def every(self, stride: int) -> State:
-        """Return the states `stride` bases apart."""
-        return State(*(x[:, ::stride] for x in self.states))
+    def at(self, h: float) -> State:
+        """Return the states a time h apart, a multiple of `base`."""
+        return State(*(x[:, :: round(h / self.base)] for x in self.states))
+
+    def steps(self, h: float) -> int:
+        """Return how many steps of h a motion has."""
+        return (self.states.s.shape[1] - 1) // round(h / self.base)
 
     def starts(self) -> State:
         """Return the states at time 0, (B, n), (B, n), (B,)."""
@@ -33,14 +38,13 @@ class Motions:
 
 
 def draw_starts(run: Run, count: int, seed: int) -> State:
-    """Draw states near recorded ones: a random sample of the run, moved by up to 5 % of the box, inside the box.
+    """Draw random recorded states of the run, each moved by up to `JITTER` of the box, and kept inside the box.
 
-    A uniform draw would fill the corners of the box too, where no data hold the model.
+    A uniform draw would fill the corners of the box too, where the model has seen no data.
     """
     generator = torch.Generator().manual_seed(seed)
     rows = leading_rows(run.data.lengths, run.train_lengths)
-    fine = torch.stack([x.reshape(len(x), -1).isfinite().all(-1).cpu() for x in run.states]).all(0)
-    rows = rows[fine[rows]]
+    rows = rows[run.states.finite.cpu()[rows]]
     if not len(rows):
         raise InputError("the run has no finite state to start from; fit it again")
     rows = rows[torch.randint(len(rows), (count,), generator=generator)]
@@ -61,7 +65,7 @@ def record(run: Run, starts: State, horizon: float) -> Motions:
     """
     with torch.no_grad():
         out = Stepper(frozen_double(run)).rollout(*starts, h=run.h, steps=round(horizon / run.h))
-    good = torch.stack([x.flatten(1).isfinite().all(1) for x in (out.q, out.p, out.s)]).all(0)
+    good = out.states.finite.all(1)
     if int(good.sum()) * 2 < len(good):
         raise InputError(
             f"the run's own stepper fails on {int((~good).sum())} of {len(good)} starts over {horizon:g}; "

@@ -20,15 +20,20 @@ from herglotz.tune.kick_composition import KickStepper
 
 @dataclass(frozen=True)
 class Setting:
-    """A way to step: a model, a step size and a form."""
+    """A way to step: a model, a step size and a form.
 
-    multiple: float  # of the run's step
+    `multiple` is the step h in steps of the run. `width` is the number of hidden units of the distilled correction,
+    None for the run's own model. `tol` is the tolerance of the eager Newton iteration, None for the default. `kicks` is
+    the number of kicks if a `KickStepper` replaces the model.
+    """
+
+    multiple: float
     h: float
-    width: int | None  # of the distilled correction; None: the run's own model
+    width: int | None
     artefact: str
     dtype: str
-    tol: float | None  # of the eager Newton iteration
-    kicks: int | None = None  # number of kicks, where a `KickStepper` replaces the model
+    tol: float | None
+    kicks: int | None = None
 
     @property
     def name(self) -> str:
@@ -42,16 +47,20 @@ class Setting:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting with the measured error and cost."""
+    """A setting with the measured error and cost.
+
+    The error of a start is the largest |q − reference| over the horizon, in units of q; `bound` is the error that the
+    demanded share of all starts keeps. `kicks` replaces the model; `stepper` is the form that was measured.
+    """
 
     setting: Setting
-    median: float  # error of the median start: largest |q − reference| over the horizon, in units of q
-    bound: float  # error that the demanded share of all starts keeps
+    median: float
+    bound: float
     worst: float
     cost: Cost
     model: ContactLagrangian = field(repr=False)
-    kicks: KickStepper | None = field(default=None, repr=False)  # steps in place of the model
-    stepper: Any = field(default=None, repr=False)  # the form that was measured
+    kicks: KickStepper | None = field(default=None, repr=False)
+    stepper: Any = field(default=None, repr=False)
 
     @property
     def us(self) -> float:
@@ -69,7 +78,8 @@ class Candidate:
         parameters = sum(p.numel() for p in self.model.parameters())
         return {
             **asdict(self.setting),
-            **{k: x if math.isfinite(x) else None for k, x in errors.items()},  # JSON has no infinity: a step failed
+            # An error is infinite where a step failed, and JSON has no infinity.
+            **{k: x if math.isfinite(x) else None for k, x in errors.items()},
             "step_us": self.cost.step_us, "us_per_time": self.us, "us_per_time_spread": self.spread,
             "parameters": parameters if self.kicks is None else self.kicks.parameters,
         }  # fmt: skip
@@ -86,17 +96,21 @@ def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 @dataclass(frozen=True)
 class Tuning:
-    """All settings tried, the choice, and the errors of the choice on starts that had no part in choosing."""
+    """All settings tried, the choice, and the errors of the choice on starts that had no part in choosing.
+
+    `asked` is max_error or budget_us with its value. `motions` are the training motions of the reference at the chosen
+    step. `notes` has the settings that could not be tried, each with the reason.
+    """
 
     run: Run
     config: TuneConfig
     horizon: float
-    asked: dict[str, float]  # max_error or budget_us
+    asked: dict[str, float]
     candidates: list[Candidate]
     chosen: Candidate
     held_out: dict[str, Any]
-    motions: State  # the reference's training motions at the chosen step, (B, K+1, …)
-    notes: list[str]  # settings that could not be tried, with the reason
+    motions: State  # (B, K+1, …)
+    notes: list[str]
 
     @property
     def front(self) -> list[Candidate]:
@@ -111,8 +125,10 @@ class Tuning:
     @property
     def own_in_c(self) -> Candidate | None:
         """Return the unchanged run in C, in the faster precision; None without C."""
-        found = [c for c in self.candidates if c.setting.artefact == "c" and c.model is self.own.model]
-        found = [c for c in found if c.setting.multiple == 1]
+        found = [
+            c for c in self.candidates
+            if c.setting.artefact == "c" and c.setting.multiple == 1 and c.model is self.own.model
+        ]  # fmt: skip
         return min(found, key=lambda c: c.us, default=None)
 
     @property

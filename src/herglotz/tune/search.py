@@ -1,4 +1,4 @@
-"""`tune`: an error or a budget in, the setting that meets it out, with the front it was chosen from."""
+"""`tune`: an error or a budget in; out come the setting that meets the demand, and the front it was chosen from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian
 from herglotz.progress import ProgressBar
@@ -25,8 +25,10 @@ from herglotz.tune.kick_header import CompiledKicks
 from herglotz.tune.reference import Motions, draw_starts, frozen_double, record
 from herglotz.tune.result import Candidate, Setting, Tuning
 
-HOPELESS = 10.0  # where a distilled model exceeds the limit this many times, no larger step is tried at its width
-LONGEST = 200  # steps of the run in the default horizon, at most
+# If the error of a distilled model is above this many limits, larger steps of its width are not tried.
+HOPELESS = 10.0
+# Number of steps of the run in the default horizon, at most.
+MAX_HORIZON_STEPS = 200
 UNTIMED = Cost(math.nan, math.nan)
 
 
@@ -79,43 +81,45 @@ def tune(
     ) as bar:
         search = _Search(run, frozen_double(run), config, max_error, training, choosing, [], bar)
         tried = [*search.forms(), *search.kicks()]
-    costs = _costs(tried, choosing, config.rounds)
+    timed = [timed_stepping(c.stepper, choosing.starts(), c.setting.h, choosing.steps(c.setting.h)) for c in tried]
+    costs = measure_costs(timed, config.rounds)
     candidates = [replace(c, cost=cost) for c, cost in zip(tried, costs, strict=True)]
     chosen = choose(candidates, asked)
     errors = _errors(chosen.stepper, chosen.setting.h, judging)
     held_out = _held_out(errors, chosen.bound if max_error is None else max_error, config)
-    stride = round(chosen.setting.h / training.base)
-    return Tuning(
-        run, config, horizon, asked, candidates, chosen, held_out, training.every(stride),
-        list(dict.fromkeys(search.notes)),
-    )  # fmt: skip
+    motions, notes = training.at(chosen.setting.h), list(dict.fromkeys(search.notes))
+    return Tuning(run, config, horizon, asked, candidates, chosen, held_out, motions, notes)
 
 
 def _demand(max_error: float | None, budget_us: float | None) -> dict[str, float]:
     asked = {k: v for k, v in (("max_error", max_error), ("budget_us", budget_us)) if v is not None}
-    if len(asked) != 1:
-        raise InputError("give either --max-error or --budget-us")
-    ((name, value),) = asked.items()
-    if not (value > 0 and math.isfinite(value)):
-        raise InputError(f"{name} must be a finite number > 0, got {value:g}")
+    refuse({
+        "give either --max-error or --budget-us": len(asked) != 1,
+        **{f"{name} must be a finite number > 0, got {value:g}": not 0 < value < math.inf
+           for name, value in asked.items()},
+    })  # fmt: skip
     return asked
 
 
 def _horizon(run: Run, config: TuneConfig, horizon: float | None) -> float:
     """Return the demanded horizon, or that of a typical trajectory; either holds two of the largest steps."""
+    least = 2 * max(config.multiples)
     if horizon is None:
         length = float(torch.tensor(run.data.lengths).double().median()) - 1
-        horizon = run.h * max(min(length, LONGEST), 2 * max(config.multiples))
-    if not (math.isfinite(horizon) and horizon >= 2 * max(config.multiples) * run.h * (1 - 1e-9)):
-        needed = 2 * max(config.multiples) * run.h
-        raise InputError(f"a horizon of {horizon:g} is shorter than two of the largest steps, {needed:g}; take longer")
+        horizon = run.h * max(min(length, MAX_HORIZON_STEPS), least)
+    if not (math.isfinite(horizon) and horizon >= least * run.h * (1 - 1e-9)):
+        raise InputError(
+            f"a horizon of {horizon:g} is shorter than two of the largest steps, {least * run.h:g}; take longer"
+        )
     return horizon
 
 
 @dataclass(frozen=True)
 class _Search:
+    """The search over all settings; `own` is the run's model in float64."""
+
     run: Run
-    own: ContactLagrangian  # the run's model
+    own: ContactLagrangian
     config: TuneConfig
     max_error: float | None
     training: Motions
@@ -127,13 +131,15 @@ class _Search:
         """Yield (multiple, width, model): the run's own model at every step, then the distilled models."""
         config, own = self.config, self.own
         multiples = sorted(config.multiples)
-        for m in sorted({1, *multiples}):  # `Tuning.own` relies on the run as it is being the first
+        # The unchanged run is first, as `Tuning.own` relies on.
+        for m in sorted({1, *multiples}):
             yield m, None, own
         for width in config.widths:
             for m in multiples:
                 start = widened(own, width, max(own.config.correction_depth, 2))
+                # At the step of the run, the run's own model is exact.
                 if m == 1 and _size(start) >= _size(own):
-                    continue  # the run's own model is exact at this step and no larger
+                    continue
                 h = m * self.run.h
                 self.bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
                 model, _ = distil(start, *self._pairs(h), h, iterations=config.iterations)
@@ -152,11 +158,10 @@ class _Search:
         for multiple, width, model in self._models():
             h = multiple * self.run.h
             if (multiple, width) == (1, None) or "eager" in self.config.artefacts:
-                solved = model.capabilities.linear_in_q1  # then a tolerance changes nothing
-                for tol in dict.fromkeys((None, *(() if solved else self.config.tolerances))):
-                    yield self._tried(
-                        Setting(multiple, h, width, "eager", "float64", tol), Stepper(model, tol=tol), model
-                    )
+                # A step in closed form has no tolerance.
+                for tol in dict.fromkeys((None, *(() if model.capabilities.linear_in_q1 else self.config.tolerances))):
+                    setting = Setting(multiple, h, width, "eager", "float64", tol)
+                    yield self._tried(setting, Stepper(model, tol=tol), model)
             if "c" in self.config.artefacts:
                 yield from self._in_c(Setting(multiple, h, width, "c", "float64", None), model)
             self.bar.update(1)
@@ -200,11 +205,10 @@ def _size(model: ContactLagrangian) -> int:
 
 def _errors(stepper: Any, h: float, motions: Motions) -> Tensor:
     """Return the largest |q − reference| of each motion, (B,), in float64; infinite where a step fails."""
-    reference = motions.every(round(h / motions.base))
-    dtype = getattr(stepper, "dtype", torch.float64)
+    reference, dtype = motions.at(h), getattr(stepper, "dtype", torch.float64)
     with torch.no_grad():
         start = (x.to(dtype).contiguous() for x in motions.starts())
-        out = stepper.rollout(*start, h=h, steps=reference.s.shape[1] - 1)
+        out = stepper.rollout(*start, h=h, steps=motions.steps(h))
     error = (out.q.double() - reference.q).abs().flatten(1)
     return error.nan_to_num(nan=math.inf, posinf=math.inf).amax(1)
 
@@ -215,41 +219,31 @@ def bound_of(errors: Tensor, config: TuneConfig) -> float:
     return float(errors.sort(descending=True).values[allowed])
 
 
-def _costs(tried: list[Candidate], choosing: Motions, rounds: int) -> list[Cost]:
-    timed = []
-    for c in tried:
-        stride = round(c.setting.h / choosing.base)
-        steps = (choosing.states.s.shape[1] - 1) // stride
-        timed.append(timed_stepping(c.stepper, choosing.starts(), c.setting.h, steps))
-    return measure_costs(timed, rounds)
-
-
 def choose(candidates: list[Candidate], asked: dict[str, float]) -> Candidate:
     """Return the cheapest candidate within max_error, or the most accurate one within budget_us.
 
     Raise InputError if there is none; the message names the nearest demand that can be met.
     """
-    if "max_error" in asked:
-        good = [c for c in candidates if c.bound <= asked["max_error"]]
-        if good:
-            return min(good, key=lambda c: (c.us, c.bound))
-        best = min(candidates, key=lambda c: c.bound)
-        raise InputError(
-            f"no setting keeps --max-error {asked['max_error']:g}: the smallest bound found is {best.bound:.3g} "
-            f"({best.setting.name}); ask for that, or try smaller --multiples or a shorter --horizon"
-        )
-    good = [c for c in candidates if c.us <= asked["budget_us"] and c.bound < math.inf]
+    ((demand, limit),) = asked.items()
+    limited, wanted = ("bound", "us") if demand == "max_error" else ("us", "bound")
+    good = [c for c in candidates if getattr(c, limited) <= limit and c.bound < math.inf]
     if good:
-        return min(good, key=lambda c: (c.bound, c.us))
-    fast = min(candidates, key=lambda c: c.us)
-    raise InputError(
-        f"no setting costs {asked['budget_us']:g} µs per unit of time or less: the cheapest found takes {fast.us:.3g} "
-        f"({fast.setting.name}); ask for that, or try larger --multiples or smaller --widths"
-    )
+        return min(good, key=lambda c: (getattr(c, wanted), getattr(c, limited)))
+    nearest = min(candidates, key=lambda c: getattr(c, limited))
+    found = f"{getattr(nearest, limited):.3g} ({nearest.setting.name}); ask for that, or try"
+    raise InputError({
+        "max_error": f"no setting keeps --max-error {limit:g}: the smallest bound found is {found} smaller --multiples "
+                     "or a shorter --horizon",
+        "budget_us": f"no setting costs {limit:g} µs per unit of time or less: the cheapest found takes {found} larger "
+                     "--multiples or smaller --widths",
+    }[demand])  # fmt: skip
 
 
 def _held_out(errors: Tensor, limit: float, config: TuneConfig) -> dict[str, Any]:
-    """Return the errors of the choice on starts that had no part in it; `limit` is its promised bound."""
+    """Return the errors of the choice on starts that had no part in the choice; `limit` is the promised bound.
+
+    An error is infinite where a step failed.
+    """
     return {
         "starts": len(errors),
         "limit": limit,
@@ -257,4 +251,4 @@ def _held_out(errors: Tensor, limit: float, config: TuneConfig) -> dict[str, Any
         "median": float(errors.median()),
         "quantile": float(errors.quantile(config.quantile, interpolation="higher")),
         "worst": float(errors.max()),
-    }  # an error is infinite where a step failed
+    }

@@ -33,16 +33,19 @@ def test_elimination_is_the_dense_solution():
 
 
 def test_a_singular_leading_block_is_solved_densely_and_alone():
-    # fails if the sample whose first block is singular is not solved densely, or that is done only where all are
+    # fails if the sample whose first block is singular is not solved densely, only a batch of such samples is, or a
+    # system without batch axes is refused
     diagonal, upper, lower = blocks()
     diagonal[1, 0] = 0.0
     rhs = torch.ones(3, 4, 2, dtype=torch.float64)
     expected = torch.linalg.solve(dense(diagonal, upper, lower), rhs.flatten(1)).unflatten(1, (4, 2))
     torch.testing.assert_close(solve_blocks((diagonal, upper, lower), rhs), expected, rtol=1e-10, atol=1e-10)
+    alone = solve_blocks((diagonal[1], upper[1], lower[1]), rhs[1])
+    torch.testing.assert_close(alone, expected[1], rtol=1e-10, atol=1e-10)
 
 
 def test_the_diagonal_of_the_inverse():
-    # fails if the elimination from one of the two ends is wrong, or the diagonal is subtracted twice
+    # fails if the elimination from either end is wrong, or the diagonal is subtracted twice
     system = blocks()
     expected = torch.linalg.inv(dense(*system)).diagonal(dim1=-2, dim2=-1).unflatten(1, (4, 2))
     torch.testing.assert_close(diagonal_of_inverse(system), expected, rtol=1e-11, atol=1e-11)

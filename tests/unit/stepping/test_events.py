@@ -34,7 +34,8 @@ def test_crossings_of_an_exact_flow_are_exact():
     found = out.events[0]
     for sample in (0, 1):
         t = found.t[found.sample[:, 0] == sample]
-        expected = math.pi / OMEGA * torch.arange(1, len(t) + 1, dtype=torch.float64)  # q = e^{−γt/2} sin ωt
+        # q = e^{−γt/2} sin ωt
+        expected = math.pi / OMEGA * torch.arange(1, len(t) + 1, dtype=torch.float64)
         assert len(t) == int(14 * OMEGA / math.pi)
         torch.testing.assert_close(t, expected, rtol=1e-14, atol=1e-13)
     assert float(found.state.q.abs().max()) < 1e-13
@@ -75,7 +76,7 @@ def test_a_terminal_event_freezes_its_sample_only():
 
 
 def test_the_first_of_two_terminal_events_wins():
-    # fails if events of one step are taken in the order of the list; what comes after the stop is no event
+    # fails if events of a step are handled in the order of the list, or a crossing after the stop is recorded
     late, early = Event(lambda x: x.q[..., 0] - 0.5), lambda x: x.q[..., 0] - 0.45
     seen = Event(lambda x: x.q[..., 0] - 0.48, terminal=False)
     with torch.no_grad():

@@ -15,7 +15,8 @@ from herglotz.theory import LeftHamiltonian, RightHamiltonian
 from herglotz.verify import verify
 from tests.lagrangians import cubic
 
-OSCILLATOR = scene("damped_oscillator")  # m = Ω = 1, γ = 0.2
+# m = Ω = 1, γ = 0.2
+OSCILLATOR = scene("damped_oscillator")
 CONJUGATE = 3.15741941699827646
 
 
@@ -36,7 +37,7 @@ def product(q0, q1, s0, h):
 
 LEFT, MIDPOINT = (OSCILLATOR.L_d_rules[rule] for rule in ("left", "midpoint"))
 
-# L_d, h, what is lost there and nowhere near
+# L_d, critical h, and the conditions that fail at this h only
 CRITICAL = {
     "left rule, h = 1/γ": (LEFT, 5.0, {"c"}),
     "implicit midpoint, h = 2/γ": (MIDPOINT, 10.0, {"c"}),
@@ -99,7 +100,8 @@ def test_a_step_at_a_conjugate_point_is_singular_and_explained(beside):
     lost = step.status == Status.SINGULAR
     assert float(lost.double().mean()) > 0.98
     error = (step.state.p - exact[1]).abs()[~lost] / (1 + exact[1].abs()[~lost])
-    assert float(error.max()) < 1e-2  # what is kept has q0 near 0, where there is little to lose
+    # The samples that are kept have q0 near 0, where p1 loses few digits.
+    assert float(error.max()) < 1e-2
     alone = State(*(x[:2] for x in start))
     (line,) = explain_step(OSCILLATOR.L_d, alone, h[:2])
     assert line.startswith(f"sample (1,), h = {critical!r}: SINGULAR: L_d has a pole at this h (conjugate point)")
@@ -123,9 +125,10 @@ def test_beside_a_conjugate_point_and_at_rest_steps_go_on():
 
 
 def test_the_error_names_the_condition():
-    # fails if `throw` says SINGULAR and leaves the reader to find out why
+    # fails if `throw` says SINGULAR without the sample, the remedy and the reason
     h = torch.tensor([0.1, 5.0], dtype=torch.float64)
-    with pytest.raises(StepError, match=r"sample \(1,\): SINGULAR, .*; sample \(1,\), h = 5.0: SINGULAR: c = 0"):
+    words = r"sample \(1,\): SINGULAR, residual .*; try a smaller h; sample \(1,\), h = 5.0: SINGULAR: c = 0"
+    with pytest.raises(StepError, match=words):
         Stepper(LEFT, throw=True).step(states(2), h)
     with pytest.raises(StepError, match=r"step 0: .*; sample \(0,\), h = 3.157\d*: SINGULAR: L_d has a pole at this h"):
         Stepper(OSCILLATOR.L_d, throw=True).rollout(*states(2), h=CONJUGATE, steps=3)
@@ -139,12 +142,13 @@ def test_both_hamiltonians_are_nan_where_they_are_lost():
         h = torch.tensor([0.1, critical], dtype=torch.float64)
         assert RightHamiltonian(L_d)(q, p, s, h).isnan().tolist() == [False, True]
         assert LeftHamiltonian(L_d)(p, q, s, h).isnan().tolist() == [False, True]
-        assert Stepper(L_d).step(states(2), h).status.tolist() == [0, 0]  # steps do not need them
+        # A step needs neither H⁺ nor H⁻.
+        assert Stepper(L_d).step(states(2), h).status.tolist() == [0, 0]
         assert explain_step(L_d, states(2), h) == []
 
 
 def test_regularity_is_det_M_and_not_D2D2():
-    # fails if the paper's regularity condition is used (E4): it calls the first regular and the second singular
+    # fails if the paper's condition is used (E4), which calls the first L_d regular and the second singular
     q, p, s = states()
     assert lost(regularity(sum_of_squares, q, q + 0.1, s, 0.1)) == {"M"}
     assert lost(regularity(product, q, q + 0.1, s, 0.1)) == {"H_plus", "H_minus"}
@@ -183,7 +187,7 @@ def test_the_parachute_pole():
 
 @pytest.mark.parametrize("factor", [pytest.param(2.0, marks=pytest.mark.slow), 10.0])
 def test_the_escape_is_found_at_its_time(factor):
-    # fails if the place of a pole inside the step is not told: λ v0 tanh(ωh*)/ω = 1
+    # fails if the pole inside the step is not found: λ v0 tanh(ωh*)/ω = 1
     parachute, omega = scene("parachute"), math.sqrt(0.1)
     v0 = factor * omega / (0.01 * math.tanh(omega * 0.1))
     pole = math.atanh(omega / (0.01 * v0)) / omega
@@ -192,7 +196,7 @@ def test_the_escape_is_found_at_its_time(factor):
     reach, escapes = longest_step(parachute.L_d, state, torch.tensor(0.1, dtype=torch.float64))
     assert abs(reach.item() / pole - 1) < 1e-6
     assert bool(escapes)
-    # fails if a step that exists counts as an escape, or Newton's own failure is not told from one
+    # fails if a step that exists counts as an escape, or a failure of Newton counts as an escape
     reach, escapes = longest_step(parachute.L_d, state, torch.tensor(0.99 * pole, dtype=torch.float64))
     assert reach.item() == 0.99 * pole
     assert not bool(escapes)
@@ -209,7 +213,7 @@ def test_a_step_without_a_solution_is_explained():
 
 
 def test_values_that_overflow_are_named():
-    # fails if inf is taken for a lost determinant
+    # fails if inf is reported as a lost determinant
     def blown(q0, q1, s0, h):
         return torch.exp(1e6 + (q1 * q0).sum(-1)) + 0 * s0 * h
 

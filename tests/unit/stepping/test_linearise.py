@@ -53,7 +53,8 @@ def through_the_step(stepper, state, h, u):
 
     def flow(q, p, s, h, *u):
         new = stepper.step(State(q, p, s), h, u=u[0] if u else None).state
-        return torch.cat([new.q, new.p, new.s[..., None]], -1).sum(0)  # samples do not influence one another
+        # Samples are independent.
+        return torch.cat([new.q, new.p, new.s[..., None]], -1).sum(0)
 
     blocks = torch.autograd.functional.jacobian(flow, tuple(inputs))
     wide = [b if b.ndim == 3 else b[..., None] for b in blocks]  # (2n+1, B, size)
@@ -73,7 +74,7 @@ def test_the_derivative_of_a_step(case):
 
 
 def test_one_state_without_a_batch():
-    # fails if a size is read off the second axis, which one state alone does not have
+    # fails if a size is read off the second axis, which a single state does not have
     model, state, h, u = problem("viscous, inputs")
     assert u is not None
     every, one = (
@@ -112,7 +113,7 @@ def test_any_discrete_lagrangian_has_a_derivative():
 
 
 def test_the_derivative_of_a_failed_step_is_not_a_number():
-    # fails if a step without a solution has a derivative that looks like one
+    # fails if a step without a solution has a finite derivative
     model, state, h, u = problem("affine")
     bad = State(state.q, state.p * math.inf, state.s)
     ours = Stepper(model).linearise(bad, h, u)

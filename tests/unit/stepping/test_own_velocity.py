@@ -48,20 +48,15 @@ def error(refined):
     return max(float((x - y).abs().max()) for x, y in zip(found, (true_q, true_v), strict=True))
 
 
-def test_velocities_on_a_grid_are_of_order_two():  # fails if v is q̇ of the step before, or p stands for it
+def test_velocities_on_a_grid_are_of_order_two():
+    # fails if v is q̇ of the step before, or p is returned for v
     errors = [error(1), error(2), error(4)]
     assert errors[0] < 0.02
     assert [math.log2(a / b) for a, b in itertools.pairwise(errors)] == pytest.approx([2, 2], abs=0.1)
 
 
-def test_velocities_come_back_as_they_were_given():  # fails if FL⁺ and its inverse differ
-    q, v = torch.randn(2, 5, 2, generator=torch.Generator().manual_seed(0)).double()
-    stepper = hz.Stepper(Spring(bend=0.2))
-    with torch.no_grad():
-        assert torch.allclose(stepper.velocity(stepper.init_qv(q, v, h=0.1), 0.1), v, rtol=1e-12, atol=1e-13)
-
-
-def test_velocities_of_turning_points_are_found():  # fails if v ≈ 0 is wanted better than positions over h round
+def test_velocities_of_turning_points_are_found():
+    # fails if the tolerance of v ≈ 0 is below the rounding of positions over h
     q, stepper = torch.linspace(0.5, 5, 200).double()[:, None], hz.Stepper(Spring(bend=0.05))
     with torch.no_grad():
         found = stepper.velocity(stepper.init_qv(q, 1e-9 * q, h=0.01), 0.01)

@@ -36,7 +36,8 @@ def conditional(kalman, rows):
     half = torch.diag(torch.tensor([0.0, NOISE.momentum[0] ** 2 * H / 2], dtype=torch.float64))
     added = A @ half @ A.T + half
     size = 2 * (STEPS + 1)
-    root = torch.zeros(size, size, dtype=torch.float64)  # x_k = Σ_j A^(k−j) w_j with independent w_j
+    # x_k = Σ_j A^(k−j) w_j with independent w_j
+    root = torch.zeros(size, size, dtype=torch.float64)
     for k in range(STEPS + 1):
         for j in range(k + 1):
             root[2 * k : 2 * k + 2, 2 * j : 2 * j + 2] = torch.linalg.matrix_power(A, k - j)
@@ -50,8 +51,8 @@ def conditional(kalman, rows):
 
 
 def test_it_is_the_conditional_of_a_linear_motion(spring):
-    # fails if an earlier sample is moved by another covariance, forces' noise enters it, or a sample too few or too
-    # many has been taken in: mean and covariance are those of one big Gaussian
+    # fails if an earlier sample is moved by another covariance, noise of forces enters an earlier sample, or a sample
+    # is missing or counted twice: mean and covariance are those of a single Gaussian of all times
     belief = begun(spring)
     for k, y in enumerate(readings()):
         belief, _ = spring.update(spring.predict(spring.remember(belief, LAG), H), y)

@@ -22,7 +22,8 @@ LEVELS = {
         **{k: (1.0, 1.0) for k in ("scale", "speed", "stiffness", "tilt")},  # pyright: ignore[reportArgumentType]
     ),
 }
-SHARP = {  # of a measured arm with two motors
+# Friction of a measured arm with two motors.
+SHARP = {
     "kinetic.log_diagonal": [-0.7], "kinetic.off_diagonal": [0.5], "friction.coulomb": [1.0, 2.0],
     "friction.breakaway": [1.2, -1.0], "friction.log_smooth": [-0.3, -6.8], "friction.log_stribeck": [0.2, 1.7],
 }  # fmt: skip
@@ -57,23 +58,6 @@ class Counted:
         return partials(self.L_d, q0, q1, s0, h, order)
 
 
-def torch_func_step(L_d, q0, p0, s0, h, iterations=6):
-    """The step as it is written first: vmap, grad and jacrev, a fixed number of Newton iterations."""
-    from torch.func import grad, jacrev, vmap
-
-    def one(q0, p0, s0):
-        def F(q1):
-            D1, D3 = grad(L_d, (0, 2))(q0, q1, s0, h)
-            return D1 + (1 + D3) * p0
-
-        q1 = q0
-        for _ in range(iterations):
-            q1 = q1 - torch.linalg.solve(jacrev(F)(q1), F(q1))
-        return q1, grad(L_d, 1)(q0, q1, s0, h), s0 + L_d(q0, q1, s0, h)
-
-    return vmap(one)(q0, p0, s0)
-
-
 @pytest.mark.parametrize("name", LEVELS)
 def test_both_orders_and_a_plain_newton_agree(name):
     # fails if a kept Jacobian changes the answer, or its P, residual or status belongs to another point
@@ -95,33 +79,14 @@ def test_both_orders_and_a_plain_newton_agree(name):
         torch.testing.assert_close(full.q1, q1, rtol=1e-13, atol=1e-13)
 
 
-def test_the_torch_func_twin_gives_the_same_step():
-    # fails if a single step and the step as one would write it first differ
-    n, h = 2, 0.2
-
-    def L_d(q0, q1, s0, h):
-        v, q = (q1 - q0) / h, (q0 + q1) / 2
-        potential = torch.cos(q).sum() + 0.1 * torch.sin(q[0] * q[1])
-        return h * (0.5 * (v * v).sum() + potential - 0.2 * s0 - 0.05 * torch.sin(s0) * v[0])
-
-    def batched(q0, q1, s0, h):
-        v, q = (q1 - q0) / h[..., None], (q0 + q1) / 2
-        potential = torch.cos(q).sum(-1) + 0.1 * torch.sin(q[..., 0] * q[..., 1])
-        return h * (0.5 * (v * v).sum(-1) + potential - 0.2 * s0 - 0.05 * torch.sin(s0) * v[..., 0])
-
-    start = states(n)
-    out = Stepper(batched).step(start, h)
-    for a, b in zip(out.state, torch_func_step(L_d, *start, h), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13)
-
-
 def test_a_good_guess_costs_one_second_derivative():
     # fails if every iteration of a rollout evaluates the Hessian again
     counted = Counted(random_model(LEVELS["correction"]))
     with torch.no_grad():
         Stepper(counted).rollout(*states(1), h=0.02, steps=40)
     second, first = counted.orders.count(2), counted.orders.count(1)
-    assert second <= 40 + 12  # more than one only at the start, where the guess is poor
+    # More than one a step only at the start, where the guess is poor.
+    assert second <= 40 + 12
     assert second + first <= 40 * 3
 
 
@@ -197,7 +162,7 @@ def test_the_solution_of_two_equations():
     assert not bool(torch.isfinite(solve(singular, torch.ones(2, 2, dtype=torch.float64))).all(-1).any())
 
 
-# The explicit step is compensated in p as well: no growth. The implicit one rounds p1 = D2 L_d at every step.
+# The explicit step is compensated in p as well: no growth. The implicit step rounds p1 = D2 L_d at every step.
 @pytest.mark.parametrize(("level", "bound"), [("correction", 100 * 4 * 1.2e-7 * 3), ("linear", 2.5e-7)])
 def test_small_steps_in_float32_keep_the_velocity(level, bound):
     # fails if a small step is solved for q1: then (q1 − q0)/h is rounding (trap 6)
@@ -216,7 +181,8 @@ def test_small_steps_in_float32_keep_the_velocity(level, bound):
     assert not float(before) < 1e4 * float(error)
     moved = (exact.q[:, -1] - exact.q[:, 0]).abs().max()
     drift = (out.q.double()[:, -1] - exact.q[:, -1]).abs().max()
-    assert float(drift) < 1.5e-7  # half a unit in the last place of the position, however many steps
+    # Half a unit in the last place of the position, for any number of steps.
+    assert float(drift) < 1.5e-7
     assert float(drift) < 1e-2 * float(moved)
 
 

@@ -50,7 +50,8 @@ def test_one_joint_against_the_closed_form():
     tau, b, c = model.friction.coulomb.item(), model.friction.viscous.item(), math.exp(-0.1 * H)
     push = c * (p - H / 2 * q)
     bound = c * H * tau
-    mass = c**0.5 + c * H / 2 * b  # of v in F: √c m + c (h/2) b
+    # The factor of v in F: √c m + c (h/2) b.
+    mass = c**0.5 + c * H / 2 * b
     expected = (push - push.clamp(-bound, bound)) / mass * H
     with torch.no_grad():
         step = Stepper(model).step(State(q, p, torch.zeros(200).double()), H)
@@ -74,11 +75,13 @@ def test_every_step_satisfies_the_inclusion(n):
         assert rest.force is not None
         held = rest.force.held
         assert held is not None
-        left = unheld_residual(P, p)  # what friction has to hold where Δ = 0; else friction is in it already
+        # The force that friction has to hold where Δ = 0; where Δ ≠ 0 the residual contains friction.
+        left = unheld_residual(P, p)
         size = 1e-12 * (p.abs().amax(-1, keepdim=True) + held + 1)
         sticks = delta == 0
         assert bool((left.abs() <= torch.where(sticks, held, 0.0) + size).all())
-        slide = -P.force.minus.sign()  # friction and viscous force both brake
+        # Friction and viscous force both brake.
+        slide = -P.force.minus.sign()
         assert bool((slide == delta.sign())[~sticks & (delta.abs() > 1e-9)].all())
 
 
@@ -117,11 +120,11 @@ def test_no_status_but_converged_at_reversals(dtype):
 
 
 def test_alone_as_in_a_batch():
-    # fails if one sample's sticking decides another's
+    # fails if the sticking of a sample changes another sample
     model, (q, p) = joints(2, seed=5), starts(6, 2)
     with torch.no_grad():
-        together = Stepper(model).rollout(q, p, h=H, steps=30)
-        alone = [Stepper(model).rollout(a, b, h=H, steps=30).q for a, b in zip(q, p, strict=True)]
+        together = Stepper(model).rollout(q, p, h=H, steps=12)
+        alone = [Stepper(model).rollout(a, b, h=H, steps=12).q for a, b in zip(q, p, strict=True)]
     torch.testing.assert_close(together.q, torch.stack(alone), rtol=1e-12, atol=1e-13)
 
 
@@ -147,6 +150,6 @@ def test_derivatives_of_sticking_and_sliding_joints():
 
 
 def test_sticking_is_of_dry_friction():
-    # fails if a model without dry friction says that it can stick
+    # fails if a model without dry friction accepts `sticking`
     with pytest.raises(InputError, match="sticking is of dry friction; set coulomb=True"):
         ModelConfig(level="forced", sticking=True)

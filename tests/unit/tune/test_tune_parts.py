@@ -11,11 +11,12 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.progress import ProgressBar
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.recorded_range import box_of
 from herglotz.tune import Candidate, Setting, TuneConfig, distil, pareto, search, tune
 from herglotz.tune.config import allowed_failures
 from herglotz.tune.cost import Cost, Timed, measure_costs
-from herglotz.tune.distil import FlowProblem, pairs_of, widened
+from herglotz.tune.distil import distillation, pairs_of, widened
 from herglotz.tune.local_error import flag_unresolved, local_errors
 from herglotz.tune.reference import JITTER, draw_starts, record
 from herglotz.tune.search import bound_of, choose
@@ -91,11 +92,12 @@ def test_front_holds_what_nothing_beats():
 
 
 def test_choice_meets_the_demand_or_says_what_can_be_had():
-    # fails if the cheapest is taken for the most accurate, or a step's cost for that of a unit of time
+    # fails if the cheapest replaces the most accurate, or the cost is that of a step, not of a unit of time
     rough, fine = candidate(1.0, 1e-2, h=4.0), candidate(2.0, 1e-4, h=0.5)
     assert choose([fine, rough], {"max_error": 2e-2}) is rough
     assert choose([fine, rough], {"max_error": 1e-3}) is fine
-    assert choose([fine, rough], {"budget_us": 1.5}) is rough  # a step of `fine` costs less, a second more
+    # A step of `fine` costs less, a unit of time more.
+    assert choose([fine, rough], {"budget_us": 1.5}) is rough
     assert choose([fine, rough], {"budget_us": 5.0}) is fine
     with pytest.raises(InputError, match=r"smallest bound found is 0\.0001"):
         choose([fine, rough], {"max_error": 1e-5})
@@ -116,7 +118,7 @@ def test_starts_lie_in_the_box_and_differ_with_the_seed():
 
 
 def test_starts_lie_on_both_sides_of_recorded_states():
-    # fails if states are moved one way only, or further than they should
+    # fails if states are moved in one direction only, or too far
     run = run_of()
     still = replace(run, states=State(*(torch.zeros_like(x) for x in run.states)))
     for name, x in zip("qp", draw_starts(still, 60, 0), strict=False):
@@ -143,14 +145,13 @@ def test_local_errors_are_those_of_two_half_steps():
     assert flag_unresolved(stepper, out, steps, 1.0).status.max() == 0
 
 
-@pytest.mark.parametrize("level", ["conservative", "linear", "affine"])
-def test_a_flow_of_the_model_itself_has_no_residual(level):
+def test_a_flow_of_the_model_itself_has_no_residual():
     # fails if a residual of the distillation is not zero at the model that made the motions
-    run = run_of(level)
+    run = run_of("affine")
     motions = record(run, draw_starts(run, 8, 0), 2.4)
-    problem = FlowProblem(run.model, *pairs_of(motions.states, 1, 40, 0), H)
-    assert float(problem.residuals(problem.parameters.get()).abs().max()) < 1e-13
-    moved = problem.parameters.get() + 1e-3
+    problem = distillation(run.model, *pairs_of(motions.states, 1, 40, 0), H)
+    assert float(problem.residuals(ParameterVector(run.model).get()).abs().max()) < 1e-13
+    moved = ParameterVector(run.model).get() + 1e-3
     assert float(problem.residuals(moved).abs().max()) > 1e-5
 
 
@@ -161,8 +162,8 @@ def test_each_part_of_the_state_has_its_residual(part, column):
     motions = record(run, draw_starts(run, 8, 0), 2.4)
     before, after = pairs_of(motions.states, 1, 20, 0)
     wrong = State(*(x + 1e-3 * (k == part) for k, x in enumerate(after)))
-    problem = FlowProblem(run.model, before, wrong, H)
-    found = problem.residuals(problem.parameters.get()).abs().amin(0) > 1e-5
+    problem = distillation(run.model, before, wrong, H)
+    found = problem.residuals(ParameterVector(run.model).get()).abs().amin(0) > 1e-5
     assert found.tolist() == [k == column for k in range(3)]
 
 
@@ -180,7 +181,7 @@ def test_distilled_model_steps_two_at_a_time_in_the_same_coordinates():
 
 
 def test_widened_keeps_what_it_can():
-    # fails if a correction of the same size is thrown away, or a new one changes the model before it is trained
+    # fails if a correction of the same size is thrown away, or a new correction changes the model before training
     run, last = run_of(width=4), "correction.network.weights.2"
     with torch.no_grad():
         run.model.get_parameter(last).add_(0.1)
@@ -191,7 +192,7 @@ def test_widened_keeps_what_it_can():
 
 
 def test_idle_calls_are_not_counted():
-    # fails if what surrounds the steps is charged to them, or the rounds are added up
+    # fails if a step costs the call around the steps, or the rounds are added up
     from time import sleep
 
     work = Timed(lambda: sleep(0.02), 2, lambda: sleep(0.01))
@@ -204,9 +205,11 @@ def test_the_run_as_it_is_costs_no_error():
     found = tune(run_of(), max_error=1e-9, config=FAST, progress=False)
     assert found.own.worst < 1e-13
     assert found.chosen is found.own
-    assert found.candidates[1].median > 1e-4  # twice the step, the same model: the rule's error
+    # Twice the step with the same model has the error of the rule.
+    assert found.candidates[1].median > 1e-4
     assert found.held_out["share_within"] == 1.0
-    assert max(map(len, found.table().splitlines())) <= 80  # fails if the table does not fit a terminal as it opens
+    # fails if the table is wider than a terminal of 80 columns
+    assert max(map(len, found.table().splitlines())) <= 80
 
 
 def test_the_run_as_it_is_is_tried_whatever_was_asked_for(monkeypatch):
@@ -222,7 +225,7 @@ def test_the_run_as_it_is_is_tried_whatever_was_asked_for(monkeypatch):
 
 @pytest.mark.parametrize(("progress", "disable"), [(True, False), (False, True), (None, None)])
 def test_the_bar_is_shown_as_asked_for(progress, disable, monkeypatch):
-    # fails if progress=True shows none, or None does not leave it to whether there is a terminal
+    # fails if progress=True shows no bar, or None does not leave the choice to the terminal
     class Asked(Exception):
         pass
 

@@ -1,4 +1,4 @@
-/* What traced functions are written in, by the C library: names of `herglotz.codegen.program`, in double precision. */
+/* The operations of traced functions, as `herglotz.codegen.program` names them, in double precision by the C library. */
 #include <math.h>
 #include <stdlib.h>
 
@@ -42,7 +42,7 @@ static inline double FN_sum(int n, const double *x) {
   return total;
 }
 
-/* y += x W for one row x (n), W (n, m); the transpose is for other runtimes. */
+/* y += x W for a row x (n) and W (n, m); the transpose is for other runtimes. */
 static inline void FN_product(int n, int m, const double *W, const double *transpose, const double *x, double *y) {
   int i, j;
   (void)transpose;

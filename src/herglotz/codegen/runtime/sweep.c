@@ -1,14 +1,14 @@
 /* Free runs over segments of a trajectory with their derivatives: the compiled half of `herglotz.training.kernel`.
 
-   Before this file stand what depends on the model: hz_N coordinates, hz_M inputs, hz_P parameters, hz_D numbers of a
-   state that the motion depends on (q, p, and s where it enters), and the functions hz_evaluate, hz_finish, hz_derive
-   and, with set-valued dry friction, hz_rest, which leave out what is behind gates that hz_prepare does not open
+   The code before this file depends on the model: hz_N coordinates, hz_M inputs, hz_P parameters, hz_D numbers of a
+   state that the motion depends on (q, p, and s where s enters), and the functions hz_evaluate, hz_finish, hz_derive
+   and, with set-valued dry friction, hz_rest, which skip statements behind gates that hz_prepare leaves closed
    (`codegen/gated.py`). */
 
 #define hz_X (2 * hz_N + 1)
 enum { hz_MAX_ITERATIONS = 60 };
-/* The last move of Newton's iteration is taken and not looked at again: quadratic convergence makes the next one
-   rounding. */
+/* A move of Newton's iteration below this part of the size is the last: convergence is quadratic, so that the next move
+   would be rounding. */
 #define hz_LAST 1e-8
 
 static inline double hz_largest(const double x[hz_N]) {
@@ -49,7 +49,7 @@ static inline int hz_solve(const double J[hz_N * hz_N], const double b[hz_N], do
   return 1;
 }
 
-/* |F| over the diagonal of J where the iteration began, in units of q: what a move has to lower. */
+/* The merit that a move has to lower: |F| over the diagonal of J where the iteration began, in units of q. */
 static inline double hz_merit(const double F[hz_N], const double scale[hz_N]) {
   double y[hz_N];
   int i;
@@ -57,7 +57,7 @@ static inline double hz_merit(const double F[hz_N], const double scale[hz_N]) {
   return hz_largest(y);
 }
 
-/* The increment of a step by Newton's iteration with backtracking, from a guess; 0 where there is none. */
+/* The increment of a step by Newton's iteration with backtracking, from a guess. Return 1, or 0 if there is no step. */
 static int hz_increment(const double x[hz_X], double h, const double *u, const double *theta, const double *constants,
                         const char *gate, const double *fixed, double delta[hz_N]) {
   double z[hz_N], F[hz_N], J[hz_N * hz_N], move[hz_N], scale[hz_N], merit;
@@ -136,7 +136,7 @@ static void hz_carry(const double A[hz_D * hz_D], const double G[hz_D * hz_P], d
   for (a = 0; a < hz_D * W; a++) Z[a] = Y[a];
 }
 
-/* The residuals of one sample, r = weight (q - y), and their rows, both times the root of the robust weight. */
+/* The residuals of a sample, r = weight (q - y), and their rows, both times the root of the robust weight. */
 static void hz_observe(const double *x, const double *Z, long W, const double *y, const double *weight, double freedom,
                        double *r, double *rows) {
   int i;
@@ -155,16 +155,16 @@ static void hz_observe(const double *x, const double *Z, long W, const double *y
 
 /* Free runs over S segments; the first model step of each is begin[s]. Return -1, or the segment that has no step.
 
-   x (S, X): the start of each, then its end.  delta (S, N): a guess of its first increment, then its last one.
-   sample[k]: the sample that the end of model step k is, or -1; first[s]: that of the start.
-   states: (X,) at every node, those of segment s from node place[s] on.
-   Z (S, D, W), W = F + D: derivatives of x by the free parameters `chosen` and the start; NULL: none are asked for.
-   r (N, n), rows (N, n, W) of the samples from `offset` on;  B (S, D, F), T (S, D, D), g (S, D): sums of the rows of
-   each segment's start by parameters, start and residuals. */
+   x (S, X): the start of each segment, then its end.  delta (S, N): a guess of its first increment, then its last
+   increment.  sample[k]: the sample at the end of model step k, or -1; first[s]: the sample at the start.
+   states: (X,) at every node; the nodes of segment s start at place[s].
+   Z (S, D, W), W = F + D: derivatives of x by the free parameters `chosen` and the start; NULL: no derivatives.
+   r (N, n), rows (N, n, W) of the samples from `offset` on;  B (S, D, F), T (S, D, D), g (S, D): the products of the
+   columns by the start with those by parameters and by the start, and with the residuals, summed over a segment. */
 long hz_sweep(long S, const long *begin, const double *h, const double *u, const double *theta, const double *constants,
               long F, const long *chosen, const long *sample, const long *first, const double *y, const double *weight,
-              double freedom, long offset, const long *place, double *x, double *delta, double *states, double *Z, double *r, double *rows,
-              double *B, double *T, double *g) {
+              double freedom, long offset, const long *place, double *x, double *delta, double *states, double *Z,
+              double *r, double *rows, double *B, double *T, double *g) {
   const long W = F + hz_D;
   double *const Y = Z ? (double *)malloc((size_t)(hz_D * W) * sizeof(double)) : 0;
   long s, k, at, failed = -1;
@@ -178,7 +178,8 @@ long hz_sweep(long S, const long *begin, const double *h, const double *u, const
   for (s = 0; s < S && failed < 0; s++) {
     double *const here = x + s * hz_X, *const own = delta + s * hz_N, *const D = Z ? Z + s * hz_D * W : 0;
     double before = begin[s] < begin[s + 1] ? h[begin[s]] : 1;
-    for (k = begin[s] - 1; k < begin[s + 1]; k++) { /* the start, then the end of every step */
+    /* The start, then the end of every step. */
+    for (k = begin[s] - 1; k < begin[s + 1]; k++) {
       if (k >= begin[s]) {
         const double *const input = hz_M ? u + k * hz_M : 0;
         double end[hz_N + 1], A[hz_D * hz_D], G[hz_D * hz_P], c;

@@ -1,7 +1,7 @@
 /* A symmetric positive definite block tridiagonal system of S blocks (d, d), with R right hand sides.
 
-   diagonal (S, d, d); upper (S, d, d): the block right of each, 0 behind the last of a trajectory; x (S, d, R): the right
-   hand sides, then the solutions; work (S, d, d). Return -1, or the block that is not positive definite. */
+   diagonal (S, d, d); upper (S, d, d): the block to the right of each, 0 at the end of a trajectory; x (S, d, R): the
+   right hand sides, then the solutions; work (S, d, d). Return -1, or the block that is not positive definite. */
 long hz_eliminate(long S, long d, long R, const double *diagonal, const double *upper, double *x, double *work) {
   double *const pivot = (double *)malloc((size_t)(d * d) * sizeof(double));
   long s, i, j, k, a, bad = -1;
@@ -12,7 +12,8 @@ long hz_eliminate(long S, long d, long R, const double *diagonal, const double *
       pivot[i] = diagonal[s * d * d + i];
       right[i] = upper[s * d * d + i];
     }
-    if (s > 0) { /* less what the block before takes over */
+    /* Eliminate the block to the left. */
+    if (s > 0) {
       const double *const U = upper + (s - 1) * d * d, *const W = work + (s - 1) * d * d, *const last = x + (s - 1) * d * R;
       for (k = 0; k < d; k++)
         for (i = 0; i < d; i++) {
@@ -22,7 +23,8 @@ long hz_eliminate(long S, long d, long R, const double *diagonal, const double *
           for (a = 0; a < R; a++) own[i * R + a] -= by * last[k * R + a];
         }
     }
-    for (j = 0; j < d && bad < 0; j++) { /* Cholesky: the factor in the lower half */
+    /* Cholesky: the factor in the lower half. */
+    for (j = 0; j < d && bad < 0; j++) {
       double y = pivot[j * d + j];
       for (k = 0; k < j; k++) y -= pivot[j * d + k] * pivot[j * d + k];
       if (!(y > 0)) bad = s;
