@@ -70,18 +70,17 @@ def png_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-# These figures draw positions and records of the fit alone: the level and the dtype of the model reach the others,
-# and each of these two kinds is drawn in four figures. The slow suite has all.
-PLAIN = ("trajectory", "training", "plan")
-SLOW = pytest.mark.slow
+# The level and the dtype of the model do not reach these figures, which draw positions and records of the fit.
+PLAIN = {"trajectory", "training", "plan", "sizes"}
 
 
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
-        pytest.param(kind, name, marks=SLOW if name in PLAIN and kind in ("affine", "single precision") else ())
+        (kind, name)
         for kind in KINDS
         for name in (*FIGURES, *IDENTITIES)
+        if name not in PLAIN or kind not in ("affine", "single precision")
     ],
 )
 def test_every_figure_of_every_kind_of_run(tmp_path, kind, name):
