@@ -26,7 +26,7 @@ def drawn(figure: Figure) -> Figure:
 
 def test_nothing_overlaps_and_nothing_is_cut_off():
     # fails if figures have no layout engine: labels, titles and panels then lie over each other
-    figure = drawn(plot_trajectory(fake_run(trajectories=5, steps=20)))
+    figure: Any = drawn(plot_trajectory(fake_run(trajectories=5, steps=20)))
     with styled():
         boxes = [ax.get_tightbbox() for ax in figure.axes]
     for box in boxes:
