@@ -36,10 +36,12 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-Files = dict[str, str]  # path from the root of the repository → text
+# Path from the root of the repository → text.
+Files = dict[str, str]
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 LOOPS = (ast.For, ast.While)
-LONG, WIDE = 40, 6  # lines of a function, its parameters
+# Lines of a function, and its parameters, above which the function is long or wide.
+LONG, WIDE = 40, 6
 # Rooms and the lines they may have (docs/architecture.md); `systems` is what `scenes` was called.
 BUDGETS = {
     "errors, settings, version": (("src",), 150),
@@ -60,7 +62,8 @@ GOALS = {
     "circles": 0, "hanging comments": 150, "pronouns": 3.0, "letters a line": 46, "decisions": 9.0,
 }  # fmt: skip
 BRANCHES = (ast.If, ast.IfExp, ast.For, ast.AsyncFor, ast.While, ast.ExceptHandler, ast.comprehension, ast.match_case)
-SOLVE = re.compile(r"(^|_)(solve|solver|solve_ex|inv_ex|pseudo_inverse)$")  # names that solve a linear problem
+# Names of functions that solve a linear problem.
+SOLVE = re.compile(r"(^|_)(solve|solver|solve_ex|inv_ex|pseudo_inverse)$")
 STEP = re.compile(r"^(?!.*(optim|schedule)).*\.(step|take|advance)$")
 NO_PROSE = re.compile(r"#\s*(\(|noqa|type:|pyright:|fmt:)")  # comments for shapes and for tools
 PRONOUNS = re.compile(r"\b(it|they|them|one|ones|such|what|whose|those)\b", re.I)
@@ -156,7 +159,8 @@ def imports(files: Files) -> dict[str, set[str]]:
     trees = {p: ast.parse(files[p]) for p in paths}
     found: dict[str, set[str]] = {}
     for path, tree in trees.items():
-        names = [] if path.endswith("__init__.py") else references(tree)  # a package only passes names on
+        # A package only passes names on.
+        names = [] if path.endswith("__init__.py") else references(tree)
         origins = {_origin(module, trees, *x) if x[1] else module.get(x[0]) for x in names}
         found[path] = {f for f in origins if f} - {path}
     return found
@@ -185,7 +189,8 @@ def _origin(module: dict[str, str], trees: dict[str, ast.Module], package: str, 
 def circles(edges: dict[str, set[str]]) -> list[list[str]]:
     """Groups of files each of which reaches every other one of its group by imports."""
     reach = {path: set(files) for path, files in edges.items()}
-    for middle in reach:  # Warshall's transitive closure
+    # The transitive closure by Warshall's algorithm.
+    for middle in reach:
         for ends in reach.values():
             if middle in ends:
                 ends |= reach[middle]
@@ -201,7 +206,8 @@ def uncalled(files: Files) -> list[str]:
     found = []
     for path in (p for p in readers if p.startswith("src/") and p.endswith(".py")):
         for node in ast.parse(files[path]).body:
-            name = getattr(node, "name", "_")  # of a function or a class
+            # Functions and classes alone have a name.
+            name = getattr(node, "name", "_")
             if not name.startswith("_") and everywhere[name] == words[path][name] == 1:
                 found.append(f"{path}:{node.lineno} {name}")
     return found

@@ -33,7 +33,8 @@ def elsewhere(text: str, folder: Path, leaves: Callable[[str], bool]) -> str:
 
 try:
     from hatchling.metadata.plugin.interface import MetadataHookInterface  # pyright: ignore[reportMissingImports]
-except ImportError:  # the site needs `elsewhere` alone
+# The documentation site imports `elsewhere` alone, and needs no hatchling.
+except ImportError:
     MetadataHookInterface = object
 
 

@@ -36,11 +36,15 @@ HERE = f"{platform.python_implementation()} {platform.python_version().rpartitio
 )
 ALLOWED = {"0BSD", "Apache-2.0", "BSD", "BSD License", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "MIT",
            "LLVM-exception", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Python Software Foundation License", "Zlib"}  # fmt: skip
-CUDA = ("nvidia-", "cuda-")  # proprietary parts of torch's CUDA builds, which herglotz does not need
-NO_FILE = re.compile(r"No matching distribution found for (\S+)")  # pip reaches no index, or one without such a file
-LISTED = re.compile(r"\(from versions: (.*)\)")  # what it has instead
-SLIPS = 3  # lines mistyped at once, by assumption: an index that lacks more than these is not the lock's
-ONE_LINE = 60  # letters; a longer field holds the licence's text, not its name
+# Proprietary parts of torch's CUDA builds, which herglotz does not need.
+CUDA = ("nvidia-", "cuda-")
+# pip's message if no index is reached or the index has no such file, and the versions that the index has instead.
+NO_FILE = re.compile(r"No matching distribution found for (\S+)")
+LISTED = re.compile(r"\(from versions: (.*)\)")
+# An index that lacks more files than this is another index than the lock's: so many lines are not mistyped at once.
+MAX_MISSING = 3
+# Letters of a licence's name. A longer field holds the text of the licence.
+MAX_NAME = 60
 
 
 def project() -> dict[str, Any]:
@@ -64,10 +68,11 @@ def runtime() -> list[Distribution]:
 
 def licence(package: Distribution) -> str:
     """SPDX expression where the package has one, or the name that it gives its licence; "" where it gives none."""
-    said = package.metadata.json  # of a field that stands there several times, a list
+    # A field that appears several times is a list.
+    said = package.metadata.json
     field = str(said.get("license", ""))
     named = [line.rpartition(" :: ")[2] for line in said.get("classifier", []) if line.startswith("License ::")]
-    return str(said.get("license_expression", "")) or (field if 0 < len(field) < ONE_LINE else " AND ".join(named))
+    return str(said.get("license_expression", "")) or (field if 0 < len(field) < MAX_NAME else " AND ".join(named))
 
 
 def allowed(words: str) -> bool:
@@ -140,11 +145,12 @@ def check_lock() -> None:
         return
     lines, missing, builds = [line for line in text.splitlines() if "==" in line], [], []
     said = _checked(lines)
-    while len(missing) <= SLIPS and (found := NO_FILE.search(said)):
+    while len(missing) <= MAX_MISSING and (found := NO_FILE.search(said)):
         (builds if _is_build(found[1], said) else missing).append(found[1])
         lines = [line for line in lines if line.split()[0] != found[1]]
-        said = _checked(lines, "--no-deps")  # what needs the one left out is no mistake
-    if len(missing) > SLIPS:
+        # Without dependencies: a package that requires the one left out is no mistake of the lock.
+        said = _checked(lines, "--no-deps")
+    if len(missing) > MAX_MISSING:
         print(f"lock.txt: not checked: no package index, or not the lock's: it lacks {', '.join(missing)} and more")
     elif said or missing:
         sys.exit(said or f"lock.txt: pip finds the other files, and no {', '.join(missing)}: mistyped, or withdrawn?")

@@ -23,7 +23,8 @@ from herglotz.verify import verify
 
 
 def main() -> int:
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
+    # Small matrices are fastest on one thread.
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     about = "\n".join(f"  {name:15} {make().about}" for name, make in CONFIGS.items())
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=f"experiments:\n{about}", formatter_class=argparse.RawDescriptionHelpFormatter

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-KNOWN_DRAWS = (1, 4471, 4627, 8053, 8817)  # of the zoo: those that earlier work looked at
-FRESH_DRAWS = (2953, 6311, 9377)  # of the zoo: those that nothing was changed for
-OPEN_DRAW = 5417  # seed of the open systems
-COUNT, OPEN_COUNT = 10, 12  # systems of a draw
+# Seeds of the zoo that earlier work looked at.
+KNOWN_DRAWS = (1, 4471, 4627, 8053, 8817)
+# Seeds of the zoo for which nothing was changed.
+FRESH_DRAWS = (2953, 6311, 9377)
+# Seed of the open systems.
+OPEN_DRAW = 5417
+# Number of systems of a draw.
+COUNT, OPEN_COUNT = 10, 12
 CASES = (
     ("bilinear_damper", ("",)), ("closed_loop", ("", "_one", "_clean", "_dither", "_nod", "_tenth")),
     ("torsion_turns", ("", "_small", "_two")), ("furuta", ("", "_big")), ("base_road", ("", "_two")),
@@ -35,8 +39,10 @@ class Row:
     """A row of the table."""
 
     name: str
-    maker: str  # module of this package, and the function that writes the job into a folder
-    given: tuple[str | int | float, ...] = ()  # what else the function takes
+    # Module of this package, and its function that writes the job into a folder.
+    maker: str
+    # Further arguments of the function.
+    given: tuple[str | int | float, ...] = ()
 
     @property
     def folder(self) -> str:

@@ -22,11 +22,14 @@ class Absent(Exception):
 class Trial:
     """A recording from an unseen start, or windows of one."""
 
-    data: str  # path, relative to the job's folder or absolute
-    warmup: int = 20  # samples that the state is read from: the default of `herglotz predict`
+    # Path, relative to the folder of the job or absolute.
+    data: str
+    # Samples that the state is estimated from: the default of `herglotz predict`.
+    warmup: int = 20
     windows: int | None = None
     horizon: float | None = None
-    scale: float | None = None  # what an error of 1 is, where it differs between the trials of a job
+    # Unit of the error, if the trials of a job have different units.
+    scale: float | None = None
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -39,17 +42,23 @@ class Trial:
 class Job:
     """A fit by the command line, and how its result is scored."""
 
-    train: str  # path, relative to the job's folder or absolute
+    # Path, relative to the folder of the job or absolute.
+    train: str
     trials: Sequence[Trial] = ()
     command: str = "fit"
     flags: Sequence[str] = ()
-    later: bool = True  # whether the unseen part of the training recordings is scored, where there is one
-    scale: Sequence[float] | float | None = None  # of each coordinate: what an error of 1 is; None: 1 in the unit
-    unit: str = ""  # of the error
-    size: Sequence[float] | None = None  # of each coordinate: the spread of its motion; None: that of the data read
+    # True if the held-out part of the training recordings is scored.
+    later: bool = True
+    # Unit of the error of each coordinate; None: 1, in `unit`.
+    scale: Sequence[float] | float | None = None
+    # Name of the unit of the error.
+    unit: str = ""
+    # Spread of the motion of each coordinate; None: the spread of the data.
+    size: Sequence[float] | None = None
     # A perfect model's error; None where it is not known, and no verdict can be called too strict.
     attainable: float | None = None
-    coordinates: Sequence[str] | None = None  # what is to be predicted: other coordinates are a wrong reading
+    # Coordinates to predict: a run of other coordinates has read the data in a wrong way.
+    coordinates: Sequence[str] | None = None
     in_degrees: bool = False  # `scale` is in degrees; a run that reads radians is scored in radians
     facts: dict[str, Any] = field(default_factory=dict)
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from benchmarks.judging import job
 from benchmarks.judging.catalogue import named
 
-ABSENT = 4  # exit code: the input data are not on this machine
+# Exit code if this machine has no such data.
+ABSENT = 4
 
 
 def main(name: str, folder: str) -> int:
@@ -18,7 +19,8 @@ def main(name: str, folder: str) -> int:
     row, home = named(name), Path(folder)
     module, function = row.maker.split(":")
     home.mkdir(parents=True, exist_ok=True)
-    warnings.filterwarnings("ignore", category=RuntimeWarning)  # draws that run away overflow
+    # Draws that diverge overflow.
+    warnings.filterwarnings("ignore", category=RuntimeWarning)
     try:
         job.write(
             Path(folder), getattr(import_module(f"benchmarks.judging.{module}"), function)(Path(folder), *row.given)

@@ -30,7 +30,8 @@ TWO_JOINTS = "uw_double_pendulum/uw_double_pendulum_estimation.csv"
 WINDOWS, LEFT_OUT, CIRCUIT = 120, 5, 10_000
 EVERYTHING = ("--train-fraction", "1")
 # What a recording of a case is to be read as, where the fit may read something else.
-OTHER = ("torsion_turns/train_two",)  # of another system than the tests beside it: its own unseen time is predicted
+# Recordings of another system than the tests in their folder: their own held-out time is predicted.
+OTHER = ("torsion_turns/train_two",)
 # Unstable motion is missed by far more than the noise. What the true equation misses of it from the same warm-up, in
 # rad: open loops, with the numbers that least squares gives of each training file (`expected.json`); windows of 2 s of
 # an arm that whirls, with the true numbers: one run of 10 s is missed by 3.9 rad.

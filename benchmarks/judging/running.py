@@ -18,23 +18,31 @@ from benchmarks.judging.catalogue import Row
 from benchmarks.judging.make import ABSENT
 
 ROOT = Path(__file__).resolve().parents[2]
-WALL = 20  # times its limit that a process may take on a busy machine
+# A busy machine may take this multiple of a process's limit on processor time.
+WALL = 20
 # A signal of its own says that the time is over; 5 s later comes one that nothing can catch.
 BOUND = 'ulimit -c 0; ulimit -H -t $(($0 + 5)); ulimit -S -t "$0"; exec "$@"'
-LOOK = 0.05  # s between two looks at a process
-MAKING = 1200  # processor time for the data of a row, s: a draw of the zoo fits its true equation many times
-AT_NOISE, USABLE = 1.5, 0.1  # times a perfect model's error, and of the spread: the bounds of the zoo's outcomes
-REFUSED, NO_FIT = 2, 3  # exit codes of the command line
-MEGABYTE = 1024  # kilobytes, in which Linux counts
+# Time between two looks at a process. [s]
+LOOK = 0.05
+# Limit on the processor time of a row's data [s]: a draw of the zoo fits its true equation many times.
+MAKING = 1200
+# Bounds of the zoo's outcomes: as a multiple of a perfect model's error, and as a part of the spread.
+AT_NOISE, USABLE = 1.5, 0.1
+# Exit codes of the command line.
+REFUSED, NO_FIT = 2, 3
+# In kilobytes, the unit of Linux.
+MEGABYTE = 1024
 
 
 @dataclass(frozen=True)
 class Ended:
     """How a process ended."""
 
-    code: int | None  # None: out of time
-    cpu: float  # s of processor time, of its children too
-    peak: float  # MB of memory
+    # Exit code; None if the limit was reached.
+    code: int | None
+    # Processor time with that of child processes [s], and the largest memory [MB].
+    cpu: float
+    peak: float
     out: str
     err: str
 
@@ -54,7 +62,8 @@ def limited(command: list[str], limit: float, environment: dict[str, str], folde
     with (folder / "stdout").open("w+") as out, (folder / "stderr").open("w+") as err:
         bound = ["sh", "-c", BOUND, str(max(1, round(limit))), *command]
         process = subprocess.Popen(bound, stdout=out, stderr=err, env=environment, cwd=folder)
-        waited = 0.0  # counted, not read off a clock: while the judge itself is stopped, its children may be, too
+        # The time is counted, not read off a clock: a stopped judge may have stopped children.
+        waited = 0.0
         while True:
             found, status, usage = os.wait4(process.pid, os.WNOHANG)
             if found:
@@ -85,9 +94,11 @@ def environment(source: Path | None) -> dict[str, str]:
 class Judge:
     """What all rows share."""
 
-    prepared: Path  # folder of data, kept between runs of the judge
-    scratch: Path  # folder of runs
-    limit: float  # s of processor time of a command
+    # Folder of data, kept between runs of the judge, and folder of runs.
+    prepared: Path
+    scratch: Path
+    # Limit on the processor time of a command. [s]
+    limit: float
     environment: dict[str, str]
 
     def row(self, of: Row) -> dict[str, Any]:
@@ -107,7 +118,8 @@ class Judge:
         done = self._python([*command, *plots], self.limit, folder / "fit")
         row |= {"cpu_s": round(done.cpu, 2), "peak_mb": round(done.peak), "exit": done.code, "unit": asked.unit}
         row |= {"error": None, "relative": None, "spread": None, "groups": {}, "trouble": "", "said": done.last}
-        row["asks"] = bool(asked.trials) or asked.later  # whether an error is to be measured at all
+        # True if the row measures an error.
+        row["asks"] = bool(asked.trials) or asked.later
         row["verdict"] = f"no result in {self.limit:g} s" if done.code is None else _without_run(done.code)
         if done.code in (0, NO_FIT):
             score = self._python(["benchmarks.judging.scoring", str(home), str(folder / "run")], self.limit, folder)

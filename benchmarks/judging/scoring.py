@@ -22,7 +22,8 @@ from benchmarks.judging.job import Job, Trial
 from herglotz.training import load_run
 
 Array = NDArray[np.float64]
-Pairs = list[tuple[Array, Array]]  # of each part: (prediction, data), both (K, n)
+# (prediction, data) of each part, both (K, n).
+Pairs = list[tuple[Array, Array]]
 # The verdicts' own words, and the class of each.
 CLASSES = (
     ("too little was recorded", "too little"), ("does not fit", "no fit"), ("worse than the noise", "worse"),
@@ -91,7 +92,8 @@ def _predicted(of: Job, run: Any) -> tuple[dict[str, tuple[Pairs, Array]], str]:
         try:
             found = run.predict(trial.data, **trial.settings)
             parts = pairs_of(found.prediction, found.data.q, found.data.lengths, found.train_lengths)
-        except Exception as error:  # what a version says of a recording is a result
+        # Whatever a version of the package raises is a result of this version.
+        except Exception as error:
             trouble, parts = f"predict {name}: {error}", [(np.full((1, n), np.nan), np.zeros((1, n)))]
         groups[name] = parts, _scale(of, trial, n)
     return groups, trouble

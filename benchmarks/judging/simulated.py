@@ -16,8 +16,10 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig
 
 WARMUP, EVERYTHING = 20, ("--train-fraction", "1")
-NOISE = 0.01  # rad, or of a motion's size
-EXACT = 1e-4  # of the spread: what counts as the noise of exact data, as in the zoo
+# Standard deviation, in rad or relative to the size of a motion.
+NOISE = 0.01
+# Errors of exact data are judged as if the data had this noise, relative to their spread; the zoo does the same.
+EXACT = 1e-4
 
 
 def _job(folder: Path, train: Trajectories, test: Trajectories, noise: float = 0.0) -> Job:
@@ -65,7 +67,8 @@ def disturbed(folder: Path, seed: int) -> Job:
     q, v = (2 * torch.rand(2, count, generator=make, dtype=torch.float64) - 1) * torch.tensor([[2.0], [1.0]])
     out, k = [q], h / parts
     for _ in range(steps):
-        for _ in range(parts):  # velocity Verlet with damping: an error of 1e-5 beside the kicks
+        # Velocity Verlet with damping: the error is 1e-5 of the kicks.
+        for _ in range(parts):
             v = v + k / 2 * (-q.sin() - 0.2 * v)
             q = q + k * v
             v = (v - k / 2 * q.sin()) / (1 + k / 2 * 0.2)

@@ -12,9 +12,12 @@ Row = dict[str, Any]
 # A row is worse or slower beyond these. Processor time of one fit differs by 10 % between quiet runs, and by up to 30 %
 # beside other work; starting Python takes 2 s.
 WORSE, SLOWER, LONGER = 1.1, 1.3, 2.0
-CLEARLY = 2.0  # standard errors of the logarithm of a ratio
-FLOOR = 1e-6  # of the spread: errors below it are rounding, whose ratios mean nothing
-FEWER = 2  # parts that a standard error needs
+# A row is worse only if the logarithm of the ratio of errors exceeds this number of its standard errors.
+CLEARLY = 2.0
+# Errors below this part of the spread are rounding, and have no meaningful ratio.
+FLOOR = 1e-6
+# A standard error needs at least this number of parts.
+FEWER = 2
 
 
 def number(value: float | None) -> float:

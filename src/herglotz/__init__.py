@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # `typing` takes 20 ms, in which an interrupt of the command would print a traceback
+# `typing` takes 20 ms to import; an interrupt of the command in that time would print a traceback.
+TYPE_CHECKING = False
 
 __version__ = "0.1.0"
 
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
     from herglotz.stepping import State, Status, Stepper
     from herglotz.training import FitConfig, Run, fit, load_run, save_run
 
-# Loaded at first use, so that `herglotz --help` does not wait for torch. (`verify` is a room of the same
-# name, and stays one: `from herglotz.verify import verify`.)
+# Names are loaded at first use, so that `herglotz --help` does not import torch. `verify` is the package of that name:
+# `from herglotz.verify import verify` has the function.
 _ROOMS = {
     "data": ("Trajectories", "load", "save", "simulate"),
     "errors": ("InputError",),

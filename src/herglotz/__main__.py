@@ -1,7 +1,7 @@
 """`python -m herglotz` and the command `herglotz`.
 
-An interrupt while the command line itself is imported (0.1 s) ends the process quietly, as later ones do. One that
-comes when all is done, while Python ends (0.4 s with torch), leaves the exit code as it is.
+An interrupt while the command line is imported (0.1 s) ends the process without a traceback, as a later interrupt
+does. An interrupt while Python ends (0.4 s with torch) does not change the exit code.
 """
 
 import os
@@ -14,7 +14,8 @@ def _leave(_number: int, _frame: object) -> None:
     os._exit(130)
 
 
-if __name__ == "__main__" or os.path.basename(sys.argv[0]).startswith("herglotz"):  # no program that imports this
+# A program that imports this module keeps its own handlers.
+if __name__ == "__main__" or os.path.basename(sys.argv[0]).startswith("herglotz"):
     signal.signal(signal.SIGINT, _leave)
     signal.signal(signal.SIGTERM, _leave)
 
@@ -22,7 +23,7 @@ from herglotz.cli import main  # noqa: E402  (after the handlers)
 
 
 def command() -> int:
-    """Run the subcommand that the process was started with; the process is to end with what is returned."""
+    """Run the subcommand of the process's arguments; return the exit code."""
     code = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -35,61 +35,64 @@ except ImportError:
 
 Array = np.ndarray
 Mode = gymnasium.vector.AutoresetMode
-FAILED = 15  # bits of a status in C (docs/c.md); the next bit marks a state outside the box
+# Bits of `Status` in a status of C (docs/c.md). The next bit marks a state outside the box.
+STATUS_BITS = 15
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
-    """B copies of a learned system, (q, p, s) ↦ (q, p, s)′ under an input u that is held, stepped at once in C.
+    """B copies of a learned system, (q, p, s) ↦ (q, p, s)′ under an input u that is held, stepped together in C.
 
-    An observation is (q, v), 2n numbers in the units of the data, per unit of time for v; an angle lies within
-    half a turn of the middle of its recorded range. An action is u, m numbers in the units of the data; beyond the
-    bounds it saturates, as an actuator does. A reset computes p = ∂L/∂v from v, and each step v from p
+    An observation is (q, v), 2n numbers in the units of the data, per unit of time for v; an angle lies within half a
+    turn of the middle of its recorded range. An action is u, m numbers in the units of the data; an action beyond the
+    bounds saturates, as an actuator does. A reset computes p = ∂L/∂v from v, and each step computes v from p
     (`docs/c.md`).
 
-    An environment ends (`terminated`) where a step fails and where a state leaves the box of the data that the model
-    was fitted to: beyond the box the model extrapolates. `infos["status"]`, (B,), then has the `Status` of the step,
-    plus 16 for the box, and `infos["_status"]` says of which environments. No observation is NaN: a failed step returns
-    that of the last good state, and a position outside the box is put on the boundary.
+    An environment ends (`terminated`) if a step fails, or if a state leaves the box of the data that the model was
+    fitted to: beyond the box the model extrapolates. `infos["status"]`, (B,), is then the `Status` of the step, plus 16
+    if the state left the box, and `infos["_status"]`, (B,) bool, marks the environments that ended in this way. No
+    observation is NaN: a failed step returns the observation of the last good state, and a position outside the box is
+    moved to its boundary.
 
     Parameters
     ----------
     source
         A run with inputs, the path of a C header that `run.export` or `export_c` wrote, or the result of `load_c`.
     num_envs
-        B.
+        Number of environments B.
     reward
         (q, v, u) ↦ (B,) rewards, of arrays (B, n), (B, n) and (B, m): the observation after the step, and the input
         during the step, after saturation.
     reset
         (generator, count) ↦ (q, v), each (count, n), or (q, v, s) with s (count,): starts of new episodes, inside the
-        box, drawn from the numpy generator that `env.reset(seed=…)` seeds. s is 0 by default.
+        box. `env.reset(seed=…)` seeds the numpy generator. s is 0 by default.
     terminated
-        (q, v, u) ↦ (B,) bool: where the task ends an episode; None: nowhere.
+        (q, v, u) ↦ (B,) bool, which episodes the task ends; None: no episode.
     exit_reward
-        Added to the reward, in the same unit, if a failed step or the box ends an episode. If rewards are costs, an
-        early end is cheap unless `exit_reward` is negative.
+        Added to the reward, in the same unit, if a failed step or the box ends an episode. If rewards are costs, a
+        policy gains by an early end unless `exit_reward` is negative.
     input_low, input_high
-        (m,) bounds of u, in the units of the data; None: the range that was recorded.
+        (m,) bounds of u, in the units of the data; None: the recorded range.
     h
-        Step of the model, in the data's unit of time; None: that of the model.
+        Step, in the data's unit of time; None: the step of the model.
     steps_per_action
         Steps of h under one action.
     max_episode_steps
         Actions after which an episode is cut off (`truncated`); None: never.
     autoreset_mode
-        "NextStep", "SameStep" or "Disabled", or gymnasium's `AutoresetMode`: whether an environment that ended is reset
-        by the next `step`, which ignores its action and gives the reward 0; by the same, with the last observation in
-        `infos["final_obs"]`; or by `env.reset(options={"reset_mask": mask})`.
+        "NextStep", "SameStep" or "Disabled", or gymnasium's `AutoresetMode`: which call resets an environment that
+        ended. "NextStep": the next `step`, which ignores the action of this environment and returns the reward 0.
+        "SameStep": the same `step`, with the last observation in `infos["final_obs"]`. "Disabled":
+        `env.reset(options={"reset_mask": mask})`.
     dtype
-        "float32" or "float64", of observations and of the spaces; the model steps in the dtype of the header.
+        "float32" or "float64": dtype of observations and spaces. The model steps in the dtype of the header.
     trust_code
         As in `load_c`, for a header.
 
     Raises
     ------
     InputError
-        If the source has no C, no inputs, no velocities or no recorded range of inputs, or an argument is not usable;
-        from `reset` and `step`, if a function gives arrays of another shape or numbers that are not finite.
+        If the source has no C, no inputs, no velocities or no recorded range of inputs, or an argument is wrong; from
+        `reset` and `step`, if a user's function returns arrays of another shape or numbers that are not finite.
     ImportError
         If gymnasium is not installed.
     """
@@ -123,15 +126,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs, self.mode, self.dtype = num_envs, Mode(autoreset_mode), np.dtype(dtype)
         self.metadata = {"autoreset_mode": self.mode, "render_modes": []}
         self.max_episode_steps, self.exit_reward = max_episode_steps, float(exit_reward)
-        self._last = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
+        self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._reward, self._draw, self._ends = reward, reset, terminated
         self.stepper = stepper = _stepper_of(source, trust_code)
         self._library = _library_of(stepper)
-        own = self._own = np.dtype(stepper.metadata["dtype"])  # that the model steps in
+        model_dtype = self._model_dtype = np.dtype(stepper.metadata["dtype"])
         h_checked = check_h(stepper.h if h is None else h, torch.empty((), dtype=stepper.dtype)).reshape(1)
         check_range(h_checked, stepper.metadata.get("h_range"))
         self._h, self.h = h_checked, float(h_checked)
-        self._low, self._high = low, high = [x.astype(own) for x in _positions(stepper)]
+        self._low, self._high = low, high = [x.astype(model_dtype) for x in _positions(stepper)]
         n, unbounded = stepper.dof, np.full(stepper.dof, np.inf)
         box = lambda a, b: gymnasium.spaces.Box(a.astype(dtype), b.astype(dtype), dtype=self.dtype.type)  # noqa: E731
         self.single_observation_space = box(np.r_[low, -unbounded], np.r_[high, unbounded])
@@ -140,14 +143,14 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        self._states, self._observed = np.zeros((num_envs, 2 * n + 2), own), np.zeros((num_envs, 2 * n), own)
-        self._u, self._status = np.zeros((num_envs, stepper.inputs), own), np.zeros(num_envs, np.int32)
+        self._states, self._observed = (np.zeros((num_envs, k), model_dtype) for k in (2 * n + 2, 2 * n))
+        self._u, self._status = np.zeros((num_envs, stepper.inputs), model_dtype), np.zeros(num_envs, np.int32)
         self._elapsed, self._ended = np.zeros(num_envs, np.int64), np.ones(num_envs, bool)
         self._started = self._some_ended = False
         self._step = self._call(self._states, self._u, steps_per_action, (self._observed, self._status))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Start new episodes in all environments, or in those of `options={"reset_mask": mask}`; (B, 2n), {}."""
+        """Start new episodes everywhere, or where `options={"reset_mask": mask}` says; return (B, 2n), {}."""
         super().reset(seed=seed)
         mask = np.ones(self.num_envs, bool)
         if options:
@@ -166,27 +169,28 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return self._observed.astype(self.dtype), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Apply an action each, (B, m): observations (B, 2n), rewards, terminated, truncated (B,), and infos."""
+        """Apply actions (B, m); return observations (B, 2n), rewards, terminated, truncated (B,), and infos."""
         if not self._started:
             raise InputError("call reset before the first step")
-        again = self._ended if self._some_ended else None  # in the step before
-        if again is not None and self.mode == Mode.DISABLED:
-            which = f"environment {int(again.argmax())} has ended"
+        ended_before = self._ended if self._some_ended else None
+        if ended_before is not None and self.mode == Mode.DISABLED:
+            which = f"environment {int(ended_before.argmax())} has ended"
             raise InputError(f'{which}; reset those that have: env.reset(options={{"reset_mask": ended}})')
         self._saturate(actions)
         self._step()
         self._elapsed += 1
-        if again is not None:  # NextStep: these were stepped in vain
-            self._restart(again)
+        # Mode "NextStep": this call resets the environments that ended in the previous call.
+        if ended_before is not None:
+            self._restart(ended_before)
         observed, n = self._observed.copy(), self.stepper.dof
         q, v, u = (_read_only(x) for x in (observed[:, :n], observed[:, n:], self._u.copy()))
         rewards, lost = self._rewards(q, v, u), self._status != 0
         terminated = lost.copy()
         if self._ends is not None:
             terminated |= self._answer("terminated", self._ends(q, v, u), bool)
-        truncated = self._elapsed >= self._last
-        if again is not None:
-            rewards[again], terminated[again] = 0.0, False
+        truncated = self._elapsed >= self._max_steps
+        if ended_before is not None:
+            rewards[ended_before], terminated[ended_before] = 0.0, False
         infos: dict[str, Any] = {}
         if lost.any():
             rewards[lost] += self.exit_reward
@@ -200,7 +204,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return observations, rewards, terminated, truncated, infos
 
     def _finish(self, observations: Array, info: dict[str, Any]) -> dict[str, Any]:
-        """Reset the environments that ended in this step; return the last observations, as gymnasium does."""
+        """Reset the environments that ended in this step; return their last observations in gymnasium's infos."""
         ended, last = self._ended, np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
             last[i] = observations[i]
@@ -208,12 +212,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return {"final_obs": last, "_final_obs": ended, "final_info": info, "_final_info": ended.copy()}
 
     def _call(self, states: Array, u: Array, steps: int, out: tuple[Array, Array]) -> Callable[[], None]:
-        """The call of C that steps these arrays in place."""
+        """Return the call of C that steps these arrays in place."""
         low, high, states_, u_, seen, status = map(torch.from_numpy, (self._low, self._high, states, u, *out))
         return self._library.holds(states_, self._h, u_, steps, low, high, (seen, status))
 
     def _saturate(self, actions: Array) -> None:
-        """Write the inputs of the next step."""
+        """Write the saturated actions into the inputs of the next step."""
         actions = np.asarray(actions)
         if actions.shape != self._u.shape or actions.dtype.kind not in "fiu":
             given = f"{actions.dtype} of shape {actions.shape}"
@@ -224,12 +228,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise InputError(f"actions: NaN for environment {int(wrong.any(1).argmax())}; give finite numbers")
 
     def _restart(self, mask: Array) -> None:
-        """New episodes where the mask is True."""
+        """Start new episodes in the environments of the mask."""
         count, n = int(mask.sum()), self.stepper.dof
         drawn = tuple(self._draw(self.np_random, count))
         refuse({f"reset must return (q, v) or (q, v, s), got {len(drawn)} entries": len(drawn) not in (2, 3)})
         parts = {"q": (count, n), "v": (count, n), "s": (count,)}
-        q, v, s = arrays = [np.ascontiguousarray(x, self._own) for x in (*drawn, np.zeros(count))[:3]]
+        q, v, s = arrays = [np.ascontiguousarray(x, self._model_dtype) for x in (*drawn, np.zeros(count))[:3]]
         for (name, shape), x in zip(parts.items(), arrays, strict=True):
             refuse({f"reset: {name} must have the shape {shape}, got {x.shape}": x.shape != shape})
             if not np.isfinite(x).all():
@@ -237,13 +241,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
                 raise InputError(f"reset: {name} of row {row} is NaN or inf; draw finite numbers")
         tensors = (torch.from_numpy(x) for x in (q, v, s))
         p, _ = self._library.momentum(*tensors, h=self._h.expand(count).contiguous())
-        states = np.concatenate([q, p.numpy(), s[:, None], np.ones((count, 1), self._own)], 1)
-        observed, status = np.zeros((count, 2 * n), self._own), np.zeros(count, np.int32)
-        self._call(states, np.zeros((count, self._u.shape[1]), self._own), 0, (observed, status))()
+        states = np.concatenate([q, p.numpy(), s[:, None], np.ones((count, 1), self._model_dtype)], 1)
+        observed, status = np.zeros((count, 2 * n), self._model_dtype), np.zeros(count, np.int32)
+        self._call(states, np.zeros((count, self._u.shape[1]), self._model_dtype), 0, (observed, status))()
         if (wrong := status != 0).any():
             row = int(wrong.argmax())
-            what = f"{Status(int(status[row]) & FAILED).name}: it has no momentum"
-            if not status[row] & FAILED:
+            what = f"{Status(int(status[row]) & STATUS_BITS).name}: it has no momentum"
+            if not status[row] & STATUS_BITS:
                 box = {key: x for key, x in self.stepper.metadata["box"].items() if key[0] in "qps"}
                 what = f"outside the box of the fitted data, {box}; its momentum is {p[row].tolist()}"
             raise InputError(f"reset: row {row}, q = {q[row].tolist()}, v = {v[row].tolist()}, is {what}")
@@ -252,7 +256,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._some_ended = bool(self._ended.any())
 
     def _rewards(self, q: Array, v: Array, u: Array) -> Array:
-        """The result of the user's function, checked."""
+        """Rewards of the user's function; raise if one is not finite."""
         rewards = self._answer("reward", self._reward(q, v, u), float)
         if not np.isfinite(rewards).all():
             row = int((~np.isfinite(rewards)).argmax())
@@ -261,7 +265,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return rewards
 
     def _answer(self, name: str, answer: Any, kind: type) -> Array:
-        """(B,) numbers or booleans that a user's function gave, as an array of their own."""
+        """A copy of the (B,) numbers or booleans of a user's function; raise if their shape or kind differs."""
         found = np.array(answer)
         right = found.dtype == bool if kind is bool else found.dtype.kind in "fiub"
         if found.shape != (self.num_envs,) or not right:
@@ -296,7 +300,7 @@ def _stepper_of(source: Any, trust_code: bool) -> ExportedStepper:
 
 
 def _library_of(stepper: ExportedStepper) -> CLibrary:
-    """The compiled functions; raise if a function that an environment needs is missing."""
+    """The compiled functions of a stepper; raise if the stepper cannot be an environment."""
     path, kind, metadata = stepper.path, stepper.kind, stepper.metadata
     terms = input_terms_of(metadata.get("columns", ()))
     refuse({
@@ -318,7 +322,7 @@ def _library_of(stepper: ExportedStepper) -> CLibrary:
 
 
 def _positions(stepper: ExportedStepper) -> tuple[Array, Array]:
-    """(n,) lowest and highest observed positions: those of the box, of an angle at most a turn."""
+    """(n,) lowest and highest observed positions: the box of the data, for an angle at most one turn of it."""
     box, angles = stepper.metadata["box"], np.array(stepper.metadata["angles"], bool)
     high = np.array(box["q_high"]) if box else np.full(stepper.dof, np.inf)
     low = np.array(box["q_low"]) if box else -high
@@ -327,7 +331,7 @@ def _positions(stepper: ExportedStepper) -> tuple[Array, Array]:
 
 
 def _input_bounds(stepper: ExportedStepper, low: Any, high: Any) -> tuple[Array, Array]:
-    """(m,) bounds of the inputs: those given, or those recorded."""
+    """(m,) bounds of the inputs: the given or the recorded ones."""
     found = []
     for end, given in (("low", low), ("high", high)):
         bound = stepper.metadata.get(f"input_{end}") if given is None else given

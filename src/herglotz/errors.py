@@ -1,4 +1,4 @@
-"""The one exception a user's mistake raises; the command line turns it into one line and exit code 2."""
+"""`InputError`, which every mistake of a user raises: the command line prints one line and ends with exit code 2."""
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
@@ -6,25 +6,25 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """Something the user gave is wrong. The message names what, where, the value and the remedy."""
+    """An input of the user is wrong. The message names the place, the value and the remedy."""
 
 
 def refuse(wrong: dict[str, object]) -> None:
-    """Raise `InputError` with the first of these messages whose condition holds."""
+    """Raise `InputError` with the first message whose condition is true; `wrong` is message → condition."""
     for message, holds in wrong.items():
         if holds:
             raise InputError(message)
 
 
 def check_coordinates(where: str, option: str, wanted: Iterable[str], names: Sequence[str]) -> None:
-    """Raise InputError if an option names a coordinate that is none of `names`."""
+    """Raise InputError if an option names an unknown coordinate; `names` are the known ones."""
     for name in wanted:
         if name not in names:
             raise InputError(f"{where or 'data'}: {option} names {name!r}, but the coordinates are {', '.join(names)}")
 
 
 def check_start(q0: bool, v0: bool, p0: bool, dash: str = "") -> None:
-    """Raise unless a start is given whole, a position with either a velocity or a momentum, or not at all."""
+    """Raise unless a start is complete, a position with either a velocity or a momentum, or absent."""
     q, v, p = (f"{dash}{name}" for name in ("q0", "v0", "p0"))
     refuse({
         f"{v} and {p} both say how fast the start is; leave one out": v0 and p0,
@@ -34,13 +34,13 @@ def check_start(q0: bool, v0: bool, p0: bool, dash: str = "") -> None:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The known word that this one resembles, as the end of a message; empty where it resembles none."""
+    """The end of a message, "; did you mean WORD?", with the known word that is most similar; empty if none is."""
     near = get_close_matches(word, list(known), n=1, cutoff=0.65)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def no_such_file(path: Path) -> str:
-    """The message on a missing file, with the file of a similar name in the same folder."""
+    """The message on a missing file, with a similar name in the same folder if there is one."""
     try:
         beside = [file.name for file in path.parent.iterdir()]
     except OSError:

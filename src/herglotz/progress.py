@@ -1,4 +1,4 @@
-"""Progress bars."""
+"""Progress bars, and the time that a fit may still take."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from typing import Any
 
 from tqdm import tqdm
 
-AGAIN = 0.2  # seconds between two drawings of a bar
-# How much of a fit's time is over where a part of it begins and ends: medians of 19 systems of `zoo.py --draw 9301`.
+REDRAW_SECONDS = 0.2
+# Share of a fit's time that has passed when a part begins and when it ends: medians over 19 systems of `zoo.py --draw
+# 9301`. The second line has shares of FINDING.
 LOOKING, FINDING, STAGES = (0.0, 0.05), (0.05, 0.65), (0.66, 0.98)
-FIRST_TERMS, MORE_TERMS, FEWER_TERMS = (0.0, 0.65), (0.65, 0.7), (0.7, 1.0)  # of FINDING
+FIRST_TERMS, MORE_TERMS, FEWER_TERMS = (0.0, 0.65), (0.65, 0.7), (0.7, 1.0)
 
 
 class ProgressBar(tqdm):
     """tqdm's bar without its monitor thread.
 
-    The thread draws bars that have not moved for ten seconds. If the thread holds stderr while Python ends, as after
-    Ctrl-C, Python aborts with signal 6 in place of the command's exit code.
+    The thread redraws bars that have not moved for ten seconds. If the thread holds stderr while Python ends, as after
+    Ctrl-C, Python aborts with signal 6 instead of the command's exit code.
     """
 
     monitor_interval = 0
@@ -29,25 +30,28 @@ class ProgressBar(tqdm):
 class FitBar(ProgressBar):
     """A bar over a whole fit, with an estimate of the time left.
 
-    The number of parts of a fit is not known before the end. The time left follows from the share of the time that
-    typical fits have behind them where the part under way begins and ends, and within a stage from the time of the
-    iterations: as many again as were done, or the rest of the bound.
+    The number of parts of a fit is not known before the end. The time left is estimated from the shares of the time
+    that have passed in typical fits when the current part begins and ends. Within a stage the estimate assumes as many
+    more iterations as were done, or the rest of the bound.
     """
 
-    under_way: FitBar | None = None  # the bar that `beat` draws
+    # The bar of the fit under way, which `beat` draws.
+    under_way: FitBar | None = None
 
     def __init__(self, **options: Any):
         self.enclosing = self.span = (0.0, 1.0)
-        self.expected = self.began = self.drawn_at = self.shown = 0.0  # expected: s of the whole fit
+        # `expected`: seconds of the whole fit; 0 before an estimate is known.
+        self.expected = self.began = self.drawn_at = self.shown = 0.0
         self.iteration = self.most = 0
         self.start = time.time()
         form = "{desc}{percentage:3.0f}%|{bar}| {elapsed}, about {left} left{postfix}"
         super().__init__(total=1, bar_format=form, leave=False, dynamic_ncols=True, **options)
-        if not self.disable:  # the fits inside a search have silent bars
+        # Bars of fits inside a search are disabled.
+        if not self.disable:
             FitBar.under_way = self
 
     def part(self, span: tuple[float, float], name: str = "", most: int = 0) -> None:
-        """Go over to what typical fits need this span of the present part's time for: `most` iterations, if known."""
+        """Begin a part that takes this span of the enclosing part's time in typical fits; at most `most` iterations."""
         if self.disable:
             return
         low, high = self.enclosing
@@ -55,7 +59,8 @@ class FitBar(ProgressBar):
         before = self.span
         self.span = max(first, before[0]), max(last, before[0])
         self.began, self.iteration, self.most = time.time(), 0, most
-        if before[0] > 0 and self.span[0] > before[0]:  # where terms were not searched for, shares tell nothing
+        # A fit without a search for terms has other shares: no time is expected from them.
+        if before[0] > 0 and self.span[0] > before[0]:
             self.expected = (self.began - self.start) / first
         if name:
             self.set_description(name, refresh=False)
@@ -63,7 +68,7 @@ class FitBar(ProgressBar):
         self.draw()
 
     def iterate(self) -> None:
-        """Count an iteration of the part under way."""
+        """Count an iteration of the current part."""
         self.iteration += 1
         self.beat()
 
@@ -81,45 +86,46 @@ class FitBar(ProgressBar):
 
     @property
     def format_dict(self) -> dict[str, Any]:
-        """See tqdm."""
+        """The numbers of tqdm, with `n` as the share of the time that has passed, and the time left."""
         found = super().format_dict
         passed, left = found["elapsed"], self.left
-        self.shown = max(self.shown, passed / (passed + left) if passed else 0.0)  # a bar does not go back
+        # The bar never goes back.
+        self.shown = max(self.shown, passed / (passed + left) if passed else 0.0)
         known = tqdm.format_interval(left) if math.isfinite(left) else "?"
         return {**found, "n": self.shown, "total": 1, "left": known}
 
     def draw(self) -> None:
-        """Draw the present bar."""
+        """Draw the bar."""
         self.drawn_at = time.monotonic()
         self.refresh()
 
     def beat(self) -> None:
-        """Draw the bar if the last drawing is a while ago."""
-        if not self.disable and time.monotonic() - self.drawn_at > AGAIN:
+        """Draw the bar if the last drawing is more than `REDRAW_SECONDS` ago."""
+        if not self.disable and time.monotonic() - self.drawn_at > REDRAW_SECONDS:
             self.draw()
 
     def close(self) -> None:
-        """See tqdm."""
+        """Remove the bar; no fit is under way any more."""
         if FitBar.under_way is self:
             FitBar.under_way = None
         super().close()
 
 
 def beat() -> None:
-    """Draw the time of the fit under way, if any."""
+    """Update the bar of the fit under way, if there is one."""
     if FitBar.under_way is not None:
         FitBar.under_way.beat()
 
 
 def part(span: tuple[float, float]) -> None:
-    """Tell the bar of the fit under way, if any, which span of the present part's time begins."""
+    """Begin a part in the bar of the fit under way, if there is one; see `FitBar.part`."""
     if FitBar.under_way is not None:
         FitBar.under_way.part(span)
 
 
 @contextmanager
 def inside() -> Iterator[None]:
-    """Parts that begin in here are of the part under way."""
+    """Inside, spans of parts are shares of the current part."""
     bar = FitBar.under_way
     if bar is None:
         yield

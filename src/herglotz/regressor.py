@@ -26,15 +26,16 @@ try:
 except ImportError:
     raise ImportError("HerglotzRegressor needs scikit-learn; install it: pip install 'herglotz[sklearn]'") from None
 
-SAME = 1e-9  # of a step: times closer than this are the same
+# Times closer than this part of a step are equal.
+SAME = 1e-9
 
 
 class HerglotzRegressor(RegressorMixin, BaseEstimator):
-    """Positions as a function of time, and of inputs where X has more columns.
+    """Positions as a function of time, and of inputs if X has more than one column.
 
-    X is (N,) or (N, 1 + m): increasing times, then inputs, each of which acts from its row's time on. y is (N,) or
-    (N, n): positions. One fit has one motion; `predict` continues it from its first sample to any later time. With
-    inputs, it takes times from the last fitted one on, at steps like those of the data.
+    X is (N,) or (N, 1 + m): increasing times, then inputs, each of which acts from the time of its row on. y is (N,) or
+    (N, n): positions. A fit has one motion. `predict` takes any time after the first sample; with inputs, times after
+    the last fitted sample, at steps like those of the data.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
     angles
         Whether every coordinate is an angle in rad.
     train_fraction
-        Part of the samples that is trained on; the default is all, as scikit-learn holds out by itself.
+        Part of the samples that is trained on; by default all, because scikit-learn holds samples out itself.
     settings
         Further settings of `FitConfig`, by name.
 
@@ -52,13 +53,13 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
     run_
         The `Run`: `run_.equation()`, `run_.verify()`, `run_.export(...)`.
     n_features_in_, feature_names_in_
-        Columns of X, and their names where X is a DataFrame: `predict` takes the same, in the same order.
+        Columns of X, and their names if X is a DataFrame: `predict` takes the same columns in the same order.
 
     Raises
     ------
     InputError
-        If X or y cannot be used, times do not increase, or a step fails; the message names the time. It is a
-        `ValueError`, as scikit-learn asks.
+        If X or y cannot be used, times do not increase, or a step fails; the message names the time. An `InputError`
+        is a `ValueError`, which scikit-learn expects.
     """
 
     def __init__(
@@ -89,12 +90,14 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
         config = FitConfig(
             level=self.level, objective=self.objective, seed=self.seed, train_fraction=self.train_fraction
         )
-        at_once = {"input_delay": 0.0, "actuator_lag": 0.0}  # rows of X act when they are given
+        # The input of a row of X acts from the time of this row on.
+        at_once = {"input_delay": 0.0, "actuator_lag": 0.0}
         if any((self.settings or {}).get(name) for name in at_once):
             raise InputError("input_delay, actuator_lag: inputs act in the row of X that has them; use herglotz.fit")
         self.run_ = fit(data, config.changed({**(self.settings or {}), **at_once}), progress=False)
         self.n_features_in_, self._flat = X.shape[1], flat
-        self.__dict__.pop("feature_names_in_", None)  # of a fit before
+        # An earlier fit may have had other names.
+        self.__dict__.pop("feature_names_in_", None)
         if names is not None:
             self.feature_names_in_ = names
         return self
@@ -124,14 +127,14 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
         return q[:, 0] if self._flat else q
 
     def _free(self, times: np.ndarray) -> np.ndarray:
-        """From the last fitted sample before each time, whole steps of the model and a part of one."""
+        """Positions at each time, by steps of the model from the last fitted sample before that time."""
         run = self.run_
         nodes = run.data.t.double().numpy()[: run.train_lengths[0]]
         if times.min() < nodes[0] - SAME * run.h:
             raise InputError(f"t = {times.min():g} is before the first fitted sample, {nodes[0]:g}; take later times")
         found = np.empty((len(times), run.data.dof))
         origin = np.searchsorted(nodes, times + SAME * run.h, side="right") - 1
-        for k in np.unique(origin):  # one motion from each sample that is needed
+        for k in np.unique(origin):
             start = State(*(x[int(k)].detach() for x in run.states))
             asked = np.flatnonzero(origin == k)
             found[asked] = self._from(start, times[asked] - nodes[k])
@@ -143,7 +146,8 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
         steps = np.round(spans / run.h).astype(int)
         if np.allclose(spans, run.h * steps, atol=1e-6 * run.h, rtol=1e-9):
             stepper, sizes, row = run.stepper, np.full(steps.max(), run.h), steps
-        else:  # steps of any length, from one asked time to the next
+        # If the times are no multiples of h, each step leads from one time to the next.
+        else:
             stepper, ends = run.at_step(run.h_range[0] / 2), np.unique(spans[spans > SAME * run.h])
             sizes, row = np.diff(ends, prepend=0.0), np.searchsorted(ends, spans) + (spans > SAME * run.h)
         return self._positions(stepper, start, sizes)[row]
@@ -158,12 +162,12 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
             return stepper.rollout(*start, h=torch.from_numpy(sizes), inputs=inputs).q.double().numpy()
 
     def _driven(self, X: np.ndarray) -> np.ndarray:
-        """From the last fitted sample on; the input of a row acts from its time to the next row's."""
+        """Positions from the last fitted sample on; the input of a row acts until the time of the next row."""
         run = self.run_
         start, fitted = run.last_fitted()
         last = run.data.offsets[0] + run.train_lengths[0] - 1
         u, (low, high) = run.data.u, run.h_range
-        assert u is not None  # `predict` asks
+        assert u is not None
         t, before = X[:, 0], np.maximum.accumulate(np.r_[fitted, X[:-1, 0]])
         step = t - before
         moves, back = step > SAME * run.h, step < -SAME * run.h
@@ -179,13 +183,13 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
 
 
 def _names(X: Any) -> np.ndarray | None:
-    """The columns of a DataFrame, where all of their names are texts."""
+    """The names of the columns of a DataFrame if all of them are strings; otherwise None."""
     names = [*getattr(X, "columns", ())]
     return np.array(names, dtype=object) if names and all(isinstance(name, str) for name in names) else None
 
 
 def _matrix(name: str, x: Any) -> np.ndarray:
-    """(N,) or (N, m) finite numbers as (N, m) float64; the messages are those that scikit-learn looks for."""
+    """(N,) or (N, m) finite numbers as (N, m) float64; scikit-learn's own checks look for words of the messages."""
     refuse({
         f"{name}: this estimator requires {name} to be passed, but the target {name} is None": x is None,
         f"{name}: sparse input is not supported; give {name}.toarray()": hasattr(x, "toarray"),

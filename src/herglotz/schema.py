@@ -1,4 +1,4 @@
-"""Types of stored entries, as plain type hints: reading a wrong file raises an error with a single message."""
+"""Check stored entries against type hints: a wrong file raises one `InputError`."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ from herglotz.errors import InputError
 
 T = TypeVar("T")
 UNION = (Union, types.UnionType)
-# Largest whole number that torch takes; JSON has no bound, and 10^400 is no float either.
-LARGEST = 2**63 - 1
+# torch's integers have 64 bits. JSON has no bound, and an integer of 10^400 is no float either.
+MAX_INTEGER = 2**63 - 1
 
 
 def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
-    """Check a dictionary against the hints of a `TypedDict` or a dataclass; further keys are let pass.
+    """Check a dictionary against the hints of a `TypedDict` or a dataclass; other keys are ignored.
 
-    `kind` has keys and their types: bool, int, float (an int will do), str, classes, None, unions, Literal, another
-    `TypedDict`, and list[T], tuple[T, ...], tuple[T, T, T], dict[K, V] of these. A list and a tuple are one, as in
-    JSON. Keys of a dataclass that have a default may be missing. InputError names the file, the key, its value and the
-    remedy.
+    Hints may be bool, int, float (which takes an int), str, classes, None, unions, Literal, another `TypedDict`, and
+    list[T], tuple[T, ...], tuple[T, T, T], dict[K, V] of these. Lists and tuples are equal, as in JSON. Fields of a
+    dataclass with a default may be missing. InputError names the file, the key, its value and the remedy.
     """
     if not isinstance(values, Mapping):
         raise InputError(f"{where}: must hold named entries, got {_shown(values)}; {remedy}")
@@ -31,17 +30,18 @@ def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
     for key, hint in get_type_hints(kind).items():
         if key not in values or (values[key] is None and types.NoneType in get_args(hint)):
             continue
-        alone = [one for one in _alternatives(hint) if is_typeddict(one) or is_dataclass(one)]
-        if alone:  # looked into key by key, so that the message names one
-            check_entries(alone[0], values[key], f"{where}: {key}", remedy)
+        alternatives = get_args(hint) if get_origin(hint) in UNION else (hint,)
+        # A nested dictionary is checked key by key, so that the message names the key.
+        if nested := [kind for kind in alternatives if is_typeddict(kind) or is_dataclass(kind)]:
+            check_entries(nested[0], values[key], f"{where}: {key}", remedy)
         elif not matches(values[key], hint):
             raise InputError(f"{where}: {key} must be {_named(hint)}, got {_shown(values[key])}; {remedy}")
 
 
 def from_plain(cls: type[T], values: dict[str, Any]) -> T:
-    """Build a settings dataclass from what `dataclasses.asdict` and JSON made of it (tuples come back as lists).
+    """Build a settings dataclass from the dictionary that `dataclasses.asdict` and JSON made; lists become tuples.
 
-    Raise InputError if a key is no field, or a value has another type than the field.
+    Raise InputError if a key is no field, or a value has another type than its field.
     """
     unknown = set(values) - {f.name for f in fields(cls)}  # type: ignore[arg-type]
     if unknown:
@@ -53,7 +53,7 @@ def from_plain(cls: type[T], values: dict[str, Any]) -> T:
 
 
 def matches(value: Any, hint: Any) -> bool:
-    """Whether a value is of a type, to its last entry."""
+    """True if a value, with all its entries, matches a type hint."""
     origin, inner = get_origin(hint), get_args(hint)
     if hint is Any:
         return True
@@ -68,10 +68,6 @@ def matches(value: Any, hint: Any) -> bool:
     return _is_number(value, hint) if hint in (int, float) else isinstance(value, hint)
 
 
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    return get_args(hint) if get_origin(hint) in UNION else (hint,)
-
-
 def _needed(kind: Any) -> Collection[str]:
     """The required keys: all keys of a `TypedDict`, the fields of a dataclass that have no default."""
     if is_typeddict(kind):
@@ -80,7 +76,7 @@ def _needed(kind: Any) -> Collection[str]:
 
 
 def _match_items(values: dict[Any, Any], hint: Any, inner: tuple[Any, ...]) -> bool:
-    """Whether entries are those of a dataclass, or of dict[K, V]."""
+    """True if a dictionary matches a dataclass, or dict[K, V]."""
     if inner:
         return all(matches(key, inner[0]) and matches(x, inner[1]) for key, x in values.items())
     hints = get_type_hints(hint)
@@ -90,16 +86,16 @@ def _match_items(values: dict[Any, Any], hint: Any, inner: tuple[Any, ...]) -> b
 
 
 def _match_each(values: Sequence[Any], hints: tuple[Any, ...]) -> bool:
-    """Whether entries are of list[T] or tuple[T, ...], or, one by one, of tuple[S, T]."""
+    """True if entries match list[T] or tuple[T, ...], or one by one tuple[S, T]."""
     if len(hints) == 1 or hints[1] is Ellipsis:
         return all(matches(x, hints[0]) for x in values)
     return len(values) == len(hints) and all(map(matches, values, hints))
 
 
 def _is_number(value: Any, hint: type) -> bool:
-    """Whether a value is a number of this type that torch takes; a truth value is no number."""
+    """True if a value is a number of this type that torch takes; a bool is no number."""
     if isinstance(value, int):
-        return not isinstance(value, bool) and abs(value) <= LARGEST
+        return not isinstance(value, bool) and abs(value) <= MAX_INTEGER
     return isinstance(value, hint)
 
 

@@ -1,8 +1,8 @@
-"""Messages while a result is made: how columns were read, how far a fit is."""
+"""Messages while a command or a fit runs: how columns were read, how far a fit has come."""
 
 import sys
 
 
 def tell(text: str) -> None:
-    """Print on stderr; in a notebook on stdout, as notebooks show stderr on red ground, as if something had failed."""
+    """Print on stderr; in a notebook on stdout, because notebooks show stderr on a red background, like a failure."""
     print(text, file=sys.stdout if "ipykernel" in sys.modules else sys.stderr, flush=True)

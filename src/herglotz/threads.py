@@ -1,4 +1,4 @@
-"""One thread for small matrices, in Python as on the command line."""
+"""Computation on one thread, which is fastest for small matrices."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one thread inside, and give the caller's number of threads back; usable as a decorator.
+    """Compute on one thread inside, and restore the caller's number of threads; also a decorator.
 
-    The matrices here are small: on a busy machine of two cores, a fit on all cores was measured to take ten times as
-    long as on one. A user who sets `OMP_NUM_THREADS` has chosen, and keeps that number.
+    The matrices are small: on a busy machine of two cores a fit on both took ten times as long as on one. A number
+    that the user sets in `OMP_NUM_THREADS` is kept.
     """
     before = torch.get_num_threads()
     if "OMP_NUM_THREADS" not in os.environ:

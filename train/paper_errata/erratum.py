@@ -28,10 +28,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Erratum:
-    """What the paper prints, what is right, and the residuals of both."""
+    """The printed formula, the corrected one, and the residuals of both; `label` is that of the paper's source."""
 
     number: str
-    label: str  # of the equation in the paper's source
+    label: str
     printed: str
     right: str
     rows: tuple[Row, ...]

@@ -164,7 +164,8 @@ def e10() -> Erratum:
 
     along = projected_flow(flow, S0, q0)
     (right_wrong, left_wrong), (_, left) = residuals(wrong, along), residuals(S1, along)
-    assert right_wrong < 1e-13  # the equation on the flow does not notice δ
+    # On the flow the equation does not depend on δ.
+    assert right_wrong < 1e-13
     own = [residuals(S, projected_step(H_plus, S0, S, q0, h, along))[0] for S in (wrong, S1)]
     commutes = [size(commutation_defect(flow, S0, S, q0)) for S in (wrong, S1)]
     setting = "quadratic L_d, c = 0.93, δ = −½D22 (q − 0.8)², q_k from −1.5 to 2"

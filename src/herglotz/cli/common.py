@@ -1,4 +1,4 @@
-"""Shared by the subcommands: number types, checks of outputs before any work, tables, JSON."""
+"""Functions that the subcommands share: argparse types, checks of output paths, tables, JSON."""
 
 from __future__ import annotations
 
@@ -19,38 +19,42 @@ from herglotz.errors import InputError, no_such_file
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-NO_FIT = 3  # exit code of a fit that does not follow its data; the run is written
-COLUMNS = 80  # of a terminal as it opens
-KICKS = "kicks.h"  # file in a folder of `tune` with the chosen step, where kicks were chosen
+# Exit code of a fit that does not follow its data. The run is written nevertheless.
+NO_FIT = 3
+# Width of a terminal when it opens.
+COLUMNS = 80
+# The step that `tune` chose, in the folder of its result, if `tune` chose kicks.
+KICKS = "kicks.h"
 
-
-Flag = tuple[tuple[str, ...], dict[str, Any]]  # names and options of a flag or argument, as argparse takes them
+# Names and options of a flag or an argument, as argparse takes them.
+Flag = tuple[tuple[str, ...], dict[str, Any]]
 
 
 def flag(*names_and_help: str, **options: Any) -> Flag:
-    """A flag by its names, its help and argparse's further options."""
+    """A flag from its names, its help and further options of argparse."""
     *names, text = names_and_help
     return tuple(names), {"help": text, **options}
 
 
 def exit_code(run: Run) -> int:
-    """0, or 3 where the run does not fit its data: it is written, and what comes after should know."""
+    """0, or 3 if the run does not fit its data."""
     return NO_FIT if run.metrics.get("verdict", "").startswith("does not fit") else 0
 
 
 def warn_of_misfit(run: Run, means: str) -> None:
-    """Say on stderr what it means that the run does not fit its data, where it does not."""
+    """Warn on stderr if the run does not fit its data; `means` names the consequence."""
     if exit_code(run):
         say(f"herglotz: warning: the run does not fit its data: {means}; fit it better first", sys.stderr)
 
 
 def import_torch() -> None:
-    """Import torch, and leave its objects out of every later search for garbage.
+    """Import torch, and exclude its objects from garbage collection.
 
-    They live as long as the process. Full collections, while torch is imported and when Python ends, met a million of
-    them: 0.7 of 3.1 s of a command that had nothing to do.
+    torch makes a million objects that live as long as the process. Collections during the import and at the end of
+    Python took 0.7 of the 3.1 s of a command without work.
     """
-    if "torch" in sys.modules:  # a program that calls `main` decides on its own objects
+    # The objects of a program that calls `main` are left to that program.
+    if "torch" in sys.modules:
         return
     gc.disable()
     try:
@@ -87,7 +91,7 @@ def count(text: str) -> int:
 
 
 def seed(text: str) -> int:
-    """Parse a seed, as PyTorch's generators take it (argparse type)."""
+    """Parse a seed of PyTorch's generators, below 2^63 (argparse type)."""
     value = count(text)
     if value >= 2**63:
         raise argparse.ArgumentTypeError(f"must be below 2^63, got {text}")
@@ -95,17 +99,17 @@ def seed(text: str) -> int:
 
 
 def existing(text: str) -> Path:
-    """Parse the path of a file or folder that is there (argparse type): it is missed before any other flag is."""
+    """Parse the path of an existing file or folder (argparse type)."""
     if not Path(text).exists():
         raise argparse.ArgumentTypeError(no_such_file(Path(text)))
     return Path(text)
 
 
 def check_output_file(path: Path, suffixes: Sequence[str], force: bool = False) -> None:
-    """Raise unless a file of this name could be written now; no file is left behind.
+    """Raise InputError unless a file of this name can be written; no file is left behind.
 
-    Raise InputError if the extension is not one of `suffixes`, the folder does not exist or cannot be written to, the
-    path is a folder, or there is such a file already and it is not to be overwritten by `force`.
+    The extension must be one of `suffixes`, the folder must exist and be writable, the path must be no folder, and a
+    file of this name must not exist unless `force` is True.
     """
     if path.suffix.lower() not in suffixes:
         raise InputError(f"--out {path}: the name must end in {' or '.join(suffixes)}")
@@ -119,10 +123,7 @@ def check_output_file(path: Path, suffixes: Sequence[str], force: bool = False) 
 
 
 def check_output_folder(path: Path) -> None:
-    """Raise unless this folder could be made and written to; no file is left behind.
-
-    Raise InputError if a file is in the way, or the folder cannot be written to.
-    """
+    """Raise InputError unless this folder exists, or can be made, and is writable; no file is left behind."""
     existing = path
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
@@ -145,19 +146,19 @@ def print_json(values: dict[str, Any]) -> None:
 
 
 def say(text: str, file: TextIO | None = None) -> None:
-    """Print a sentence in lines that fit a terminal as it opens; names of files are not broken."""
+    """Print a sentence in lines of at most `COLUMNS` letters; names of files are not broken."""
     lines = textwrap.fill(text, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     print(lines, file=file)
 
 
 def print_next(*commands: Sequence[object]) -> None:
-    """Print what comes next as a shell takes it: a name with blanks is quoted."""
+    """Print the next commands for a shell: a name with blanks is quoted."""
     for i, command in enumerate(commands):
         print(f"{'      ' if i else 'Next: '}herglotz {shlex.join(map(str, command))}")
 
 
 def print_next_of(run: Run, out: Path, *commands: Sequence[object]) -> None:
-    """Print what comes next of a run in this folder: nothing is made of one that does not fit its data."""
+    """Print the next commands for a run in this folder; of a run that does not fit its data, those that say why."""
     if exit_code(run):
         trust = shlex.join(["herglotz", "trust", str(out)])
         say(f"Next: what the verdict says, or {trust}, which says what the data leave open")
@@ -166,7 +167,7 @@ def print_next_of(run: Run, out: Path, *commands: Sequence[object]) -> None:
 
 
 def complain(message: str) -> None:
-    """Print what went wrong on stderr: wrapped for a person at a terminal, one line for logs and other programs."""
+    """Print a mistake on stderr: wrapped at a terminal, on one line for logs and other programs."""
     line = f"herglotz: {' '.join(message.split())}"
     if sys.stderr.isatty():
         say(line, sys.stderr)

@@ -1,4 +1,4 @@
-"""`herglotz export`: a run as one file that steps without this package."""
+"""`herglotz export`: write the model of a run as one file that steps without this package."""
 
 from __future__ import annotations
 
@@ -17,18 +17,13 @@ from herglotz.cli.common import (
     warn_of_misfit,
 )
 from herglotz.cli.flags import FORCE
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 
 # File extension of each format.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
 SUFFIX |= {"casadi": ".c", "acados": ".c", "fmu": ".fmu", "fmu2": ".fmu"}
-FORMAT = {
-    ".pt2": "pt2",
-    ".onnx": "onnx",
-    ".h": "c",
-    ".c": "casadi",
-    ".fmu": "fmu",
-}  # of a file whose format is not named
+# Format of each file extension, for a command without --format.
+FORMAT = {SUFFIX[form]: form for form in ("pt2", "onnx", "c", "casadi", "fmu")}
 DESCRIPTION = """\
 Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
 
@@ -76,24 +71,25 @@ FLAGS = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export, load again and say what it is."""
+    """Export, read the file again and report."""
     form: str | None = arguments.format or FORMAT.get(arguments.out.suffix.lower())
     check_output_file(arguments.out, tuple(FORMAT) if form is None else (SUFFIX[form],), arguments.force)
-    assert form is not None  # the name ends in one of them
+    assert form is not None
     kicks = arguments.source / KICKS
     if kicks.is_file() and form == "c":
-        if arguments.name is not None:
-            raise InputError("--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out")
-        if arguments.dtype is not None:
-            raise InputError("--dtype: kicks that tune chose have the numbers that it chose; leave --dtype out")
-        if arguments.parameters is not None or arguments.extras is not None:
-            raise InputError("--parameters, --extras: kicks that tune chose have neither; leave them out")
-        return _kicks(arguments, kicks)
+        refuse({
+            "--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out":
+                arguments.name is not None,
+            "--dtype: tune chose the dtype of its kicks; leave --dtype out": arguments.dtype is not None,
+            "--parameters, --extras: kicks that tune chose have neither; leave them out":
+                arguments.parameters is not None or arguments.extras is not None,
+        })  # fmt: skip
+        return _copy_kicks(arguments, kicks)
     import_torch()
 
     from herglotz.training import load_run
 
-    result = load_run(arguments.source)
+    run = load_run(arguments.source)
 
     from herglotz.export import export_run, load_exported
     from herglotz.export.load import read_header
@@ -103,11 +99,11 @@ def run(arguments: argparse.Namespace) -> int:
         name, _, other = arguments.between.partition("=")
         if not other:
             raise InputError(f"--between takes NAME=RUN, as in payload=runs/loaded, got '{arguments.between}'")
-        result = between(result, name, load_run(Path(other)))
+        run = between(run, name, load_run(Path(other)))
 
-    warn_of_misfit(result, "the file will not step as the recorded system does")
+    warn_of_misfit(run, "the file will not step as the recorded system does")
     export_run(
-        result,
+        run,
         arguments.out,
         form,
         h_range=arguments.h_range,
@@ -118,19 +114,17 @@ def run(arguments: argparse.Namespace) -> int:
         unroll=arguments.unroll,
     )
     in_c = form not in ("pt2", "aoti", "onnx")
-    if in_c:  # the header is read, not compiled: no compiler is needed to write it
-        _, found = read_header(arguments.out)
-    else:
-        found = load_exported(arguments.out).metadata
+    # C is read, not compiled, so that this machine needs no compiler.
+    metadata = read_header(arguments.out)[1] if in_c else load_exported(arguments.out).metadata
     size = arguments.out.stat().st_size
     if arguments.json:
-        print_json({"file": str(arguments.out), "bytes": size, "metadata": found})
+        print_json({"file": str(arguments.out), "bytes": size, "metadata": metadata})
     else:
-        plural = "coordinate" if found["dof"] == 1 else "coordinates"
-        print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} {plural}, h {result.h:g}")
+        dof = f"{metadata['dof']} coordinate{'' if metadata['dof'] == 1 else 's'}"
+        print(f"{arguments.out}: {size / 1024:.0f} KiB, {metadata['dtype']}, {dof}, h {run.h:g}")
         if kicks.is_file():
             print(f"tune chose kicks, which exist in C only (--format c); {arguments.out} holds the run's own model")
-        if not in_c and (tol := result.setting.get("tol")):
+        if not in_c and (tol := run.setting.get("tol")):
             print(f"The tolerance {tol:g} of tune applies to PyTorch and C only; this file solves to rounding")
         if form == "c":
             say(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
@@ -138,8 +132,8 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _kicks(arguments: argparse.Namespace, kicks: Path) -> int:
-    """Copy the header of kicks that `herglotz tune` wrote."""
+def _copy_kicks(arguments: argparse.Namespace, kicks: Path) -> int:
+    """Copy the header of kicks that `herglotz tune` wrote; return the exit code 0."""
     from herglotz.data.files import write_atomically
 
     text = kicks.read_bytes()

@@ -42,7 +42,8 @@ examples:
 """
 
 
-USAGE = "%(prog)s DATA --out RUN [flag ...]"  # all of the flags are twenty lines
+# argparse's own usage, with every flag, has twenty lines.
+USAGE = "%(prog)s DATA --out RUN [flag ...]"
 HELP = "train a model on measured positions"
 FLAGS = (
     *RUN, *PROGRESS,
@@ -68,7 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
         check_output_folder(arguments.tensorboard)
     data, reading = data_of(arguments, columns_of(arguments))
     _fit_into(out, data, config, plan, reading, arguments)
-    result = load_run(out)  # what later commands will see, and on the cpu
+    # The stored run is reported: later commands read the same, on the CPU.
+    result = load_run(out)
     drawn: list[Path] = []
     if not arguments.no_plots:
         from herglotz.plots import save_figures
@@ -85,7 +87,7 @@ def _fit_into(
     out: Path, data: Trajectories, config: FitConfig, plan: Run | None, reading: dict[str, Any],
     arguments: argparse.Namespace,
 ) -> None:  # fmt: skip
-    """Train and save; a folder that was made for nothing goes again."""
+    """Train and save; remove the folders that were made if the fit fails."""
     from herglotz.data.lock import locked
     from herglotz.training import fit, save_run
 
@@ -100,13 +102,14 @@ def _fit_into(
             raise KeyboardInterrupt("; the same command with --resume goes on") from None
         raise
     finally:
-        for folder in made:  # innermost first; only what is empty, so only after a failure
+        # `rmdir` removes empty folders alone: those of a fit that failed.
+        for folder in made:
             with suppress(OSError):
                 folder.rmdir()
 
 
 def report(result: Run, out: Path, drawn: list[Path]) -> None:
-    """Print what was reached, for people, and what to do next."""
+    """Print the plan, the result and the next commands."""
     from herglotz.data.units import common_unit
     from herglotz.training import Plan
 

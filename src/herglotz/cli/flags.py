@@ -1,4 +1,4 @@
-"""Flags that several commands share, and their checks."""
+"""Flags that several commands share, and functions that read them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from herglotz.cli.common import check_output_folder, existing, finite, flag
 from herglotz.cli.settings import DATA
 from herglotz.errors import InputError
 
-Progress = Literal[False, "lines", "iterations"] | None  # what `herglotz.training.fit` takes
+# Values of `progress` of `herglotz.training.fit`.
+Progress = Literal[False, "lines", "iterations"] | None
 
 
 def names(text: str) -> list[str]:
@@ -19,7 +20,7 @@ def names(text: str) -> list[str]:
     return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]
 
 
-# How a file is read: the roles of its columns, angles, and what its sensors read.
+# How a file is read: roles of columns, angles, and zeros and scales of sensors.
 EACH = "a number for each coordinate, or for each of every recording: positions are scale * (reading - zero)"
 READING = (
     "how DATA is read (default: by the names of its columns, printed as a table)",
@@ -50,7 +51,7 @@ PROGRESS = (
 FORCE = flag("--force", "overwrite the file that --out names", action="store_true")
 TRUST = flag("--trust-code", "open a .pt2 or .h file that was not written by this user on this machine: that runs the "
              "code in it", action="store_true")  # fmt: skip
-# Of commands that fit.
+# Flags of the commands that fit.
 RUN = (
     flag("data", "file with time and positions, or a folder of them", metavar="DATA", type=existing),
     flag("--out", "folder for the result; made if missing", required=True, type=Path, metavar="RUN"),
@@ -60,22 +61,23 @@ RUN = (
 
 
 def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what the flags say of the columns, for `load`."""
-    roles = ("time", "coordinates", "inputs", "drop", "group")
-    meant = ("angles", "degrees", "polar", "input_terms", "sensor_zeros", "sensor_scales")
-    given = {name: getattr(arguments, name) for name in (*meant, *roles)}
-    return {name: value for name, value in given.items() if value is not None}
+    """Return the arguments of `load` that the flags of `READING` give."""
+    names = (
+        "angles", "degrees", "polar", "input_terms", "sensor_zeros", "sensor_scales", "time", "coordinates", "inputs",
+        "drop", "group",
+    )  # fmt: skip
+    return {name: value for name in names if (value := getattr(arguments, name)) is not None}
 
 
 def progress(arguments: argparse.Namespace) -> Progress:
-    """A bar on a terminal, a line a stage elsewhere, a line an iteration when verbose, nothing when quiet."""
+    """None for a bar (at a terminal), "lines" for a line a stage, "iterations" for --verbose, False for --quiet."""
     if arguments.quiet:
         return False
     return "iterations" if arguments.verbose else None if sys.stderr.isatty() else "lines"
 
 
 def check_run_folder(out: Path, resume: bool) -> None:
-    """Raise unless a run can be written there: nothing in the way, and no fit that would be lost."""
+    """Raise InputError unless a run can be written to this folder without losing an earlier fit."""
     check_output_folder(out)
     if (out / "model.pt").exists() and not resume:
         raise InputError(f"--out {out}: already holds a run; choose another folder, delete it, or add --resume")

@@ -1,4 +1,4 @@
-"""The argument parser: one subparser a subcommand, one line for a usage error."""
+"""The argument parser: a subparser a subcommand, and one line for a usage error."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ Check every identity, exit code 1 if one fails:
 One file that steps with PyTorch alone:
   herglotz export runs/pendulum --out pendulum.pt2
 """
-NEGATIVE_NUMBER = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")  # argparse takes -1e-3 for an option
+# argparse's own pattern has no exponents: argparse takes -1e-3 for an option.
+NEGATIVE_NUMBER = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
-    """Help as wide as the terminal: paragraphs are wrapped, lines of lists and examples (indented ones) each alone."""
+    """Help as wide as the terminal: paragraphs are wrapped, and indented lines (lists, examples) stay lines."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         paragraphs = [
@@ -46,11 +47,12 @@ class Help(argparse.RawDescriptionHelpFormatter):
 
 
 def _item(line: str, width: int) -> str:
-    """A line of a list, its later lines under its second column; a command is broken as a shell allows."""
+    """A line of a list, continued under its second column; a command is continued after a backslash."""
     if len(line) <= width:
         return line
     if line.lstrip().startswith("herglotz "):
-        words = re.sub(r"(--\S+) (?=[^-])", "\\1\x00", line)  # a flag and its value stay together
+        # A flag and its value stay on one line.
+        words = re.sub(r"(--\S+) (?=[^-])", "\\1\x00", line)
         return " \\\n".join(textwrap.wrap(words, width - 2, subsequent_indent=" " * 6, break_on_hyphens=False)).replace(
             "\x00", " "
         )
@@ -66,13 +68,13 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = NEGATIVE_NUMBER
 
     def format_help(self) -> str:
-        """Make a description that is a function when it is asked for."""
+        """Format the help; a description that is a function is called first."""
         if callable(self.description):
             self.description = self.description()
         return super().format_help()
 
     def parse_known_args(self, args=None, namespace=None):
-        """Refuse what no flag takes here, where the subcommand's own help is the one to name."""
+        """Parse; refuse unknown arguments here, so that the message names the subcommand's help."""
         found, rest = super().parse_known_args(args, namespace)
         if rest:
             near = did_you_mean(rest[0], self._option_string_actions)
@@ -81,7 +83,7 @@ class Parser(argparse.ArgumentParser):
         return found, rest
 
     def error(self, message: str) -> NoReturn:
-        """Print the mistake and where to read on; exit with code 2."""
+        """Print the mistake and the command for help; exit with code 2."""
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)$", message):
             message += did_you_mean(wrong[1], re.findall(r"[\w-]+", wrong[2]))
         complain(f"error: {message}; see '{self.prog} --help'".replace("?; see", "? See"))
@@ -105,7 +107,7 @@ def build_parser() -> Parser:
 
 
 def _add(command: argparse.ArgumentParser, flags: Iterable[Flag | str]) -> None:
-    """Add the flags of a command; a text among them is the title of the group of those after it."""
+    """Add the flags of a command; a text among the flags is the title of the next group."""
     place: argparse._ActionsContainer = command
     for one in flags:
         if isinstance(one, str):

@@ -9,7 +9,8 @@ from herglotz.cli.common import check_output_folder, flag, import_torch
 from herglotz.cli.flags import READING, columns_of
 from herglotz.errors import InputError
 
-FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
+# A copy of `plots.style.FORMATS`, so that help does not import matplotlib; a test compares both.
+FORMATS = ("png", "svg", "pdf")
 DESCRIPTION = """\
 Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training and the plan; with
 --animate, animation.gif instead, of data and model moving. Of DATA: its samples. Of a SCENE, and with --theory of a
@@ -37,7 +38,7 @@ FLAGS = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw and say where."""
+    """Draw, and print the names of the files."""
     source: Path = arguments.source
     folder = arguments.out or (source if source.is_dir() else Path())
     check_output_folder(folder)
@@ -82,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _is_scene(source: Path) -> bool:
-    """Whether this names a scene, and no file or folder."""
+    """True if this is the name of a scene, and no file or folder."""
     if source.exists():
         return False
     from herglotz.scenes import scene_names

@@ -25,7 +25,8 @@ from herglotz.errors import InputError
 if TYPE_CHECKING:
     from herglotz.training.predict import Prediction
 
-WARMUP = 20  # a copy, so that help does not import PyTorch; a test compares
+# A copy of the default of `Run.predict`, so that help does not import PyTorch; a test compares both.
+WARMUP = 20
 DESCRIPTION = """\
 Score a trained model on a recording it has not seen: another start, other steps, its own inputs. The state is
 estimated from the first K samples of each trajectory, the model held; from there the model runs on alone, driven by
@@ -108,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _tell_of_names(names: tuple[str, ...], known: tuple[str, ...]) -> None:
-    """Say on stderr which coordinates of a recording are not those of the run."""
+    """Say on stderr which coordinates of a recording the run does not have."""
     others = [name for name in names if name not in known]
     if len(names) == len(known) == 1 and others:
         say(f"herglotz: note: {names[0]} is taken for {known[0]}, the run's only coordinate", sys.stderr)
@@ -144,7 +145,7 @@ def _report(found: Prediction, arguments: argparse.Namespace) -> None:
 
 
 def _write(found: Prediction, out: Path, momenta: bool) -> list[Path]:
-    """The predicted motion as far as it goes, and the figure."""
+    """Write the predicted motion as far as no step failed, and the figure; return the files."""
     from herglotz.data import save
     from herglotz.data.units import in_degrees
     from herglotz.plots import save_figure

@@ -1,4 +1,4 @@
-"""`herglotz report`: one HTML file that says whether to believe a run."""
+"""`herglotz report`: one HTML page that says how far to trust a run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FLAGS = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write both files and say where."""
+    """Write both files, and print their names."""
     folder = arguments.out or arguments.source
     import_torch()
 

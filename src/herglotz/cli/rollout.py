@@ -51,7 +51,20 @@ SUFFIXES = (".pt2", ".onnx", ".h", ".c", ".fmu")
 
 @dataclass(frozen=True)
 class Source:
-    """A model that can be stepped, with the start, labels and box that its file holds."""
+    """A model that can be stepped, with the start, the labels and the box that its run or file holds.
+
+    limits, h_range
+        Lowest and highest q, p, s, and steps, of the fit; empty and None if they are not known. `box` is a function
+        of states that says which leave the limits.
+    arrival
+        Delay and lag of the inputs of the fit.
+    degrees
+        Names of the coordinates that were recorded in degrees.
+    columns
+        Name, role and unit of each column of the fit's table.
+    frequencies
+        Angular frequencies of the periodic inputs of the model.
+    """
 
     stepper: Stepper | ExportedStepper
     start: State | None
@@ -61,14 +74,14 @@ class Source:
     units: tuple[str, ...]
     angles: tuple[bool, ...]
     time_unit: str
-    limits: Mapping[str, Sequence[float]]  # lowest and highest q, p, s of the fit; empty: not known
-    box: Box | None  # the same, as a function of states
-    h_range: tuple[float, float] | None  # steps of the fit
-    arrival: Arrival  # what happened to the inputs of the fit before they acted
+    limits: Mapping[str, Sequence[float]]
+    box: Box | None
+    h_range: tuple[float, float] | None
+    arrival: Arrival
     inputs: int
-    degrees: tuple[str, ...]  # coordinates that were recorded in degrees
-    columns: Sequence[Sequence[str]]  # name, role and unit of each column of the fit's table
-    frequencies: tuple[float, ...] = ()  # of waves that are its inputs
+    degrees: tuple[str, ...]
+    columns: Sequence[Sequence[str]]
+    frequencies: tuple[float, ...] = ()
 
 
 HELP = "step a model and write the motion"
@@ -99,7 +112,7 @@ FLAGS = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read the model, step it, write the motion."""
+    """Read the model, step the model, write the motion."""
     check_output_file(arguments.out, (".csv", ".npz"), arguments.force)
     if arguments.steps < 2:
         raise InputError(f"--steps must be at least 2, got {arguments.steps}")
@@ -151,12 +164,13 @@ def _motion(source: Source, found: Rollout, times: torch.Tensor, arguments: argp
 
 
 def _velocity(source: Source, found: Rollout, times: torch.Tensor) -> torch.Tensor | None:
-    """The velocities (K + 1, n); None, with a note, where the file or the model has none."""
+    """The velocities (K + 1, n); None, with a note on stderr, if the file or the model has none."""
     import torch
 
     from herglotz.stepping import StepError
 
-    h = times.diff().to(found.q.dtype)  # a state's velocity is that of the step that made it
+    # The velocity of a state is that of the step that made the state.
+    h = times.diff().to(found.q.dtype)
     try:
         with torch.no_grad():
             return source.stepper.velocity(found.states, torch.cat([h[:1], h])).double()
@@ -193,10 +207,11 @@ def _report(source: Source, found: Rollout, times: torch.Tensor, what: str) -> N
 
 
 def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[Beyond], remedy: str = "") -> None:
-    """Say on stderr where the motion or its steps are beyond the data of the fit; a remedy for its steps."""
+    """Say on stderr where the motion leaves the range of the fit, and whether its steps do, with a remedy."""
     from herglotz.training.recorded_range import other_steps
 
-    if left is not None and source.box is not None and (far or source.box.by_s):  # a hair beyond q or p is no news
+    # `far` leaves out a motion that is only just beyond the limits of q and p.
+    if left is not None and source.box is not None and (far or source.box.by_s):
         states = "(q, p, s)" if source.box.by_s else "(q, p)"
         each = "".join(f"; {one.words(source.time_unit)}" for one in far)
         _note(f"from step {left} on, the motion leaves the range of states {states} that the model was fitted to{each}")
@@ -209,7 +224,7 @@ def _note(text: str) -> None:
 
 
 def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source:
-    """Read a run or an exported model, to be stepped.
+    """Read a run or an exported model.
 
     Raise InputError if the file cannot be read, or the run has no such trajectory.
     """
@@ -241,10 +256,11 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     angles = tuple(m.get("angles") or [False] * n)
     units = tuple(m.get("units") or ["rad" if angle else "1" for angle in angles])
     box = None if m["box"] is None else Box(m["box"], angles, stepper.dtype, by_s=s_matters(m))
-    span, stepper.metadata["h_range"] = m.get("h_range"), None  # a note beside the motion, as for a run: no refusal
+    # Steps outside of h_range give a note, as for a run; the stepper itself would refuse them.
+    h_range, stepper.metadata["h_range"] = m.get("h_range"), None
     t0 = (stored or {}).get("t", 0.0)
     return Source(
-        stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), m["box"] or {}, box, span,
+        stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), m["box"] or {}, box, h_range,
         Arrival(**m.get("arrival", {})), stepper.inputs, tuple(m.get("degrees", ())), m.get("columns", ()),
     )  # fmt: skip
 
@@ -275,7 +291,7 @@ def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]
 
 
 def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[torch.Tensor | None, torch.Tensor]:
-    """Return the inputs (K, m), where there are any, and the times (K + 1,)."""
+    """Return the inputs (K, m), None without inputs, and the times (K + 1,)."""
     import torch
 
     from herglotz.data.driving import driven, even_times, input_recording
@@ -299,7 +315,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
 
 
 def _check(found: Rollout, h: float) -> None:
-    """Raise if a step failed, so that no motion that ends early is written."""
+    """Raise InputError if a step failed: a motion that ends early is not written."""
     if not bool(found.ok):
         k = int((found.status != 0).nonzero()[0])
         raise InputError(f"step {k + 1} of h = {h:g} has no solution; take a smaller --h or another start")

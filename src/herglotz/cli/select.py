@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from herglotz.cli.common import count, exit_code, flag, import_torch, print_json, print_next_of
+from herglotz.cli.fit import USAGE as USAGE
 from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
 from herglotz.cli.settings import LEVELS, MACHINE, data_of, settings_of
 
@@ -23,7 +24,6 @@ examples:
 """
 
 
-USAGE = "%(prog)s DATA --out RUN [flag ...]"  # all of the flags are twenty lines
 HELP = "compare kinds of damping, keep the simplest"
 FLAGS = (
     *RUN,

@@ -1,4 +1,4 @@
-"""The flags that are settings of a fit; a flag that is not given leaves the setting to --config, or to `FitConfig`."""
+"""The flags that are settings of a fit. A flag that is not given leaves its setting to --config, or to `FitConfig`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from herglotz.data import Trajectories
     from herglotz.training import FitConfig
 
-# Copies, so that help does not import PyTorch; a test compares them.
+# Copies of the package's values, so that help does not import PyTorch; a test compares them.
 SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
 HOLDS = ("zero", "first", "smooth")
@@ -27,7 +27,7 @@ DTYPES = ("float64", "float32")
 
 
 def settings_of(arguments: argparse.Namespace) -> FitConfig:
-    """The settings: those of --config, or the defaults, with the flags that were given over them.
+    """The settings of --config, or the defaults, replaced by the flags that are given.
 
     Raise InputError if the file is no `config.json` of a run, or a setting is wrong.
     """
@@ -40,7 +40,7 @@ def settings_of(arguments: argparse.Namespace) -> FitConfig:
 
 
 def data_of(arguments: argparse.Namespace, columns: dict[str, Any]) -> tuple[Trajectories, dict[str, Any]]:
-    """The recording and how it was read: as --config says of its own data, with the flags that were given over it.
+    """The recording, and how it was read: as --config read its data, replaced by the flags that are given.
 
     Raise InputError if the file is no `config.json` of a run, or the recording cannot be read that way.
     """
@@ -48,15 +48,12 @@ def data_of(arguments: argparse.Namespace, columns: dict[str, Any]) -> tuple[Tra
 
     before = {} if arguments.config is None else _read(arguments.config)[1]
     given = {name: x for name in ("hold", "every") if (x := getattr(arguments, name, None)) is not None}
-    told = before | columns | given
+    reading = before | columns | given
     if before:
-        told_before = ", ".join(f"{name} {_in_words(x)}" for name, x in before.items() if told[name] is x)
-        say(
-            f"herglotz: note: read as {arguments.config} says: {told_before or 'nothing, flags stand over it'}",
-            sys.stderr,
-        )
-    data = load(arguments.data, **{name: x for name, x in told.items() if name != "every"})
-    return data.thinned(told.get("every", 1)), told
+        kept = ", ".join(f"{name} {_in_words(x)}" for name, x in before.items() if reading[name] is x)
+        say(f"herglotz: note: read as {arguments.config} says: {kept or 'nothing, flags stand over it'}", sys.stderr)
+    data = load(arguments.data, **{name: x for name, x in reading.items() if name != "every"})
+    return data.thinned(reading.get("every", 1)), reading
 
 
 def _in_words(value: Any) -> str:
@@ -64,7 +61,7 @@ def _in_words(value: Any) -> str:
 
 
 def _read(path: Path) -> tuple[FitConfig, dict[str, Any]]:
-    """The settings in a run's config.json, and how its data were read."""
+    """The settings in the config.json of a run, and how the data of that run were read."""
     from herglotz.data.files import read_bytes
     from herglotz.training import FitConfig
     from herglotz.training.run_folder import reading_in
@@ -91,26 +88,26 @@ def _duration(text: str) -> float | None:
 
 
 def setting(name: str, text: str, *, field: str | None = None, **options: Any) -> Flag:
-    """A flag of one field of `FitConfig`, in the namespace only where it is given."""
+    """A flag for one field of `FitConfig`; the namespace has no such name if the flag is not given."""
     dest = field or name.removeprefix("--").replace("-", "_")
     return flag(name, text, dest=dest, default=argparse.SUPPRESS, **options)
 
 
-# Whose settings, and on what part of the data.
+# Settings of another run, and the part of the data to train on.
 DATA = (
     flag("--config", "settings that another run was told, and how its data were read: its folder or its config.json; "
          "flags that are given stand over them. On the same data it is the same fit", type=existing, metavar="FILE"),
     setting("--train-fraction", "part of every trajectory, in time, to train on, 0 < F <= 1 (default 0.667)",
             type=finite, metavar="F"),
 )  # fmt: skip
-# Where and how it runs.
+# Seed, device, precision and output.
 MACHINE = (
     setting("--seed", "seed of the initial weights (default 0)", type=seed),
     setting("--device", "cpu or cuda (default cpu)", metavar="D"),
     setting("--dtype", "precision (default float64)", choices=DTYPES),
     flag("--json", "print the numbers as JSON, and nothing else", action="store_true"),
 )  # fmt: skip
-# What the Lagrangian may hold.
+# Terms of the model.
 MODEL = (
     "model",
     setting("--level", "auto: forced with dry friction where inputs u are recorded, else linear; for two or three "
@@ -135,7 +132,7 @@ MODEL = (
             action="append", metavar="NUMBER"),
     setting("--alike", "one mass for all, a potential of features alone: chains", action="store_true"),
 )  # fmt: skip
-# How it is fitted: the objective; samples, steps and iterations; how strong a prior.
+# The objective; samples, steps and iterations; the prior.
 OPTIMISER = (
     "objective and optimiser",
     setting("--objective", "residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. "
@@ -166,10 +163,10 @@ OPTIMISER = (
     setting("--departures", "prior strengths on the networks that held-out blocks choose from; one fixes it (default: "
             "2e-4 to 6e-3)", type=positive, nargs="+", metavar="TAU"),
 )  # fmt: skip
-AS_TOLD = (
+DURATION_HELP = (
     "in the data's unit; none, or auto, as without this flag: what the file says or else what explains the data best"
 )
-# What the user knows of the system.
+# Knowledge of the system.
 EXPERT = (
     "what is known (expert)",
     setting("--feature", "what L = K - V may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2' (of "
@@ -188,6 +185,6 @@ EXPERT = (
             "mass is 1", type=finite, nargs="+", metavar="G"),
     flag("--hold", "what the inputs do between samples: nothing, straight lines or polynomials (default: what the file "
          "says, or what explains the data best)", choices=HOLDS),
-    setting("--input-delay", f"time by which inputs act later, {AS_TOLD}", type=_duration, metavar="T"),
-    setting("--actuator-lag", f"time constant of the actuator, {AS_TOLD}", type=_duration, metavar="T"),
+    setting("--input-delay", f"time by which inputs act later, {DURATION_HELP}", type=_duration, metavar="T"),
+    setting("--actuator-lag", f"time constant of the actuator, {DURATION_HELP}", type=_duration, metavar="T"),
 )  # fmt: skip

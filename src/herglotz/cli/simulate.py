@@ -32,7 +32,7 @@ example:
 
 
 def description() -> str:
-    """The text of --help; the registry of scenes is read only when the text is."""
+    """The text of --help, which lists the scenes: the registry of scenes is imported when help is asked for."""
     from herglotz.scenes import scene, scene_names
 
     return ABOUT.format(scenes="".join(f"  {name:<20}{scene(name).description}\n" for name in scene_names()))

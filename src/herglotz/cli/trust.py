@@ -1,4 +1,4 @@
-"""`herglotz trust`: how far a fitted model can be trusted, and what its data do not determine."""
+"""`herglotz trust`: how far to trust a fitted model, and which parameters its data do not determine."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ def _numbers(result: Run, posterior: Laplace, bands: Bands, level: float) -> dic
     from herglotz.training import traded
 
     inside = bands.inside(result.data.unwrapped().q, level)
-    held = ~trained_mask(result)
+    held_out = ~trained_mask(result)
     return {
         "level": level,
-        "inside_training": float(inside[~held].double().mean()),
-        "inside_held_out": float(inside[held].double().mean()) if bool(held.any()) else None,
+        "inside_training": float(inside[~held_out].double().mean()),
+        "inside_held_out": float(inside[held_out].double().mean()) if bool(held_out.any()) else None,
         "noise": dict(zip(result.data.names, bands.sigma.tolist(), strict=True)),
         "held_out_over_noise": posterior.inflation,
         "traded": [{"index": t.index, "parts": dict(t.parts), "words": str(t)} for t in traded(posterior)],
@@ -91,7 +91,7 @@ def _numbers(result: Run, posterior: Laplace, bands: Bands, level: float) -> dic
 
 
 def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
-    """Value and standard deviation of every entry of the parameters that have a meaning of their own."""
+    """Value and standard deviation of every entry of each physical parameter, by its name."""
     numbers: dict[str, list[list[float]]] = {}
     for x in found:
         numbers.setdefault(x.name, []).append([x.value, x.std])
@@ -113,7 +113,8 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figu
     rows.append(("noise of a sample", f"{noise}; held-out blocks miss {worse} times as much"))
     rows.append(("parameters the data fix", determined(numbers["effective_parameters"], numbers["all_parameters"])))
     print_table(rows)
-    if result.metrics.get("equation"):  # the coefficients of named terms stand there with their deviations
+    # The equation has the coefficients of named terms with their standard deviations.
+    if result.metrics.get("equation"):
         print("Learned equation:")
         print(*(f"  {line}" for line in str(result.equation()).splitlines()), sep="\n")
     print("Value ± standard deviation (the first mass is 1):")

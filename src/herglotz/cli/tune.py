@@ -1,4 +1,4 @@
-"""`herglotz tune`: find the step that meets an error or a budget."""
+"""`herglotz tune`: find the cheapest step within an error, or the most accurate step within a budget."""
 
 from __future__ import annotations
 

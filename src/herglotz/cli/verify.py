@@ -1,4 +1,4 @@
-"""`herglotz verify`: the identities of the theory, measured."""
+"""`herglotz verify`: measure the identities of the theory."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ examples:
   herglotz verify runs/pendulum --json
   herglotz verify stepper.onnx --against runs/pendulum
 """
-# Largest difference after 1000 steps, relative to the largest value: rounding that each step feeds back.
-AGREEMENT = {"float64": 1e-9, "float32": 1e-3}
+# Bounds on the largest difference after 1000 steps, relative to the largest value: each step amplifies rounding.
+MAX_DIFFERENCE = {"float64": 1e-9, "float32": 1e-3}
 
 
 HELP = "check the identities of the theory"
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: argparse.Namespace) -> str:
-    """The report, the symmetries that were found, and how a file compares with its run."""
+    """The report, the symmetries, and the comparison of a file with its run."""
     alone = agreement is None and report.passed and Path(arguments.target).is_file()
     verdict = "its identities hold; its numbers are not verified" if alone else ""
     if agreement is not None and not agreement["passed"]:
@@ -94,7 +94,7 @@ def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: 
 
 
 def _opened(path: Path, arguments: argparse.Namespace) -> Any:
-    """Open a file; a C header of a run that is at hand is generated again, and opened where it is the same text."""
+    """Open a file. A C header is trusted without --trust-code if its run is found and generates the same text."""
     from herglotz.export import load_c, load_exported
     from herglotz.export.load import WITH_HEADER, read_header
     from herglotz.training import load_run
@@ -120,7 +120,8 @@ def _exported_from(metadata: dict[str, Any], file: Path) -> Path | None:
             try:
                 if weights_digest(load_run(model.parent).model) == metadata["weights_sha256"]:
                     return model.parent
-            except InputError:  # not a run of this package
+            # A model.pt of another program is no run.
+            except InputError:
                 continue
     return None
 
@@ -135,7 +136,7 @@ def _agreement(target: Any, arguments: argparse.Namespace) -> dict[str, Any]:
     states = State(*(x.to(target.dtype) for x in found.states))
     states = State(*(x[states.finite] for x in states))
     result = compare(target, found.stepper, h=arguments.h, states=states, seed=arguments.seed)
-    bound = AGREEMENT[target.metadata["dtype"]]
+    bound = MAX_DIFFERENCE[target.metadata["dtype"]]
     close = all(result[name] <= bound for name in "qpsc")
     other = other_metadata(target.metadata, found)
     passed = close and result["status"] == 0 and result["same_weights"] is not False and not other
@@ -143,11 +144,12 @@ def _agreement(target: Any, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def other_metadata(metadata: dict[str, Any], run: Any) -> list[str]:
-    """Names of what a file says of its model and its run does not."""
-    expected = json.loads(json.dumps(run.model.config.to_dict()))  # tuples become lists, as in the file
-    said = {"level": run.model.config.level, "dof": run.model.config.dof, "model": expected}
-    metadata = json.loads(json.dumps({name: metadata[name] for name in said}))
-    return [name for name, value in said.items() if metadata[name] != value]
+    """Names of the entries about the model that differ between a file and its run."""
+    config = run.model.config
+    expected = {"level": config.level, "dof": config.dof, "model": config.to_dict()}
+    # Through JSON tuples become lists, as in the file.
+    found, wanted = (json.loads(json.dumps({name: x[name] for name in expected})) for x in (metadata, expected))
+    return [name for name in expected if found[name] != wanted[name]]
 
 
 def _table(agreement: dict[str, Any], against: Path | None) -> str:

@@ -1,4 +1,4 @@
-"""Figures of data, runs and the theory, as matplotlib `Figure` objects; no function opens a window."""
+"""Figures of data, runs and the theory, as matplotlib `Figure` objects. No function opens a window."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FIGURES = {
     "plan": plot_plan,
     "sizes": plot_sizes,
 }
-# Imported at first use, for they take rooms that no figure of a run needs: theory, scenes, export and verify.
+# These names are imported at first use: they import theory, scenes, export and verify, which no figure of a run needs.
 _OF_THE_THEORY = (
     "IDENTITIES",
     "plot_fall",
@@ -69,14 +69,14 @@ def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
     Returns
     -------
     list of Path
-        In the order of `FIGURES`, without the plan, and the sizes of the models that a search compared, where the run
-        holds none. All are drawn before one is written.
+        The files, in the order of `FIGURES`. `plan` is left out for a run without a plan, and `sizes` for a run
+        without a search for terms. Every figure is drawn before the first is written.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written to.
     """
-    needed = {"plan": "plan", "sizes": "compared"}
-    held = {name: plot for name, plot in FIGURES.items() if needed.get(name) is None or run.metrics.get(needed[name])}
-    return save_all({name: plot(run) for name, plot in held.items()}, folder, form)
+    required = {"plan": "plan", "sizes": "compared"}
+    plots = {name: plot for name, plot in FIGURES.items() if name not in required or run.metrics.get(required[name])}
+    return save_all({name: plot(run) for name, plot in plots.items()}, folder, form)

@@ -1,4 +1,4 @@
-"""A moving picture of data and model: pendulums and arms as links, chains as beads, two lengths as a moving point."""
+"""An animation of data and model: angles as links, two lengths as a point in the plane, other lengths as beads."""
 
 from __future__ import annotations
 
@@ -23,9 +23,12 @@ from herglotz.plots.style import DPI, INK, MODEL, MUTED, SHADE, UNSEEN, captions
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-FRAMES, PER_SECOND, COLOURS = 120, 20, 64  # a file of six seconds and below 1 MB
-MOST_PANELS = 3  # more are too small to read
-Shape = tuple[np.ndarray, np.ndarray]  # x and y of the joints, (points,) each
+# Six seconds, in a file below 1 MB.
+FRAMES, FRAMES_PER_SECOND, COLOURS = 120, 20, 64
+# More coordinates in one panel cannot be told apart.
+MAX_COORDINATES = 3
+# x and y of the joints, (points,) each.
+Shape = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -41,9 +44,9 @@ class Animation:
 def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
     """Write a GIF of one trajectory: the recording in grey beside the model's free run, and both against time.
 
-    Where all coordinates are angles, links of equal length hang from a point, each angle measured from the vertical;
-    angles after a length hang from a cart. Two lengths of the same unit are a point in the plane; other lengths are
-    beads side by side, each displaced by a coordinate. Time is stretched to six seconds.
+    If all coordinates are angles, links of equal length hang from a point, and each angle is measured from the
+    vertical; angles after a length hang from a cart. Two lengths of the same unit are a point in the plane. Other
+    lengths are beads side by side, each displaced by its coordinate. The animation lasts six seconds.
 
     Parameters
     ----------
@@ -52,7 +55,7 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
     path
         The file, which ends in .gif.
     trajectory
-        Which of `run.data`, from 0.
+        Number of the trajectory in `run.data`, from 0.
 
     Returns
     -------
@@ -62,7 +65,7 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
     Raises
     ------
     InputError
-        If the name does not end in .gif, or `trajectory` is no number of a trajectory.
+        If the name does not end in .gif, or the data have no such trajectory.
     """
     data = run.data.unwrapped()
     if Path(path).suffix.lower() != ".gif":
@@ -90,44 +93,45 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
             artist.set_animated(True)
         canvas, images = FigureCanvasAgg(figure), []
         canvas.draw()
-        still = canvas.copy_from_bbox(figure.bbox)  # all but the artists: drawn once
+        # The background, all but the animated artists, is drawn once.
+        background = canvas.copy_from_bbox(figure.bbox)
         for time in frames:
             recorded.set_data(*scene.shape(_at(time, t, q)))
             moving.set_data(*scene.shape(_at(time, t, model)))
             moving.set_color(MODEL if time <= boundary else UNSEEN)
             cursor.set_xdata([time, time])
-            canvas.restore_region(still)
+            canvas.restore_region(background)
             for ax, artist in zip((left, left, right), artists, strict=True):
                 ax.draw_artist(artist)
             images.append(Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS))
-    moved = io.BytesIO()
-    images[0].save(moved, "GIF", save_all=True, append_images=images[1:], duration=1000 // PER_SECOND, loop=0)
-    write_atomically(path, moved.getvalue())
+    gif = io.BytesIO()
+    images[0].save(gif, "GIF", save_all=True, append_images=images[1:], duration=1000 // FRAMES_PER_SECOND, loop=0)
+    write_atomically(path, gif.getvalue())
     return Animation(Path(path))
 
 
 def _at(time: float, t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Positions (n,) at a time between samples."""
+    """Positions (n,) at a time, interpolated between samples."""
     return np.array([np.interp(time, t, column) for column in q.T])
 
 
 def _series(ax: Axes, data: Trajectories, motion: tuple[np.ndarray, np.ndarray, np.ndarray], boundary: float):
-    """Draw the coordinates against time; return the line that moves."""
+    """Draw the coordinates against time; return the line that marks the present time."""
     (t, q, model), seen = motion, motion[0] <= boundary
-    for i in range(min(q.shape[1], MOST_PANELS)):
+    for i in range(min(q.shape[1], MAX_COORDINATES)):
         ax.plot(t, q[:, i], ".", color=DATA, ms=5)
         ax.plot(t[seen], model[seen, i], color=MODEL, lw=1)
         ax.plot(t[t >= boundary], model[t >= boundary, i], color=UNSEEN, lw=1)
     if boundary < t[-1]:
         ax.axvspan(boundary, t[-1], color=SHADE, lw=0, zorder=0)
     ax.set(xlim=(t[0], t[-1]), xlabel=with_unit("time", data.time_unit))
-    names = data.names[:MOST_PANELS]
+    names = data.names[:MAX_COORDINATES]
     ax.set_ylabel(", ".join(with_unit(name, unit) for name, unit in zip(names, data.units, strict=False)))
     return ax.axvline(t[0], color=INK, lw=1)
 
 
 class _Scene:
-    """The drawing of a position, by the kinds of the coordinates."""
+    """How a position is drawn: as links, as a point in the plane, or as beads."""
 
     def __init__(self, run: Run, positions: np.ndarray):
         angles, n = run.data.angles, run.data.dof
@@ -152,7 +156,7 @@ class _Scene:
         return (q, np.zeros(1)) if len(q) == 1 else (np.arange(len(q)) * 1.0, q)
 
     def frame(self, ax: Axes) -> None:
-        """Limits, and the parts that stand still."""
+        """Set the limits and draw the parts that do not move."""
         ax.set(xlim=self.x, ylim=self.y)
         if self.links or self.plane:
             ax.set_aspect("equal")

@@ -1,4 +1,4 @@
-"""Residuals of a run and the predictive band of its posterior."""
+"""Residuals of a run, and the predictive bands of its posterior."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from herglotz.plots.style import MODEL, MUTED, SHADE, UNSEEN, captions, new_figu
 if TYPE_CHECKING:
     from herglotz.training import Bands, Run
 
-MOST_PANELS = 4  # more are too small to read
+# More panels are too small to read.
+MAX_PANELS = 4
 
 
 def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
     """Draw data − model against time, with the bands of the model's position and of a measured value.
 
-    At most four panels: coordinates of one trajectory, then of the next. Panels of one unit have one scale.
+    At most four panels: the coordinates of the first trajectory, then those of the next. Panels of the same unit have
+    the same scale.
     """
-    inside, held = bands.inside(run.data.unwrapped().q, level), ~trained_mask(run)
+    inside, held_out = bands.inside(run.data.unwrapped().q, level), ~trained_mask(run)
     data, factor = as_recorded(run.data.unwrapped())
-    part, word = (held, "held-out ") if bool(held.any()) else (~held, "")
+    part, word = (held_out, "held-out ") if bool(held_out.any()) else (~held_out, "")
     share = 100 * float(inside[part].double().mean())
     title = f"{share:.0f} % of the {word}samples lie in the {100 * level:g} % band"
-    cells = [(b, i) for b in range(len(data)) for i in range(data.dof)][:MOST_PANELS]
+    cells = [(b, i) for b in range(len(data)) for i in range(data.dof)][:MAX_PANELS]
     width = NormalDist().inv_cdf(0.5 + level / 2)
     with styled():
         figure = new_figure(8.0, 1.2 + 1.9 * len(cells), title)
@@ -52,9 +54,10 @@ def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
                 ax.set_title(f"trajectory {b}")
             ax.set_ylabel(with_unit(f"residual of {data.names[i]}", data.units[i]))
         units = [data.units[i] for _, i in cells]
-        for ax, unit in zip(axes, units, strict=True):  # one scale a unit: panels can be compared
-            alike = max(other for other, own in zip(reaches, units, strict=True) if own == unit)
-            ax.set_ylim(-1.5 * alike, 1.5 * alike)
+        # Panels of the same unit have the same scale, so that a reader can compare them.
+        for ax, unit in zip(axes, units, strict=True):
+            largest = max(reach for reach, other in zip(reaches, units, strict=True) if other == unit)
+            ax.set_ylim(-1.5 * largest, 1.5 * largest)
         captions(axes[0], [("● training", MODEL), ("● held out", UNSEEN), ("dark: model, light: measurement", MUTED)])
         axes[-1].set_xlabel(with_unit("time", data.time_unit))
     return figure

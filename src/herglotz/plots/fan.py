@@ -1,4 +1,4 @@
-"""Fans of solutions for the figures of the generating function and of the Hamilton–Jacobi equation."""
+"""Fans of solutions, from many states or through one point, for the figures of `hamilton_jacobi.py`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from herglotz.stepping import State, Stepper
 from herglotz.theory import GeneratingFunction, generating_functions
 from herglotz.verify.subject import subject
 
-CAUSTIC = 1e-3  # smallest spread of ∂q_k/∂p̂0, relative to the median, at which S^k is still drawn
+# S^k is drawn where the spread of ∂q_k/∂p̂0 is above this part of the fan's median. At a caustic the spread is 0, and
+# S^k has no derivative.
+MIN_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Fan:
     momentum_unit: str = ""
 
     def generating_functions(self, steps: int, start: State | None = None) -> list[GeneratingFunction]:
-        """Return S^1, S^2, … and their derivatives along every solution of the fan."""
+        """Return S^1, S^2, …, S^steps and their derivatives along every solution of the fan."""
         stepper = Stepper(self.L_d)
 
         def flow(*state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -39,15 +41,15 @@ class Fan:
 
 
 def regular(S: GeneratingFunction) -> Tensor:
-    """Return where S^k exists, (F,) bool: it is finite and not at a caustic."""
+    """Return (F,) bool, where S^k exists: S^k is finite, and the solution is not at a caustic."""
     finite = torch.isfinite(S.S) & torch.isfinite(S.D2).all(-1) & torch.isfinite(S.p).all(-1)
     spread = torch.where(finite, S.spread, torch.zeros_like(S.spread))
     typical = spread[finite].median() if bool(finite.any()) else spread.sum()
-    return finite & (spread > CAUSTIC * typical)
+    return finite & (spread > MIN_SPREAD * typical)
 
 
 def spread_fan(source: Any, size: int, h: float | None = None) -> Fan:
-    """Return `size` solutions that start all over the data (a run), or from drawn states."""
+    """Return `size` solutions from states spread over the data of a run; without a run, from drawn states."""
     if not _is_run(source):
         known = subject(source, _typical_step(source) if h is None else h, size, 0)
         if known.L_d is None:
@@ -60,9 +62,9 @@ def spread_fan(source: Any, size: int, h: float | None = None) -> Fan:
 
 
 def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
-    """Return `size` solutions that leave one point (q̂0, ŝ0) with different p̂0 along one direction.
+    """Return `size` solutions through one point (q̂0, ŝ0) with different p̂0 along one direction.
 
-    The point is one of the data of a run, or of the states that `spread_fan` starts from.
+    The point is a state of the run's data, or of the states that `spread_fan` starts from.
     """
     if _is_run(source):
         whole = Fan(source.model, source.states, source.h if h is None else h, momentum_unit(source))
@@ -78,7 +80,7 @@ def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
 
 
 def _sound(states: State) -> State:
-    """The states whose numbers are finite."""
+    """The finite states; raise if there are none."""
     finite = states.finite
     if not bool(finite.any()):
         raise InputError("the run has no finite state to start from; fit it again")
@@ -86,12 +88,12 @@ def _sound(states: State) -> State:
 
 
 def _is_run(source: Any) -> bool:
-    """Whether the source has states fitted to data; hand-made runs of tests have, too."""
+    """True if the source holds a model and states that were fitted to data."""
     return hasattr(source, "states") and hasattr(source, "model")
 
 
 def _typical_step(source: Any) -> float | None:
-    """A tenth of the typical time of a model; of anything else its own step."""
+    """A tenth of the typical time of a model; None for other sources, which have a step of their own."""
     if not isinstance(source, ContactLagrangian):
         return None
     return 0.1 * min(a / b for a, b in zip(source.config.scale, source.config.speed, strict=True))

@@ -1,4 +1,4 @@
-"""The learned functions of a model: potential, force, friction, damping and mass by coordinate, with the support."""
+"""The learned functions of a model: potential, force, friction, damping and mass along each coordinate."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from herglotz.training.learned_functions import LearnedFunction, learned_functio
 if TYPE_CHECKING:
     from herglotz.training import Laplace, Run
 
-MOST_COLUMNS, POINTS = 3, 161
-BEYOND = 0.25  # of the data's range, drawn on both sides of it
+MAX_COLUMNS, POINTS = 3, 161
+# Functions are drawn beyond the data, on both sides by this part of the data's range.
+BEYOND = 0.25
 ROWS = ("potential", "force", "friction", "damping", "mass")
 
 
 def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
-    """Draw the functions that a run has learned, along each coordinate, the others at their median.
+    """Draw the functions that a run has learned, along each coordinate with the others at their median.
 
-    These are V(q_i), the force −∂V/∂q_i, friction by the velocity, and damping and the entries m_jk of the mass where
-    they depend on position (`herglotz.training.learned_functions`). The first mass is 1 in the mean over the data, so
-    that forces are accelerations of the first coordinate; V is 0 in the mean over their range, which is shaded: beyond
-    it the model extrapolates.
+    The functions are V(q_i), the force −∂V/∂q_i, friction over the velocity, and, if they depend on position, damping
+    and the entries m_jk of the mass (`herglotz.training.learned_functions`). The mean of the first mass over the data
+    is 1, so that forces are accelerations of the first coordinate. The range of the data is shaded: the mean of V over
+    this range is 0, and beyond the range the model extrapolates.
 
     Parameters
     ----------
     run
         A fitted run.
     posterior
-        Adds bands of two standard deviations about the posterior's mean, where the data are.
+        If given, bands of two standard deviations about the posterior's mean are drawn over the range of the data.
     """
-    every = learned_functions(run if posterior is None else posterior, points=POINTS, beyond=BEYOND)
-    columns = min(run.data.dof, MOST_COLUMNS)
-    rows = [kind for kind in ROWS if any(f.kind == kind for f in every)]
+    functions = learned_functions(run if posterior is None else posterior, points=POINTS, beyond=BEYOND)
+    columns = min(run.data.dof, MAX_COLUMNS)
+    rows = [kind for kind in ROWS if any(f.kind == kind for f in functions)]
     labels, speed = _labels(run), momentum_unit(run)
     with styled():
         figure = new_figure(1.2 + 3.9 * columns, 2.3 * len(rows) + 0.5, "What the model has learned, mass 1")
@@ -45,7 +46,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
         for row, i in product(range(len(rows)), range(columns)):
             ax, kind = axes[row, i], rows[row]
             colors = SERIES if kind == "mass" else (MODEL,)
-            drawn = list(zip((f for f in every if (f.kind, f.of[-1]) == (kind, i)), colors, strict=False))
+            drawn = list(zip((f for f in functions if (f.kind, f.of[-1]) == (kind, i)), colors, strict=False))
             if not drawn:
                 ax.set_axis_off()
                 continue
@@ -66,11 +67,12 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
 
 
 def _labels(run: Run) -> dict[str, str]:
-    """Labels of the axes of each kind, with units."""
+    """Label of the vertical axis of each kind of function, with its unit."""
     speed, time = momentum_unit(run), run.data.time_unit
-    force = speed + "²" if speed and time not in ("", "1") else ""  # rad/s, rad/s²
+    # The first mass is 1: a speed in rad/s makes forces of rad/s² and energies of rad²/s².
+    force = speed + "²" if speed and time not in ("", "1") else ""
     length = "" if run.data.units[0] == "1" else run.data.units[0]
-    energy = force.replace(length, f"{length}²", 1) if length else force  # rad²/s²: the first mass is 1
+    energy = force.replace(length, f"{length}²", 1) if length else force
     at = " at s = 0" if run.model.config.dissipation else ""
     return {
         "potential": with_unit("potential V", energy), "force": with_unit("force −∂V/∂q", force),

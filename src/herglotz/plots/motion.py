@@ -1,4 +1,4 @@
-"""Positions against time: the data, the free run of the model, and the residual."""
+"""Positions against time: data, the free run of the model, and the residual."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ if TYPE_CHECKING:
     from herglotz.training import Run
     from herglotz.training.predict import Prediction
 
-MOST_PANELS, DATA = 4, "#B5B5B5"
-ROOM_FOR_RMS = 0.2  # of the axis: the caption takes 0.15 of the axis in a figure with a single panel
-# Shares that have a word.
+MAX_PANELS, DATA = 4, "#B5B5B5"
+# The RMS is written if its part takes more than this part of the axis. The text itself takes 0.15 of the axis in a
+# figure of one panel.
+MIN_WIDTH_OF_RMS = 0.2
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
 
 def plot_data(data: Trajectories) -> Figure:
-    """Draw the samples alone, up to four trajectories (or the coordinates of a single one); gaps stay open."""
+    """Draw the samples of up to four trajectories, or up to four coordinates of a single one; gaps stay open."""
     cells = _cells(data, None)
     data, _ = as_recorded(data)
     with styled():
@@ -45,19 +46,20 @@ def plot_data(data: Trajectories) -> Figure:
 
 
 def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
-    """Draw data, free run and residual against time; the part beyond training is shaded.
+    """Draw data, free run and residual against time; held-out time is shaded.
 
     Parameters
     ----------
     run
-        A fitted run; the prediction is a rollout of each trajectory, never corrected by later data.
+        A fitted run; the prediction is one rollout of each trajectory, which no later sample corrects.
     trajectory
-        Number of a trajectory, with up to four coordinates; left out, up to four trajectories spread over the set.
+        Number of the trajectory whose coordinates are drawn, at most four; None: up to four trajectories spread over
+        the data.
 
     Raises
     ------
     InputError
-        If `trajectory` is no number of a trajectory.
+        If the data have no such trajectory.
     """
     if trajectory is not None and not 0 <= trajectory < len(run.data):
         raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(run.data) - 1}")
@@ -66,10 +68,10 @@ def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
 
 
 def plot_prediction(found: Prediction) -> Figure:
-    """Draw a recording, the free run of a model not fitted to it, and the residual; the warm-up is not shaded.
+    """Draw a recording, the free run of a model that was not fitted to it, and the residual; the free run is shaded.
 
-    A single trajectory shows up to four coordinates. Of several, up to four spread over the set show the first
-    coordinate.
+    Up to four coordinates of a single trajectory are drawn. Of several trajectories up to four are drawn, each by its
+    first coordinate.
     """
     counts = (found.warmup,) * len(found.data)
     return _drawn(
@@ -78,12 +80,13 @@ def plot_prediction(found: Prediction) -> Figure:
 
 
 class _Motion(NamedTuple):
-    """Data beside the motion of a model that has seen the first samples of every trajectory."""
+    """Data, positions of the model, the samples of each trajectory that the model has seen, and two captions."""
 
     data: Trajectories
-    model: torch.Tensor  # (N, n) positions
-    counts: Sequence[int]  # samples that the model has seen, of every trajectory
-    words: tuple[str, str]  # for the model there, and beyond
+    model: torch.Tensor  # (N, n)
+    counts: Sequence[int]  # (B,)
+    # Captions of the model's motion over samples that the model has seen, and over the others.
+    words: tuple[str, str]
 
 
 def _drawn(motion: _Motion, title: str, trajectory: int | None = None) -> Figure:
@@ -112,7 +115,7 @@ def _prediction_title(found: Prediction) -> str:
 
 
 def trajectory_title(run: Run) -> str:
-    """Return the message of the figure: the distance of the free run from data that the fit has not seen."""
+    """Return the title: the RMS distance of the free run from the samples that the fit has not seen."""
     data, factor = as_recorded(run.data)
     unit, error = common_unit(data.units), (run.prediction * factor - data.q).detach()
     unseen = ~trained_mask(run)
@@ -130,7 +133,7 @@ def trajectory_title(run: Run) -> str:
 
 
 def trained_mask(run: Run) -> torch.Tensor:
-    """Return which samples were trained on, (N,) bool: the first `train_lengths` of every trajectory."""
+    """Return (N,) bool, which samples were trained on: the first `train_lengths` of every trajectory."""
     return leading(run.data.lengths, run.train_lengths)
 
 
@@ -152,7 +155,8 @@ def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, la
     if count < len(t):
         for ax in (top, bottom):
             ax.axvspan(boundary, t[-1], color=SHADE, lw=0, zorder=0)
-    top.plot(t, q, ".", color=DATA, ms=7, mew=0, zorder=2)  # wide and pale: the line does not hide the data
+    # The points are wide and pale, so that the line of the model does not hide the data.
+    top.plot(t, q, ".", color=DATA, ms=7, mew=0, zorder=2)
     seen, unseen = slice(0, max(count, 0)), slice(max(count - 1, 0), None)
     top.plot(t[seen], model[seen], color=MODEL, lw=1.2, zorder=3)
     if count < len(t):
@@ -179,20 +183,21 @@ def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, un
     """Write the RMS of each part above the residuals."""
     split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
     reach = float(np.nanmax(np.abs(residual))) if np.isfinite(residual).any() else 0.0
-    bottom.set_ylim(-1.25 * (reach or 1.0), 1.9 * (reach or 1.0))  # room for the RMS above the points
+    # The axis goes further up than down: the RMS stands above the points.
+    bottom.set_ylim(-1.25 * (reach or 1.0), 1.9 * (reach or 1.0))
     for span, color, where in ((slice(0, count), MODEL, 0.0), (slice(count, None), UNSEEN, split)):
         part = residual[span]
-        if np.isfinite(part).any() and (where or split == 0.0 or split > ROOM_FOR_RMS):
+        if np.isfinite(part).any() and (where or split == 0.0 or split > MIN_WIDTH_OF_RMS):
             text = f"RMS {size(math.sqrt(float(np.nanmean(part**2))), unit)}"
             place = {"xycoords": bottom.get_xaxis_transform(), "xytext": (5, -2), "va": "top"}
             label(bottom, t[0] + where * (t[-1] - t[0]), 1.0, text, color, **place)
 
 
 def _cells(data: Trajectories, trajectory: int | None) -> list[tuple[int, int]]:
-    """Return (trajectory, coordinate) of each panel: coordinates of a trajectory, or coordinate 0 of several."""
+    """Return (trajectory, coordinate) of each panel: all coordinates of one trajectory, or the first of several."""
     if trajectory is not None or len(data) == 1:
-        return [(trajectory or 0, i) for i in range(min(data.dof, MOST_PANELS))]
-    chosen = np.linspace(0, len(data) - 1, min(len(data), MOST_PANELS)).round().astype(int)
+        return [(trajectory or 0, i) for i in range(min(data.dof, MAX_PANELS))]
+    chosen = np.linspace(0, len(data) - 1, min(len(data), MAX_PANELS)).round().astype(int)
     return [(int(b), 0) for b in chosen]
 
 
@@ -215,7 +220,7 @@ def _series(data: Trajectories, values: torch.Tensor, b: int, i: int) -> tuple[n
 
 
 def _readings(data: Trajectories, b: int, i: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times of a trajectory, and the readings of a coordinate; NaN where a reading is missing."""
+    """Times of a trajectory, and positions of a coordinate; NaN where a reading is missing."""
     t, q = _series(data, data.q, b, i)
     return t, q if data.observed is None else np.where(_series(data, data.observed, b, i)[1] > 0, q, np.nan)
 

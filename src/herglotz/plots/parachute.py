@@ -1,7 +1,7 @@
-"""Two figures of the parachute, and the numbers behind them: the map that the paper prints, and a fall (erratum E9).
+"""Two figures of the parachute and their numbers: the map that the paper prints, and a fall (erratum E9).
 
-The printed map (H⁺ without the near-identity part, λ = −0.01) is iterated from (q, p, s) = (100, 1, 1) as the paper
-does. Beside it the parachute q̈ = λq̇² − g, λ = +0.01, from the same start, with its exact discrete Lagrangian.
+The paper iterates the printed map (H⁺ without the near-identity part, λ = −0.01) from (q, p, s) = (100, 1, 1). The
+fall is the parachute q̈ = λq̇² − g, λ = +0.01, from the same start, with its exact discrete Lagrangian.
 """
 
 from __future__ import annotations
@@ -22,40 +22,54 @@ from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State, Stepper
 from herglotz.theory import generating_functions, hamilton_jacobi_residual
 
-FLOOR = 1e-18  # where a difference of exactly 0 is drawn
+# The axes are logarithmic: a difference of exactly 0 is drawn here.
+FLOOR = 1e-18
+# Points of the printed map in the figures: the next is ten times larger, and the one after that 1e22.
+SHOWN = 6
+# Gravity [m/s²], drag [1/m] and step [s] of the fall.
+G, LAM, H = 10.0, 0.01, 0.2
 
 
 @dataclass(frozen=True)
 class PrintedOrbit:
-    """The printed map's first points; arrays over k = 0…K, the slopes over k = 1…K."""
+    """The printed map's first points.
+
+    Arrays over k = 0…K, slopes dS = D2S^k(q_k) over k = 1…K. The names with `_squared` belong to the map with −2λ²s_k²
+    in the line of s. `last` is the last k that is finite in float64.
+    """
 
     q: np.ndarray
     p: np.ndarray
-    dS: np.ndarray  # D2S^k(q_k), s as printed
-    p_squared: np.ndarray  # p_k with −2λ²s_k² in the s-line
+    dS: np.ndarray
+    p_squared: np.ndarray
     dS_squared: np.ndarray
-    last: int  # the last k that is finite in float64
+    last: int
 
 
 @dataclass(frozen=True)
 class Fall:
-    """A fall in closed form, from t = 0 to the last step before the ground; slopes from k = 1."""
+    """A fall in closed form, from t = 0 to the last step before the ground.
+
+    Slopes dS = D2S^k(q_k) are those from k = 1 on. `residual` is that of the discrete Hamilton–Jacobi equation between
+    k and k + 1, relative to the sum of its terms' sizes. Velocities are negative downwards.
+    """
 
     t: np.ndarray
     q: np.ndarray
     v: np.ndarray
     p: np.ndarray
     dS: np.ndarray
-    residual: np.ndarray  # of the discrete Hamilton–Jacobi equation between k and k + 1, relative to its terms
+    residual: np.ndarray
     landing_time: float
-    landing_speed: float  # signed
+    landing_speed: float
     terminal_speed: float
 
 
 def plot_printed_map(orbit: PrintedOrbit) -> Figure:
-    """Draw what the paper's two figures plot: q_k and p_k of the printed map, and D2S^k(q_k) beside p_k.
+    """Draw the paper's two figures: q_k and p_k of the printed map, and D2S^k(q_k) beside p_k.
 
-    The second panel has D2S^k twice: of the map as printed, and with the square that its s-line lacks (erratum E9).
+    The second panel has D2S^k(q_k) twice: of the map as printed, and with the square that is missing in its line of s
+    (erratum E9).
     """
     k = np.arange(len(orbit.q))
     with styled():
@@ -84,7 +98,7 @@ def plot_printed_map(orbit: PrintedOrbit) -> Figure:
 
 
 def plot_fall(fall: Fall) -> Figure:
-    """Draw the fall with λ = +0.01: height and velocity to the ground, and D2S^k(q_k) on the momentum."""
+    """Draw the fall with λ = +0.01: height and velocity until the ground, and D2S^k(q_k) beside p_k."""
     with styled():
         title = f"A parachute lands after {size(fall.landing_time, 's')} at {size(-fall.landing_speed, 'm/s')}"
         figure = new_figure(9.2, 5.0, title)
@@ -133,10 +147,6 @@ def _draw_differences(ax: Axes, fall: Fall) -> None:
     captions(ax, [(r"● $|D_2S^k - p_k|$", UNSEEN), ("× Hamilton–Jacobi residual", ACCENT)])
 
 
-SHOWN = 6  # points of the printed map in the figures; the next is ten times larger, the one after it 1e22
-G, LAM, H = 10.0, 0.01, 0.2
-
-
 def start() -> State:
     """Return the start of both motions, (100, 1, 1)."""
     q, p, s = (torch.tensor(x, dtype=torch.float64) for x in MAP_START)
@@ -144,7 +154,7 @@ def start() -> State:
 
 
 def printed_map() -> tuple[dict, PrintedOrbit]:
-    """Return the orbit as printed and with s², as far as floats go, and D2S^k of both."""
+    """Return numbers and figure data of the orbit, as printed and with s², while finite; with D2S^k of both."""
     found, momenta, slopes = {}, {}, {}
     for name, step in (("printed", PrintedParachute()), ("squared", PrintedParachute(squared=True))):
         (q, p, s), last = step.orbit(*start(), steps=SHOWN + 6)
@@ -159,7 +169,7 @@ def printed_map() -> tuple[dict, PrintedOrbit]:
 
 
 def landing(q0: float, v0: float) -> tuple[float, float]:
-    """Return time and velocity at q = 0 in closed form.
+    """Return time and velocity at q = 0, in closed form.
 
     cosh ωt − a sinh ωt = e^{λq0} with ω = √(λg), a = λv0/ω, and v² = g/λ − (g/λ − v0²) e^{−2λq0}.
     """
@@ -170,7 +180,11 @@ def landing(q0: float, v0: float) -> tuple[float, float]:
 
 
 def physical_fall() -> tuple[dict, Fall]:
-    """Return landing, twice; p_k of the stepper, D2S^k(q_k), and the discrete Hamilton–Jacobi equation between them."""
+    """Return numbers and figure data of the fall.
+
+    The landing is computed twice, in closed form and by an event of the stepper; D2S^k(q_k) is compared with p_k, and
+    the discrete Hamilton–Jacobi equation is evaluated between k and k + 1.
+    """
     fall, x = scene("parachute", g=G, lam=LAM), start()
     v0 = float(fall.velocity(*x))
     time, speed = landing(float(x.q), v0)

@@ -1,4 +1,4 @@
-"""The plan of a fit: its decisions, in the order in which they are taken, with their reasons."""
+"""The plan of a fit: its decisions in order, with their reasons."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from herglotz.training.plan import Plan
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-WIDTH, LINE, GAP = 7.4, 0.16, 0.14  # inches: of the figure, of a line of text, between two boxes
-DECISION, REASON = 26, 62  # characters in a line
+# Width of the figure, height of a line of text, and distance of two boxes. [inches]
+WIDTH, LINE, GAP = 7.4, 0.16, 0.14
+# Characters in a line of a decision and of a reason.
+DECISION, REASON = 26, 62
 
 
 def plot_plan(run: Run) -> Figure:
-    """Draw the decisions of one reason in a box, the reason beside it, and arrows from one box to the next.
+    """Draw a box for the decisions of each reason, the reason beside the box, and arrows between the boxes.
 
     Raise InputError if the run holds no plan.
     """

@@ -1,4 +1,4 @@
-"""Held-out error of each level of the ladder: the reason for the choice of `select`."""
+"""Held-out error of each level of the ladder, by which `select` chooses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def plot_selection(selection: Selection) -> Figure:
             if any(failed) and math.isfinite(c.error):
                 label(ax, k, ceiling, f"{sum(failed)} failed", MUTED, ha="center", xytext=(0, 6))
         logarithmic(ax)
-        ax.set_ylim(min(finite) / 3, 1.5 * ceiling)  # at least a decade, so that a few per cent look small
+        # The axis spans at least a decade, so that differences of a few per cent look small.
+        ax.set_ylim(min(finite) / 3, 1.5 * ceiling)
         names = [f"{c.level}\n{c.parameters} parameters\n{c.step_us:.0f} µs a step" for c in candidates]
         ax.set_xticks(range(len(names)), names)
         ax.set(xlim=(-0.6, len(names) - 0.3), ylabel=with_unit("held-out RMS", common_unit(selection.run.data.units)))

@@ -1,4 +1,4 @@
-"""The trade of accuracy against size: held-out errors of the models that a search for terms compared."""
+"""Held-out error against the number of parameters, for the models that a search for terms compared."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 def plot_sizes(run: Run) -> Figure:
-    """Draw the held-out error of every model that was compared over the longest segments by its count of numbers.
+    """Draw the held-out error over the longest segments against the number of parameters, a point a model.
 
-    The line is the best one of each size, and the one that was taken is in colour. Raise InputError if the run has no
-    search for terms.
+    The line joins the best models of each size, and the model that was taken is in colour. Raise InputError if the
+    run has no search for terms.
     """
     compared = run.metrics.get("compared")
     if not compared:

@@ -1,4 +1,4 @@
-"""The figures of the theory: the identities of S^k of any L_d, and the paper's parachute."""
+"""Figures of the theory: the identities of S^k of any L_d, and the paper's parachute."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from herglotz.plots.parachute import physical_fall, plot_fall, plot_printed_map,
 from herglotz.plots.style import save_all
 from herglotz.verify.subject import named
 
-# Of S^k, which a model with forces does not have: identities that hold to rounding.
+# Figures of identities of S^k that hold to rounding. A model with forces has no S^k.
 IDENTITIES = {"momentum_vs_dS": plot_momentum_vs_generating_function, "hj_residual": plot_hamilton_jacobi_residual}
 NAMED = {**FIGURES, **IDENTITIES}
 

@@ -1,4 +1,4 @@
-"""The cost while training, one panel a stage."""
+"""The cost of every iteration of a fit, one panel a stage."""
 
 from __future__ import annotations
 
@@ -17,23 +17,26 @@ from herglotz.plots.style import MODEL, MUTED, logarithmic, new_figure, styled
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-Stage = tuple[str, list[float]]  # name and costs
-MOST_PANELS, COLUMNS = 12, 4
-SETTLED = 0.01  # change in the last iteration, of the whole fall in the stage
+# Name of a stage, and the cost of every iteration.
+Stage = tuple[str, list[float]]
+MAX_PANELS, MAX_COLUMNS = 12, 4
+# A stage has settled if its last iteration changed the cost by at most this part of the stage's whole decrease.
+SETTLED = 0.01
 
 
 def plot_training(run: Run) -> Figure:
-    """Draw the cost of every iteration, each stage in a panel of its own: each minimises another cost.
+    """Draw the cost of every iteration, a panel a stage, since each stage minimises another cost.
 
-    With more than twelve stages, the last twelve are drawn. A stage is said to have settled where its last iteration
-    changed the cost by less than 1 % of the stage's whole fall. Raise InputError if the run has no history.
+    The last twelve stages are drawn. A panel says "settled" if the last iteration changed the cost by at most 1 % of
+    the stage's whole decrease. Raise InputError if the run has no history.
     """
     if not run.history:
         raise InputError("the run has no history of its cost; fit it again to get one")
-    every = [(name, [float(row["cost"]) for row in rows]) for name, rows in groupby(run.history, lambda r: r["stage"])]
-    stages = [stage for stage in every if len(stage[1]) > 1] or every  # a single cost: the stage had nothing to do
-    shown = stages[-MOST_PANELS:]
-    columns = min(COLUMNS, len(shown))
+    costs = [(name, [float(row["cost"]) for row in rows]) for name, rows in groupby(run.history, lambda r: r["stage"])]
+    # A stage with a single cost made no iteration.
+    stages = [stage for stage in costs if len(stage[1]) > 1] or costs
+    shown = stages[-MAX_PANELS:]
+    columns = min(MAX_COLUMNS, len(shown))
     rows = math.ceil(len(shown) / columns)
     with styled():
         figure = new_figure(max(4.8, 2.6 * columns), 1.0 + 2.1 * rows, _title(stages, len(shown)))
@@ -44,13 +47,13 @@ def plot_training(run: Run) -> Figure:
             ax.set_axis_off()
         for ax in axes[::columns]:
             ax.set_ylabel("cost")
-        for ax in axes[: len(shown)][-columns:]:  # the lowest of each column
+        for ax in axes[: len(shown)][-columns:]:
             ax.set_xlabel("iteration of the stage")
     return figure
 
 
 def settled(cost: list[float]) -> bool:
-    """Whether the last iteration changed the cost by less than 1 % of the stage's whole fall."""
+    """True if the last iteration changed the cost by at most 1 % of the stage's whole decrease."""
     return len(cost) > 2 and abs(cost[-2] - cost[-1]) <= SETTLED * (max(cost) - min(cost))
 
 

@@ -1,4 +1,4 @@
-"""Error against cost of every setting that `tune` tried, and their Pareto front."""
+"""Error against cost of every setting that `tune` tried, with the Pareto front."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_f
 if TYPE_CHECKING:
     from herglotz.tune.result import Candidate, Tuning
 
-FLOOR = 1e-16  # an error of 0 (the run's own setting) is drawn here, because the axis is logarithmic
+# The axis is logarithmic: an error of 0, that of the run's own setting, is drawn here.
+FLOOR = 1e-16
 KINDS = (
     ("eager", "float64", "o", MUTED, "PyTorch"),
     ("c", "float64", "s", MODEL, "C, float64"),
     ("c", "float32", "^", ACCENT, "C, float32"),
 )
-FORMS = (("own model", "none"), ("distilled", "full"), ("kicks", "left"))  # and how their marks are filled
+# Forms of a step, and how their marks are filled.
+FORMS = (("own model", "none"), ("distilled", "full"), ("kicks", "left"))
 
 
 def _form(candidate: Candidate) -> str:
@@ -31,7 +33,7 @@ def _form(candidate: Candidate) -> str:
 
 
 def plot_tuning(tuning: Tuning) -> Figure:
-    """Draw the error bound against the cost: filled marks: distilled models, half: kicks, circle: the choice."""
+    """Draw the error bound against the cost; marks of distilled models are filled, and a circle marks the choice."""
     good = [c for c in tuning.candidates if math.isfinite(c.bound)]
     share, unit = f"{100 * tuning.config.quantile:g} % of starts", tuning.run.data.time_unit
     chosen = tuning.chosen
@@ -60,7 +62,7 @@ def plot_tuning(tuning: Tuning) -> Figure:
 
 
 def _draw_limits(ax: Axes, tuning: Tuning) -> None:
-    """The error or the cost that was asked for, and the model's own error against its data."""
+    """Draw the error or the cost that the user asked for, and the error of the model against its data."""
     if "max_error" in tuning.asked:
         ax.axhline(tuning.asked["max_error"], color=UNSEEN, lw=0.9, ls="--")
     else:

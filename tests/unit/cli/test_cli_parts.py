@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.cli import SIGNALS, _importing, _internal, _orderly, main, rollout
+from herglotz.cli import SIGNALS, _importing, _internal, _interruptible, main, rollout
 from herglotz.cli.common import exit_code, print_next_of, print_table, warn_of_misfit
 from herglotz.cli.tune import _whole
 from herglotz.data import driving
@@ -54,10 +54,10 @@ def test_a_program_that_calls_a_command_keeps_its_signals():
     # fails if the handlers of a command outlive one that ended, or come back while an interrupted one ends
     before = [signal.getsignal(one) for one in SIGNALS]
     try:
-        with _orderly():
+        with _interruptible():
             assert all(signal.getsignal(one) not in before for one in SIGNALS)
         assert [signal.getsignal(one) for one in SIGNALS] == before
-        with pytest.raises(KeyboardInterrupt), _orderly():
+        with pytest.raises(KeyboardInterrupt), _interruptible():
             signal.raise_signal(signal.SIGTERM)
         assert all(signal.getsignal(one) not in before for one in SIGNALS)
     finally:

@@ -42,36 +42,32 @@ def test_verify_and_compare_with_the_run(tiny_onnx, tiny_run, monkeypatch, capsy
     assert "is no file" in capsys.readouterr().err
 
 
-def test_other_weights_do_not_agree_however_close_the_motion(tiny_run, monkeypatch):
-    # fails if motions alone are compared: a weight that is off by less than their bound is another model
-    close = {**dict.fromkeys("qpsc", 0.0), "status": 0, "failed": 0, "per_batch": {}}
-    run = load_run(tiny_run)
-    said = {"dtype": "float64", "level": run.model.config.level, "dof": 1, "model": run.model.config.to_dict()}
-    file = SimpleNamespace(dtype=torch.float64, metadata=said)
-    for same in (True, False, None):  # None: the file says nothing of its weights
-        monkeypatch.setattr("herglotz.export.compare", lambda *_, same=same, **__: {**close, "same_weights": same})
-        agreement = _agreement(file, Namespace(against=tiny_run, h=None, seed=0))
-        assert agreement["passed"] is (same is not False)
-    off = {**close, "p": 1.0, "same_weights": True}  # fails if three of q, p, s and c are enough
-    monkeypatch.setattr("herglotz.export.compare", lambda *_, **__: off)
-    assert _agreement(file, Namespace(against=tiny_run, h=None, seed=0))["passed"] is False
-    monkeypatch.setattr("herglotz.export.compare", lambda *_, **__: {**close, "same_weights": True})
-    said["level"] = "forced"
-    assert _agreement(file, Namespace(against=tiny_run, h=None, seed=0))["passed"] is False  # rows would be left out
-
-
-@pytest.mark.parametrize("differing", [0, 1])
-def test_a_step_that_fails_in_one_of_both_is_no_agreement(differing, tiny_run, monkeypatch):
-    # fails if a file agrees with its run whose steps fail where those of the run do not: failed ones have no numbers
-    run = load_run(tiny_run)
-    row = {"q": 0.0, "p": 0.0, "s": 0.0, "c": 0.0, "failed": 0, "status": differing}
-    result = {**row, "per_batch": {1: row}, "same_weights": True}
+@pytest.mark.parametrize(
+    ("difference", "level", "agrees"),
+    [
+        ({}, "linear", True),
+        # fails if a file that says nothing of its weights is refused
+        ({"same_weights": None}, "linear", True),
+        # fails if motions alone are compared: a weight that is off by less than their bound is another model
+        ({"same_weights": False}, "linear", False),
+        # fails if three of q, p, s and c are enough
+        ({"p": 1.0}, "linear", False),
+        # fails if steps may fail where those of the run do not: failed steps have no numbers to compare
+        ({"status": 1}, "linear", False),
+        # fails if the metadata of the file are not compared
+        ({}, "forced", False),
+    ],
+)
+def test_what_a_file_and_its_run_must_agree_on(difference, level, agrees, tiny_run, monkeypatch):
+    config = load_run(tiny_run).model.config
+    row = {**dict.fromkeys("qpsc", 0.0), "failed": 0, "status": difference.get("status", 0)}
+    result = {**row, "same_weights": True, "per_batch": {1: row}, **difference}
     monkeypatch.setattr("herglotz.export.compare", lambda *_, **__: result)
-    said = {"level": run.model.config.level, "dof": run.model.config.dof, "model": run.model.config.to_dict()}
-    file = SimpleNamespace(dtype=torch.float64, metadata={"dtype": "float64", **said})
+    said = {"dtype": "float64", "level": level, "dof": 1, "model": config.to_dict()}
+    file = SimpleNamespace(dtype=torch.float64, metadata=said)
     agreement = _agreement(file, Namespace(against=tiny_run, h=None, seed=0))
-    assert agreement["passed"] is (differing == 0)
-    assert ("DOES NOT AGREE" in _table(agreement, tiny_run)) is (differing == 1)
+    assert agreement["passed"] is agrees
+    assert ("DOES NOT AGREE" in _table(agreement, tiny_run)) is not agrees
 
 
 def test_the_file_holds_a_model_card(tiny_onnx, tiny_run):
