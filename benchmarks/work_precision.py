@@ -1,0 +1,261 @@
+"""Error against cost, for every way to step: `python benchmarks/work_precision.py [--scenes a,b]`.
+
+Eight scenes, all in C: learned steppers (their own step, larger steps re-trained, several widths and depths, float64
+and float32; large steps of a few learned kicks; with terms more and less), RK4, DOP853 (adaptive and with equal steps)
+and leapfrog on the true equations, and RK4 and DOP853 on neural ODEs trained on the same data. Needs scipy.
+
+Error: largest |q − exact| at 4 times up to T, of motions from unseen starts (median, and 95 % of them), in units of q.
+Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn), the same in
+steps of C leapfrog, evaluations and flops beside it. Written after each scene, beside those of earlier runs:
+work_precision.json and .md. `--page` only puts the table of terms into docs/work_precision.md, where it stands between
+`<!-- terms -->` and `<!-- /terms -->`; nothing there is typed in.
+
+`--headline` measures two scenes over several training seeds instead, into headline.json and .md: learned kicks on the
+damped pendulum and a learned equation on the double pendulum, beside neural ODEs trained on the same motions and what
+is best on the true equations. A seed draws the training motions and the first weights of every network. Of each
+starting set the first half chooses a setting, the second half judges it; what it is compared with is the cheapest rival
+that is as accurate on the judging half itself, a choice no user can make.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
+from benchmarks.work_precision_rivals import classical, equation, neural
+from benchmarks.work_precision_ways import SETUPS, TOLD, Timed, costs, kicks, learned, prepare
+
+PAGE = harness.ROOT / "docs" / "work_precision.md"
+WANTED = {"damped_pendulum": (1e-2, 1e-3, 1e-4, 2e-5), "double_pendulum": (2e-2, 5e-3, 1e-3)}  # errors of the headline
+RIVALS = (
+    ("neural ODE", lambda p: p["kind"].startswith("neural ODE")),
+    ("DOP853", lambda p: p["kind"] == "DOP853, true equations"),
+    ("DOP853, equal steps", lambda p: p["kind"] == "DOP853 fixed, true equations"),
+    ("RK4", lambda p: p["kind"] == "RK4, true equations"),
+    ("leapfrog", lambda p: p["kind"] == "leapfrog, true equations"),
+)
+
+
+def front(points: list[dict]) -> list[dict]:
+    """Points that no other beats in both error and cost, cheapest first."""
+    kept: list[dict] = []
+    for p in sorted((p for p in points if p.get("median") is not None), key=lambda p: p["us_per_time"]):
+        if not kept or p["median"] < kept[-1]["median"]:
+            kept.append(p)
+    return kept
+
+
+# What a fit with another set of terms lacks or has besides, where its label does not say it.
+CHANGED = {"level conservative": "no damping", "level linear": "one rate, no drag",
+           "level affine": "drag besides, with its network"}  # fmt: skip
+TERMS = {
+    "damped_oscillator": "K, V quadratic, γ, correction",
+    "damped_pendulum": "K, V network, γ, correction",
+    "double_pendulum": "K(q) network, V network, γ, correction",
+    "parachute": "K, V, γ, λ, drag network, correction",
+    "kepler": "K, V of r, γ, correction",
+    "chain": "K, V of stretches, γ",
+    "driven_pendulum": "K, V network, γ, friction, input, correction",
+    "rigid_body": "K(q) network, V network, γ, correction",
+}
+
+
+def terms(scenes: dict[str, list[dict]]) -> list[str]:
+    """Each scene's own model at the step of its data, and what other terms cost and bring: all fitted alike."""
+    rows = []
+    for name, points in scenes.items():
+        own = next((p for p in points if p["kind"] == "learned" and p["dtype"] == "float64"), None)
+        if own is not None:
+            rows.append([f"**{name}**", f"**{TERMS[name]}**", f"{own['us_per_time'] * own['h']:.2g}", _error(own), ""])
+        for p in points:
+            label = p["kind"][9:]
+            if not p["kind"].startswith("learned, ") or not p["setting"].startswith(label):
+                continue
+            times = ""
+            if own is not None:
+                worse = f"{p['median'] / own['median']:.2g}" if p["median"] and own["median"] else "–"
+                times = f"{p['us_per_time'] / own['us_per_time']:.2g}, {worse}"
+            cost = f"{p['us_per_time'] * p['h']:.2g}{' (PyTorch)' if p['artefact'] == 'eager' else ''}"
+            rows.append(["", CHANGED.get(label, label), cost, _error(p), times])
+    head = ("scene", "terms", "µs a step", "median error", "times the scene's own: cost, error")
+    return ["", "## Terms", "", *harness.table(head, rows)]
+
+
+def add_leapfrog_unit(result: dict[str, Any]) -> None:
+    """The unit of cost: a step of C leapfrog on the damped pendulum (or, without it, another scene) of the same run."""
+    for name in ("damped_pendulum", *result["scenes"]):
+        points = [p for p in result["scenes"].get(name, []) if p["kind"].startswith("leapfrog")]
+        if points:
+            result["leapfrog_step_us"] = min(p["us_per_time"] / p["evaluations_per_time"] for p in points)
+            result["leapfrog_of"] = name
+            return
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The fronts, the knobs, what the others cost and what terms bring, as tables."""
+    measured = f"Commit {result['commit']}, {result['machine']['cores']} cores, one thread."
+    lines = ["# Error against cost", "", measured, "Errors: the largest departure of a position from the truth at four "
+             "times up to T, median of unseen starts."]  # fmt: skip
+    if unit := result.get("leapfrog_step_us"):
+        lines += [f"One C leapfrog step of the {result['leapfrog_of'].replace('_', ' ')}: {1e3 * unit:.3g} ns."]
+    for name, points in result["scenes"].items():
+        head = ("setting", "µs per time", "±", "leapfrog steps", "evaluations", "flops", "median", "95 %")
+        rows = []
+        for p in front(points):
+            work = [unit and p["us_per_time"] / unit, p.get("evaluations_per_time"), p.get("flops_per_time")]
+            rows.append([f"{p['kind'].split(',')[0]}: {p['setting']}", f"{p['us_per_time']:.3g}", f"{p['spread']:.2g}",
+                         *("" if c is None else f"{c:.3g}" for c in work), f"{p['median']:.2g}",
+                         "" if p["q95"] is None else f"{p['q95']:.2g}"])  # fmt: skip
+        lines += ["", f"## {name}", "", *harness.table(head, rows)]
+    return "\n".join([*lines, *terms(result["scenes"])])
+
+
+def _error(p: dict) -> str:
+    return "fails" if p["median"] is None else f"{p['median']:.2g}"
+
+
+def study(name: str, seeds: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Every seed's learned and neural settings and the classical ones, timed together; the ratios of each seed."""
+    setup = SETUPS[name]
+    if name == "double_pendulum":
+        setup = replace(setup, fit={**setup.fit, **TOLD})
+    timed: list[Timed] = []
+    seconds = []
+    for seed in range(seeds):
+        say(f"seed {seed}")
+        case = prepare(setup, seed)
+        mine = kicks(case) + equation(case) + neural(case)
+        timed += [replace(t, point={**t.point, "seed": seed}) for t in mine]
+        seconds.append(case.seconds)
+        if seed == 0:
+            timed += classical(case)
+    found = costs(timed)
+    rows = {e: [chosen(found, e, w, seeds) for w in WANTED[name]] for e in ("median", "q95")}
+    return {"seeds": seeds, "seconds": seconds, "rows": rows, "points": found}
+
+
+def chosen(points: list[dict], error: str, wanted: float, seeds: int) -> dict[str, Any]:
+    """Of each seed the cheapest learned setting within `wanted` on the choosing starts; its error on the others.
+
+    Beside it the cost of each rival (of this seed, where rivals are trained) that is no less accurate there.
+    """
+    rows = []
+    for seed in range(seeds):
+        mine = [p for p in points if p.get("seed", seed) == seed]
+        good = _within([p for p in mine if p["kind"].startswith("learned")], f"choice_{error}", wanted)
+        best = min(good, key=lambda p: p["us_per_time"], default=None)
+        if best is None or best[error] is None:
+            continue
+        row = {"seed": seed, "setting": best["setting"], "error": best[error], "us_per_time": best["us_per_time"]}
+        for rival, belongs in RIVALS:
+            costs_ = [p["us_per_time"] for p in _within(mine, error, best[error]) if belongs(p)]
+            row[rival] = min(costs_) / best["us_per_time"] if costs_ else None
+        rows.append(row)
+    return {"wanted": wanted, "seeds": rows}
+
+
+def _within(points: list[dict], error: str, most: float) -> list[dict]:
+    """Points whose error is known and at most so large."""
+    return [p for p in points if p.get(error) is not None and p[error] <= most]
+
+
+def study_table(name: str, result: dict[str, Any]) -> list[str]:
+    """Markdown: one line a wanted error."""
+    own = statistics.median(s["fit"] + s.get("kicks", 0) for s in result["seconds"])
+    theirs = statistics.median(s["neural ODE"] for s in result["seconds"])
+    lines = [
+        "",
+        f"## Headline: {name}, {result['seeds']} training seeds",
+        "",
+        f"Training, CPU seconds a seed: learned {own:.0f}, all neural ODEs {theirs:.0f}. "
+        "Each number: median (range) over the seeds.",
+    ]
+    names = [n for n, _ in RIVALS]
+    for error, wanted in result["rows"].items():
+        rows = []
+        for row in wanted:
+            found = row["seeds"]
+            cells = [middle([r[k] for r in found]) if found else "" for k in ("error", "us_per_time", *names)]
+            rows.append([f"{row['wanted']:g}", f"{len(found)} of {result['seeds']}", *cells])
+        lines += ["", f"By the {'median start' if error == 'median' else '95 % start'}:", ""]
+        lines += harness.table(("wanted", "seeds", "error", "µs per time", *names), rows)
+    return lines
+
+
+def middle(values: list[float | None]) -> str:
+    """Median and range, or how many never get there."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return "not reached"
+    text = f"{statistics.median(known):.3g} ({min(known):.3g} … {max(known):.3g})"
+    return text if len(known) == len(values) else f"{text}, not reached by {len(values) - len(known)}"
+
+
+def measure_headline(path: Path, names: list[str], seeds: int) -> None:
+    """Two scenes over several seeds, into headline.json and .md; the points themselves are not stored."""
+    scenes = harness.load(path, {"scenes": {}})["scenes"]
+    for name in names:
+        found = study(name, seeds, lambda what, name=name: print(name, what, flush=True))
+        scenes[name] = {k: v for k, v in found.items() if k != "points"} | {"measured": harness.conditions()}
+        tables = [line for scene, one in scenes.items() for line in study_table(scene, one)]
+        harness.store(path, {"scenes": scenes}, "\n".join(["# Cost of the others over the learned stepper's", *tables]))
+
+
+def measure_scene(name: str, result: dict[str, Any], say: Callable[[str], None]) -> None:
+    """Every setting of a scene, into the result."""
+    began, setup, timed = time.process_time(), SETUPS[name], []
+    say("fit")
+    case = prepare(setup)
+    for ways in (learned, equation, classical, neural):
+        say(ways.__name__)
+        timed += ways(case)
+    say("timing")
+    result["scenes"][name] = costs(timed)
+    notes = {"seconds": case.seconds, "one_step_rms": case.run.metrics["one_step_rms"]}
+    result["notes"][name] = {**notes, "T": setup.T, "h": setup.h, "total_seconds": time.process_time() - began}
+
+
+def page() -> str:
+    """docs/work_precision.md with the table of terms as the stored results have it."""
+    begin, end = "<!-- terms -->\n", "<!-- /terms -->\n"
+    before, rest = PAGE.read_text().split(begin)
+    lines = terms(harness.load(harness.RESULTS / "work_precision.json", {})["scenes"])[3:]
+    return before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1]
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__)
+    parser.add_argument("--scenes", help="with commas (default: all)")
+    parser.add_argument("--headline", action="store_true", help="two scenes, several training seeds")
+    parser.add_argument("--seeds", type=int, default=5, help="training seeds of the headline (default 5)")
+    parser.add_argument("--page", action="store_true", help="only write the table of terms into the page")
+    arguments = parser.parse_args(argv)
+    if arguments.page:
+        PAGE.write_text(page())
+        return
+    names = harness.chosen(parser, arguments.scenes, WANTED if arguments.headline else SETUPS, "scene")
+    path = harness.json_file(arguments, "headline" if arguments.headline else "work_precision")
+    if arguments.headline:
+        measure_headline(path, names, arguments.seeds)
+        return
+    earlier = harness.load(path, {"scenes": {}, "notes": {}})
+    result = {**harness.conditions(), "scenes": earlier["scenes"], "notes": earlier["notes"]}
+    with tqdm(names, disable=None) as bar:
+        for name in bar:
+            measure_scene(name, result, lambda what, name=name: bar.set_postfix_str(f"{name}: {what}"))
+            result["scenes"] = {name: result["scenes"][name] for name in SETUPS if name in result["scenes"]}
+            add_leapfrog_unit(result)
+            harness.store(path, result, markdown(result))
+
+
+if __name__ == "__main__":
+    main()
