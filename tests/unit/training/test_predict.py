@@ -16,6 +16,7 @@ from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
 from herglotz.training.predict import predict
 from herglotz.training.recorded_range import MARGIN
+from herglotz.training.smoother import process_noise
 
 predict_module = sys.modules[predict.__module__]  # the package has the function's name
 
@@ -271,7 +272,7 @@ def test_no_warm_up_is_named_where_none_works():
     # fails if a trajectory of four samples, which no warm-up of three leaves two of, is told --warmup 3
     model = model_of("linear")
     data = recording(model)
-    with pytest.raises(InputError, match="needs at least 22: leave it out, for none is short enough"):
+    with pytest.raises(InputError, match="needs at least 22: leave it out, as no warm-up is short enough"):
         predict(run_of(model), data.rows(torch.arange(85), (81, 4)))
 
 
@@ -314,17 +315,7 @@ def test_a_free_run_beyond_the_recorded_range_is_noted():
     assert "leaves the range" in repr(motion)
 
 
-def test_a_warm_up_is_believed_alike_at_every_step(monkeypatch):
-    # fails if noise of each step adds up: over 145 samples a period free runs began 1.6 times the noise off
+def test_process_noise_does_not_depend_on_the_step():
+    # fails if the noise of every step adds up: over 145 samples a period free runs began 1.6 times the noise off
     model = ContactLagrangian(ModelConfig(level="linear", rate=0.1, scale=(1.0,), speed=(1.0,), potential_width=0))
-    t, found = 0.1 * torch.arange(9, dtype=torch.float64), []
-    make = predict_module.SmoothingProblem
-
-    def noted(*arguments, process, **settings):
-        found.append(process)
-        return make(*arguments, process=process, **settings)
-
-    monkeypatch.setattr(predict_module, "SmoothingProblem", noted)
-    for step in (0.1, 0.025):
-        predict_module._smoothed(model, Trajectories.of(t, t.sin()[:, None], (9,)), 0.01, step, None)
-    assert found[0] == pytest.approx(2 * found[1])
+    assert process_noise(model, 0.1) == pytest.approx(2 * process_noise(model, 0.025))
