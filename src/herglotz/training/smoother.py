@@ -28,7 +28,7 @@ PROCESS_NOISE = 0.1
 
 @dataclass(frozen=True)
 class Smoothed:
-    """States at every sample and their standard errors for a fixed model; 0 for s if the motion does not depend on s."""
+    """States at every sample and their standard errors for a fixed model; s has 0 if the motion has no s."""
 
     states: State  # (N, n), (N, n), (N,)
     std: State  # (N, n), (N, n), (N,)
@@ -63,7 +63,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     if solved is None:
         where = data.source or "data"
         raise InputError(
-            f"{where}: a step of the model near these data fails, so nothing can be smoothed; fit the model again"
+            f"{where}: a step of the model near these data fails, so nothing can be smoothed; fit it again"
         )
     x, _ = solved
     found = problem.states(x)
