@@ -257,13 +257,12 @@ def fit_trajectories(
 ) -> Chosen[TrajectoryFit] | None:
     """Fit parameters and states to positions.
 
-    Segments grow from 20 steps to whole trajectories, or to the longest that the model follows; each stage starts from
-    the states of the stage before. Then every prior strength is fitted in turn, first the weakest, whose residuals give
-    the noise level for all. The strongest prior wins whose held-out error is not beaten beyond its spread. With many
-    coordinates the strongest is fitted first, and is the only one if its held-out error exceeds the spread of the
-    motion: there are then too few samples for the parameters. A model that is `known` from an earlier fit skips the
-    growth: whole trajectories follow the shortest segments.
-    The result has the longest segments that could be fitted; None if the model does not follow even the shortest.
+    Segments grow from 20 steps to whole trajectories, or to the longest that the model follows (None: it does not
+    follow even the shortest); each stage starts from the states of the stage before. Then every prior strength is
+    fitted in turn, first the weakest, whose residuals give the noise level for all. The strongest prior wins whose
+    held-out error is not beaten beyond its spread. With many coordinates the strongest is fitted first, and is the only
+    one if its held-out error exceeds the spread of the motion: too few samples for the parameters. A model that is
+    `known` from an earlier fit skips the growth: whole trajectories follow the shortest segments.
     """
     # Without a network there is no strength of a prior to choose.
     fixed = model.potential.network is None

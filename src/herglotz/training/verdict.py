@@ -284,7 +284,7 @@ def _worse(errors: Errors) -> str:
 
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[[], str]) -> str:
-    """The verdict on a model that the data do not determine, with a remedy; a longer recording only if it would help."""
+    """The verdict on a model that the data do not determine, with the recording that would help."""
     over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.windows > AT_THE_NOISE * errors.limit
     if not ahead.reached:
         return f"the model's own motion breaks off {over}; {errors}. {_remedy(metrics, missed, shown)}"
