@@ -103,7 +103,7 @@ def test_every_start_is_made_regular(monkeypatch):
 
 def test_least_squares_stay_where_no_robust_fit_is_found(monkeypatch):
     # fails if a fit that follows the data is dropped because its shortest segments cannot be fitted again
-    plain: Any = stub(misfit=torch.ones(4, 1), follows=lambda _: True)
+    plain: Any = stub(misfit=torch.ones(4, 1), noise=1.0)
     monkeypatch.setattr(trajectory_fit, "SegmentStages", lambda *_: stub(at_once=lambda _: plain))
     monkeypatch.setattr(trajectory_fit, "_wide_enough", lambda *_: (None, None))
     monkeypatch.setattr(trajectory_fit, "heavy_tailed", lambda _: True)
