@@ -112,7 +112,7 @@ class Laplace:
     def predict(self, data: Trajectories, seen: int) -> Bands:
         """Bands of new trajectories: their first `seen` samples give the start states, a free run the rest.
 
-        The start x of each is fitted to those samples with θ fixed. With JᵀJ of that fit in blocks, and C the covariance
+        The start x of each is fitted to those samples, θ being fixed. With JᵀJ of that fit in blocks, C the covariance
         of θ, x has the derivative G = −A_xx⁻¹ A_xθ by θ, and (θ, x) the covariance [[C, C Gᵀ], [G C, G C Gᵀ + A_xx⁻¹]].
 
         The data have the coordinates, units and inputs of the run, and more than `seen` ≥ 3 samples per trajectory; in
