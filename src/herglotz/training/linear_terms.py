@@ -157,7 +157,7 @@ class LinearTerms:
         return values | {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
 
     def _columns(self, of: NamedTerms) -> Tensor:
-        """Columns of a family, of masses, springs and friction; coupled masses and friction only for joints together."""
+        """Columns of a family, masses, springs and friction; joints that are not `apart` are coupled by the last three."""
         joints = any(self.data.angles) and not of.apart
 
         def used(name: str) -> bool:
