@@ -157,7 +157,7 @@ class LinearTerms:
         return values | {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
 
     def _columns(self, of: NamedTerms) -> Tensor:
-        """Columns of a family, masses, springs and friction; joints that are not `apart` are coupled by the last three."""
+        """Columns of a family, masses, springs and friction; joints are coupled unless `apart`."""
         joints = any(self.data.angles) and not of.apart
 
         def used(name: str) -> bool:

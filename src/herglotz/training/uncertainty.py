@@ -146,7 +146,7 @@ class Laplace:
         """Runs from `start`, (B, 2n+1), with a covariance of (θ, start) for each, (P + d, P + d)."""
         whole, path = self._solved(data, start)
         with torch.no_grad():
-            Z = whole.slopes_at_samples(self.theta, path).double().split(data.lengths)  # each (N_b, n, P + d)
+            Z = whole.slopes_at_samples(self.theta, path).double().split(data.lengths)  # (N_b, n, P + d) each
             variance = torch.cat([((z @ C) * z).sum(-1) for z, C in zip(Z, joint, strict=True)])
         q, std = whole.grid.at_samples(path.x[..., : whole.n]), variance.clamp_min(0).sqrt().to(data.q)
         return Bands(q, std, self.problem.deviations)

@@ -23,7 +23,7 @@ class Bordered:
 
     corner: Tensor  # (P, P)
     border: Tensor  # (S, M, d, P)
-    blocks: Blocks  # of T, (S, M, d, d) each
+    blocks: Blocks  # (S, M, d, d) each
 
     def __matmul__(self, v: Tensor) -> Tensor:
         """The matrix times v, (P + S·M·d,)."""
