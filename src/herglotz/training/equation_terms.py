@@ -17,7 +17,7 @@ from torch import Tensor
 from herglotz.models import ContactLagrangian
 from herglotz.models.action import ActionFlow, ActionPowers
 from herglotz.models.config import POWERS
-from herglotz.models.drag import DragFeature, parse_drag
+from herglotz.models.drag import parse_drag
 from herglotz.models.feature_grammar import Feature
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import Combination, baseline_is_named, sorted_features
@@ -168,7 +168,8 @@ class Reader:
             for i in (i for i in range(len(self.names)) if f.air or i in (f.on, f.of)):
                 size = unit_of(self.data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)
                 value = self.model.drag.coefficient[g] * (1.0 if f.of == i else -1.0)
-                yield Line(self.own[i], self._drag_in_words(f, i), size, value)
+                words = drag_in_words(f, i, self.names, self._sign(f.on) if f.dry else "")
+                yield Line(self.own[i], words, size, value)
 
     def _dry(self, i: int, left: str) -> Iterator[Line]:
         """Dry friction of one coordinate; a set-valued friction force below 0 counts as 0."""
@@ -196,9 +197,6 @@ class Reader:
             return f"sgn({name}′)"
         width = self.shown(friction.widths[0][i], f"the speed below which dry friction of {name} is smooth")
         return f"tanh({name}′/{width})"
-
-    def _drag_in_words(self, f: DragFeature, i: int) -> str:
-        return drag_in_words(f, i, self.names, self._sign(f.on) if f.dry else "")
 
     def _inputs(self) -> Iterator[Line]:
         """Each input less the zero of its sensor."""

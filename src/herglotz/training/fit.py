@@ -132,10 +132,9 @@ def fit(
         if checkpoint is not None and is_first():
             remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
-        # The fit found positions on a line; later recordings are read in the same way.
-        if any(read.angles) and not any(run.data.angles):
-            reading = {**reading, "angles": False}
-        run = replace(run, reading=reading_told(reading, data.names))
+        # Later recordings have no angles either if the fit found positions on a line.
+        line = {"angles": False} if any(read.angles) and not any(run.data.angles) else {}
+        run = replace(run, reading=reading_told({**reading, **line}, data.names))
         if log is not None:
             log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run

@@ -50,8 +50,7 @@ class HeldOut:
         by = (problem.weight * problem.root_weights(problem.weight * r))[..., None]
         slopes = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
         order = torch.tensor([*range(P), P + problem.d, *range(P, P + problem.d)], device=r.device)
-        # Columns: numbers, residual, start state.
-        rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d)
+        rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d) of numbers, residual, start
         segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
         piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
         grams = _grams(rows * by, of, len(piece))  # (Q, P + 1 + d, P + 1 + d)

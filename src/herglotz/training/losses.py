@@ -71,7 +71,7 @@ def herglotz_residual(
 
     Source: discrete Herglotz equations; erratum E4 of `docs/mathematics.md`.
     """
-    h, s0, u = _checked(q, h, s0, u, 2)
+    h, s0, u = _checked(q, h, s0, u)
     q0, q1 = q[..., :-1, :], q[..., 1:, :]
     s, axis = _action(L_d, q, h, s0, u), q.ndim - 2
     P = partials(driven_by(L_d, u), q0, q1, s, h, 2)
@@ -79,7 +79,12 @@ def herglotz_residual(
     after = P.map(lambda x: x.narrow(axis, 1, h.shape[-1] - 1))
     R = momentum_residual(after, p)
     r = solve(momentum_jacobian(after, p), R) if preconditioned else R
-    _refuse_infinite(r)
+    if len(bad := (~torch.isfinite(r)).nonzero()):
+        *sample, k, _ = bad[0].tolist()
+        raise InputError(
+            f"J = ∂R/∂q1 is singular, or L_d not finite, at step {k + 1} of window {tuple(sample)}: a discrete "
+            "Lagrangian must join q0 to q1, as m |q1 - q0|² / 2h does; add this term, or start from smaller weights"
+        )
     return r
 
 
@@ -153,7 +158,7 @@ def starts(
     InputError
         If q has fewer than three samples, or length is not positive.
     """
-    _checked(q, 1.0, None, None, 2)
+    _checked(q, 1.0, None, None)
     refuse({f"length must be a whole number >= 1, got {length}": length < 1})
     at = torch.arange(max((q.shape[-2] - 2) // length, 1), device=q.device) * length
     found = Starts(q[..., at, :], q[..., at + 1, :], q.new_zeros((*q.shape[:-2], len(at))))
@@ -205,7 +210,7 @@ def shooting(
 
     Source: multiple shooting (Bock 1984) on Φ̃ of section 1 of `docs/mathematics.md`.
     """
-    h, _, u = _checked(q, h, None, u, 2)
+    h, _, u = _checked(q, h, None, u)
     K, (*batch, S, n) = h.shape[-1], starts.q0.shape
     length = min(K - 1 if length is None else length, K - 1)
     fitting = max((K - 1) // length, 1) == S and tuple(batch) == tuple(q.shape[:-2]) and n == q.shape[-1]
@@ -253,15 +258,13 @@ def _joints(x: Tensor, starts: Starts) -> Tensor:
     return torch.cat([*positions, ((s[..., :-1, -2] - starts.s[..., 1:]) * by)[..., None]], -1)
 
 
-def _checked(
-    q: Tensor, h: Tensor | float, s0: Tensor | None, u: Tensor | None, least: int
-) -> tuple[Tensor, Tensor, Tensor | None]:
+def _checked(q: Tensor, h: Tensor | float, s0: Tensor | None, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
     """Check the arguments of a loss and expand them: h (..., K), s0 (...) and u (..., K, m)."""
     refuse({f"q must be a tensor (..., K+1, n), got a {type(q).__name__}; torch.as_tensor makes one":
             not isinstance(q, Tensor)})  # fmt: skip
     refuse({
-        f"q needs shape (..., K+1, n) with at least {least + 1} samples, got {tuple(q.shape)}; "
-        "one coordinate is q[:, None]": q.ndim < 2 or q.shape[-2] <= least,
+        f"q needs shape (..., K+1, n) with at least 3 samples, got {tuple(q.shape)}; "
+        "one coordinate is q[:, None]": q.ndim < 2 or q.shape[-2] < 3,
         f"q must hold float numbers, got {q.dtype}; convert it with .double()": not q.is_floating_point(),
     })  # fmt: skip
     if len(bad := (~torch.isfinite(q)).nonzero()):
@@ -283,12 +286,3 @@ def _fits(shape: torch.Size | tuple[int, ...], whole: tuple[int, ...]) -> bool:
     """True if a shape broadcasts to the shape `whole`."""
     short = len(shape) <= len(whole)
     return short and all(a in (1, b) for a, b in zip(reversed(shape), reversed(whole), strict=False))
-
-
-def _refuse_infinite(r: Tensor) -> None:
-    if len(bad := (~torch.isfinite(r)).nonzero()):
-        *sample, k, _ = bad[0].tolist()
-        raise InputError(
-            f"J = ∂R/∂q1 is singular, or L_d not finite, at step {k + 1} of window {tuple(sample)}: a discrete "
-            "Lagrangian must join q0 to q1, as m |q1 - q0|² / 2h does; add this term, or start from smaller weights"
-        )

@@ -72,8 +72,8 @@ class Run:
 
     def states_at_end(self) -> State:
         """The state at the last sample of every trajectory, (B, n), (B, n), (B,): the start of a forecast."""
-        last = [first + length - 1 for first, length in zip(self.data.offsets, self.data.lengths, strict=True)]
-        return State(*(x[last] for x in self.states))
+        ends = torch.tensor(self.data.lengths).cumsum(0) - 1
+        return State(*(x[ends] for x in self.states))
 
     @property
     def decided(self) -> FitConfig:

@@ -106,7 +106,7 @@ class Selection:
 
     @property
     def run(self) -> Run:
-        """The chosen level's representative run."""
+        """The representative run of the chosen level."""
         return self.chosen.best
 
     def table(self) -> str:
@@ -199,7 +199,6 @@ def select(
 
     for level in ladder:
         runs = [one(level, config.seed)]
-        # Without a network or batches nothing is random: one fit stands for all seeds.
         drawn = runs[0].model.config.networks or config.batch
         runs += [one(level, config.seed + k) if drawn else runs[0] for k in range(1, seeds)]
         errors = torch.stack([block_errors(run) for run in runs])

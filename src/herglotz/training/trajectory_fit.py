@@ -265,14 +265,13 @@ def fit_trajectories(
     `known` from an earlier fit skips the growth: whole trajectories follow the shortest segments.
     """
     # Without a network there is no strength of a prior to choose.
-    fixed = model.potential.network is None
-    if fixed:
+    if model.potential.network is None:
         task = replace(task, config=replace(task.config, departures=task.config.departures[:1]))
     stages, last = _longest(task, model, sigma, known=known)
     if last is None:
         return None
     departures = stages.task.config.departures
-    if fixed:
+    if model.potential.network is None:
         return Chosen(last, departures[0], {departures[0]: last.held_out_errors()})
     previous, noise = last, last.noise
     # Only converged fits are compared.

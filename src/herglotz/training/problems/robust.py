@@ -24,6 +24,8 @@ TAIL = 5.0
 SHARE, FAR = 3e-3, 10.0
 # Largest share of samples that may be left out as outliers; with more, a heavy-tailed loss is needed.
 FEW = 0.1
+# Re-weightings of a linear robust fit.
+ROUNDS = 10
 # Standard deviation over median absolute deviation of a normal distribution.
 MAD = 1.4826
 
@@ -40,10 +42,10 @@ def root_weights(r: Tensor, freedom: float | None) -> Tensor:
     return torch.ones_like(r) if freedom is None else ((freedom + 1) / (freedom + r.square())).sqrt()
 
 
-def robust_fit(A: Tensor, b: Tensor, rounds: int = 10) -> Tensor:
+def robust_fit(A: Tensor, b: Tensor) -> Tensor:
     """Solve A x ≈ b by Student's t instead of least squares, with re-weighting; A (..., m, k), b (..., m, 1)."""
     x = least_squares(A, b)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         r = A @ x - b
         scale = MAD * r.abs().median(-2, keepdim=True).values.clamp_min(torch.finfo(r.dtype).tiny)
         by = root_weights(r / scale, FREEDOM)

@@ -206,6 +206,5 @@ def _damped_step(A: Tensor | ByProducts, b: Tensor, diagonal: Tensor) -> Tensor 
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not everywhere(int(info) == 0):
         return None
-    step = -torch.cholesky_solve(b.double()[:, None], factor)[:, 0].to(b.dtype)
-    (step,) = of_first(step)
+    (step,) = of_first(-torch.cholesky_solve(b.double()[:, None], factor)[:, 0].to(b.dtype))
     return step if bool(torch.isfinite(step).all()) else None
