@@ -238,7 +238,7 @@ def _check_metrics(run: Run, path: Path) -> None:
 def _log(history: list[dict[str, Any]]) -> bytes:
     """Stage, iteration and cost as csv."""
     buffer = StringIO()
-    writer = csv.DictWriter(buffer, ("stage", "iteration", "cost"), extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(buffer, ["stage", "iteration", "cost"], extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(history)
     return buffer.getvalue().encode()
