@@ -158,7 +158,7 @@ def _grams(rows: Tensor, of: Tensor, count: int) -> Tensor:
 
 
 def _following(grams: Tensor, P: int) -> Tensor:
-    """T⁻¹ [B, b_x] of each segment, (S, d, P + 1): minus the derivatives of its start by the numbers, and its step."""
+    """T⁻¹ [B, b_x] of each segment, (S, d, P + 1): minus (derivatives of its start by the numbers, own step)."""
     T = grams[:, P + 1 :, P + 1 :]
     size = T.diagonal(dim1=-2, dim2=-1)
     T = T + torch.diag_embed(RIDGE * size + torch.finfo(T.dtype).tiny ** 0.5)
