@@ -13,6 +13,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.trades import listed
 
+# Columns of a printed table.
 COLUMNS = 80
 # Starting values of the baseline; all other names in `Plan.start` are parameters of the model.
 STARTS = ("stiffness", "tilt", "rate")
