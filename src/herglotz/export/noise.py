@@ -24,9 +24,9 @@ from herglotz.models import ContactLagrangian
 from herglotz.stepping.filter import Noise
 from herglotz.stepping.linearise import forward_slopes
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.predict import BELIEVED
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.smoothing import SmoothingProblem
+from herglotz.training.smoother import process_noise
 
 # The scale of the noise is that of the last 50 samples. Windows of the measured UW double pendulum have a mean surprise
 # of 1.2 to 2.7 then, where 2 is right, and 0.6 to 3.5 with the same noise in all of them (`benchmarks/filter.py`).
@@ -165,8 +165,7 @@ def _descended(cost: Callable[[Tensor], float], x: Tensor) -> Tensor:
 
 def _problem(run: FittedRun) -> SmoothingProblem:
     """The smoothing of the run's own data, for the noise that it assumes."""
-    data, config, high = run.data.unwrapped(), run.model.config, run.h_range[1]
-    turn = run.h * max(v / x for v, x in zip(config.speed, config.scale, strict=True))
-    process = run.metrics.get("process") or BELIEVED * min(1.0, turn) ** 0.5
+    data, high = run.data.unwrapped(), run.h_range[1]
+    process = run.metrics.get("process") or process_noise(run.model, run.h)
     sigma = run.metrics.get("sigma") or 0.0
     return SmoothingProblem(run.model, data, segment_grid(data, data.samples, high), sigma=sigma, process=process)

@@ -1,7 +1,7 @@
 """JᵀJ of multiple shooting: a border of parameters around block tridiagonal states of segments.
 
 ⎡ C  Bᵀ ⎤     C (P, P): parameters
-⎣ B  T  ⎦     T: the start of every segment and of the next, B (S, d, P): how each depends on the parameters
+⎣ B  T  ⎦     T: starts of segments, block tridiagonal; B (S, d, P): starts by parameters
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None where T is not positive definite
+# (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None if T is not positive definite
 Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
 
 
@@ -42,7 +42,7 @@ class Arrowhead:
         return torch.cat([self.corner.diagonal(), self.blocks.diagonal(dim1=-2, dim2=-1).flatten()])
 
     def dense(self) -> Tensor:
-        """All of it, (P + S·d, P + S·d)."""
+        """The matrix as a tensor, (P + S·d, P + S·d)."""
         P, (S, d) = len(self.corner), self.border.shape[:2]
         A = self.corner.new_zeros(P + S * d, P + S * d)
         A[:P, :P] = self.corner
@@ -55,7 +55,7 @@ class Arrowhead:
         return A
 
     def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(matrix + diag(damping))⁻¹ b, the states being eliminated first; None where there is no finite one."""
+        """(matrix + diag(damping))⁻¹ b by eliminating the states first; None if there is no finite solution."""
         P, (S, d) = len(self.corner), self.border.shape[:2]
         blocks = self.blocks + torch.diag_embed(damping[P:].reshape(S, d))
         solved = self.eliminate(blocks, self.upper, torch.cat([self.border, b[P:].reshape(S, d, 1)], -1))
@@ -72,5 +72,5 @@ class Arrowhead:
 
 
 def dense(A: Tensor | Any) -> Tensor:
-    """JᵀJ as a matrix, however the problem has it."""
+    """JᵀJ as a tensor, from a tensor or from an object with `dense`."""
     return A if isinstance(A, Tensor) else A.dense()

@@ -1,4 +1,4 @@
-"""Sizes of the data, a typical step and starting values of the baseline, by linear least squares."""
+"""The baseline: sizes of the data, a typical step, and starting values by linear least squares."""
 
 from __future__ import annotations
 
@@ -18,29 +18,38 @@ from herglotz.least_squares import least_squares
 from herglotz.models.translations import projection
 from herglotz.training.problems.robust import robust_fit, scale_of
 
-JITTER = 1.05  # a step up to this factor longer than the typical one is crossed in as many model steps
-PULLED = 3.0  # ratio of the least-squares misfit to that of Student's t above which outliers pull least squares
-NEGLIGIBLE = 1e-3  # a misfit of the bulk below this share of the RMS acceleration means rest or exact data
-GROSS = 30.0  # residual, in robust standard deviations of the acceleration, that no smooth motion reaches
+# A step longer than the typical one by up to this factor takes no additional model step.
+JITTER = 1.05
+# Outliers pull least squares if their misfit of the bulk exceeds that of Student's t by this ratio.
+PULLED = 3.0
+# Share of the RMS acceleration. A smaller misfit of the bulk means rest or exact data.
+NEGLIGIBLE = 1e-3
+# Residual of the acceleration, in robust standard deviations, that no smooth motion reaches.
+GROSS = 30.0
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """Sizes and starting values of the data, as plain numbers for `ModelConfig`."""
+    """Sizes of the data and starting values, as plain numbers for `ModelConfig`.
+
+    `scale` and `speed` are the largest |q| and |q̇|, `low` and `high` the range of q. `max_step` is the longest recorded
+    step that is no gap, `model_step` the longest model step along a trajectory. `input_map` has accelerations per unit
+    of each input, row by row; `start` known values of parameters, `spreads` prior deviations of terms, both by name.
+    """
 
     angles: tuple[bool, ...]
-    scale: tuple[float, ...]  # largest |q|
-    speed: tuple[float, ...]  # largest |q̇|
+    scale: tuple[float, ...]
+    speed: tuple[float, ...]
     stiffness: tuple[float, ...]
     tilt: tuple[float, ...]
     rate: float
-    max_step: float  # longest recorded step that is no gap
-    model_step: float  # longest step of the model along a trajectory
-    low: Tensor  # (n,) lowest position
-    high: Tensor  # (n,) highest
-    input_map: tuple[float, ...] = ()  # (n · m) accelerations per unit of each input, row by row
-    start: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # values of parameters, where they are known
-    spreads: Mapping[str, float] = field(default_factory=dict)  # prior deviations of terms, where they have a prior
+    max_step: float
+    model_step: float
+    low: Tensor  # (n,)
+    high: Tensor  # (n,)
+    input_map: tuple[float, ...] = ()  # (n · m)
+    start: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    spreads: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def inputs(self) -> int:
@@ -48,32 +57,30 @@ class Baseline:
         return len(self.input_map) // len(self.angles)
 
     def stepped(self, times: float) -> Baseline:
-        """The same of data whose steps are so many times as long."""
+        """The baseline of data whose steps are longer by the factor `times`."""
         return replace(self, max_step=times * self.max_step, model_step=times * self.model_step)
 
 
 def _check_moved(data: Trajectories, speed: list[float]) -> None:
     still = [name for name, moved in zip(data.names, speed, strict=True) if moved == 0]
-    remedy = (
-        "record a motion" if len(still) == data.dof else f"leave it out: --drop {','.join(still)} (drop= in Python)"
-    )
-    for name in still:
-        raise InputError(f"{data.source or 'data'}: coordinate '{name}' never moves; {remedy}")
+    remedy = f"leave it out: --drop {','.join(still)} (drop= in Python)" if len(still) < data.dof else "record a motion"
+    if still:
+        raise InputError(f"{data.source or 'data'}: coordinate '{still[0]}' never moves; {remedy}")
 
 
 def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool = False, substeps: int = 1) -> Baseline:
     """Fit q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ + (G u)ᵢ (angles) or −kᵢ qᵢ − bᵢ − γ q̇ᵢ + (G u)ᵢ to finite differences.
 
-    With `drag` d (affine level) there is Σⱼ dⱼ q̇ⱼ q̇ᵢ − dᵢ|q̇|²/2 as well, the motion of L = |q̇|²/2 − V + s d·q̇; a
-    constant V acts there as a force dV, so that the weight of one coordinate, −b, starts as V = −b/d.
+    With `drag` d (affine level) the right-hand side has Σⱼ dⱼ q̇ⱼ q̇ᵢ − dᵢ|q̇|²/2 as well, the motion of
+    L = |q̇|²/2 − V + s d·q̇. A constant V acts there as a force dV, so the weight of a single coordinate, −b, starts as
+    V = −b/d.
 
-    Noise biases second differences, so these numbers only start a fit. Where the data are known to hold `outliers`,
-    Student's t takes the place of least squares (`problems.robust`), and rows that miss grossly set no size. A recorded
-    step is crossed in `substeps` model steps by trajectory fitting. Raise InputError if nothing moves.
+    Noise biases second differences, so these numbers only start a fit. With `outliers` Student's t replaces least
+    squares (`problems.robust`), and samples with gross errors do not count for scale and speed. Trajectory fitting
+    takes `substeps` model steps per recorded step. Raise InputError if a coordinate does not move.
     """
     t, v, a, columns, max_step = differences(data, drag)
-    n = data.dof
-    m = 0 if data.u is None else data.u.shape[1]
+    n, m = data.dof, 0 if data.u is None else data.u.shape[1]
     q, rows, right = data.q, columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
     found = robust_fit(rows, right) if outliers else least_squares(rows, right)
     if outliers:
@@ -81,11 +88,11 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
         good = (r.abs().reshape(a.shape).amax(1) <= GROSS * scale_of(r)).to(q.device)
         q, v = t.q1[good], v[good]
     x = found[:, 0].tolist()
-    # The size of an angle that turns over and over is half a turn.
+    # The scale of a rotating angle is half a turn.
     scale = [min(x, math.pi) if angle else x for x, angle in zip(q.abs().amax(0).tolist(), data.angles, strict=True)]
     speed = [float(s) for s in v.abs().amax(0)]
     _check_moved(data, speed)
-    # A rate from noisy differences can have either sign; start from a small damping of the right order.
+    # A rate from noisy differences can be negative; then a small damping of the right order replaces it.
     typical = min(v / s for v, s in zip(speed, scale, strict=True))
     rate = x[2 * n] if x[2 * n] > 1e-3 * typical else 1e-2 * typical
     tilt, start = x[1 : 2 * n : 2], {}
@@ -111,20 +118,21 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
 
 
 def across_translations(base: Baseline, data: Trajectories, translations: Sequence[str], **how: bool) -> Baseline:
-    """The springs and the rate of what translations leave alone: a drift along them would hide both."""
+    """The baseline with springs and rate of the motion across the translations; a drift along them would hide both."""
     P = projection(translations, data.angles)
     if P is None:
         return base
-    P = P + torch.diag((P == 0).all(1).to(P.dtype))  # an angle that is translated has no spring whatever its start
+    # A translated coordinate keeps its own motion; its model has no spring.
+    P = P + torch.diag((P == 0).all(1).to(P.dtype))
     own = estimate_baseline(replace(data, q=data.q @ P.to(data.q)), **how)
     return replace(base, stiffness=own.stiffness, tilt=own.tilt, rate=own.rate)
 
 
 def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
-    """Return whether outliers that are no lone spikes pull the least-squares start away from the other samples.
+    """True if outliers in runs (no single spikes) pull the least-squares start away from the other samples.
 
-    All needed: accelerations jump from sample to sample (a smooth motion has h|a| < |v| down to six samples a period),
-    and least squares miss their bulk, by more than rounding, three times as far as Student's t does.
+    Two conditions: accelerations jump from sample to sample (a smooth motion has h|a| < |v| down to six samples a
+    period), and least squares miss the bulk by more than rounding and three times as far as Student's t.
     """
     t, v, a, columns, _ = differences(data, drag)
     size = float(a.square().mean().sqrt())
@@ -138,18 +146,18 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
 
 
 class Differences(NamedTuple):
-    """A linear model of the accelerations, by differences of three samples each."""
+    """A linear model of accelerations by differences of three samples: velocities v, accelerations a, and columns."""
 
     triples: Triples
-    v: Tensor  # (T, n) velocities
-    a: Tensor  # (T, n) accelerations
-    columns: Tensor  # (T, n, k) of the coefficients
-    max_step: float  # longest step
+    v: Tensor  # (T, n)
+    a: Tensor  # (T, n)
+    columns: Tensor  # (T, n, k)
+    max_step: float
 
 
 def differences(data: Trajectories, drag: bool = False) -> Differences:
-    """Velocities and accelerations, and the columns that `estimate_baseline` fits to these."""
-    max_step = GAP * data.typical_step  # longer ones are gaps: crossed in several model steps
+    """Velocities, accelerations, and the columns of `estimate_baseline`; longer steps than `max_step` are gaps."""
+    max_step = GAP * data.typical_step
     t = data.triples(max_step)
     if len(t) == 0:
         raise InputError(f"{data.source or 'data'}: no three samples in a row without a gap; record at equal steps")

@@ -35,113 +35,112 @@ class FitConfig:
     level
         "conservative" (no damping), "linear" (one damping rate), "affine" (damping depends on position and velocity),
         "full" (on s as well; s at the start is unknown, so fit several seeds) or "forced" (one rate, and friction of
-        each joint). "auto": "forced" with dry friction where inputs u are recorded, else "linear"; and for two or three
-        coordinates with an angle among them, or several without, where nothing is told, what the data say
+        each joint). "auto": "forced" with dry friction if inputs u are recorded, else "linear". With default settings
+        the data choose the structure for two or three coordinates with an angle among them, or several without
         (`herglotz.training.structure`).
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
-        "smoothing": every state an unknown and a little noise in every step, for noisy data that no model follows for
-        long (pushes, chaos). "auto": the first or the second, as the noise found in the data asks for. "raw": a plain
-        network trained on ‖R‖², which collapses (always seen with Adam, at some seeds with Levenberg–Marquardt); for
+        "smoothing": every state is an unknown and every step has a little noise, for noisy data that no model follows
+        for long (pushes, chaos). "auto": "residual" or "trajectory", by the noise found in the data. "raw": a plain
+        network trained on ‖R‖², which collapses (always with Adam, at some seeds with Levenberg–Marquardt); for
         demonstration.
     optimiser
         "lm" (Levenberg–Marquardt), or "adam" or "adamw" for the residual objectives.
     train_fraction
-        Part of every trajectory, in time, that is trained on, dimensionless; the rest tests. 1 trains on everything.
+        Leading share of every trajectory that is trained on, dimensionless; the rest is the test part. 1: no test part.
     seed
-        Of the initial weights.
+        Seed of the initial weights.
     dtype, device
-        Of the whole fit and of the model it returns. An L_d of your own is fitted there, and its run is on the CPU.
+        Type and place of the whole fit and of the fitted model. The run of your own L_d is on the CPU after the fit.
     iterations
-        Bound on the iterations of the residual objectives (Adam takes 20 times as many); each stage of trajectory
-        fitting takes 40 at the most.
+        Most iterations of the residual objectives (Adam takes 20 times as many); a stage of trajectory fitting takes at
+        most 40.
     restarts
-        Random initialisations of the one-step objective; the best after 30 iterations is kept. None: 4 where the
+        Random initialisations of the one-step objective; the best after 30 iterations is kept. None: 4 if the
         correction is a single layer (`baseline_motion`), else 1.
     departures
-        Prior strengths τ, dimensionless, tried for the networks' departure from the baseline; held-out blocks of time
-        choose. One value fixes it.
+        Candidate prior strengths τ, dimensionless, for the networks' departure from the baseline; held-out blocks of
+        time choose one. A single value fixes it.
     potential_width, damping_width, correction_width
-        Hidden units of the networks; the correction is used by the residual objectives, the potential's network by
-        trajectory fitting. The correction has two layers, or one of three times as many units where the baseline's
-        equation of motion explains exact data and its motions fill their holes (`herglotz.training.baseline_motion`).
+        Hidden units of the networks. The residual objectives use the correction, trajectory fitting the potential's
+        network. The correction has two layers, or one with three times as many units if the baseline's equation of
+        motion explains exact data and its motions fill their holes (`herglotz.training.baseline_motion`).
     learning_rate
-        Of Adam, dimensionless.
+        Learning rate of Adam, dimensionless.
     batch
-        Triples of samples in one step of Adam; None: all. Levels whose motion has no s, or with s recorded.
+        Triples of samples in one step of Adam; None: all. For levels whose motion has no s, or with s recorded.
     activation
-        Of the networks: tanh, softplus or silu.
+        Activation of the networks: tanh, softplus or silu.
     mass_width
-        Hidden units of a mass that depends on position; 0 for a constant one.
+        Hidden units of a mass that depends on position; 0: constant mass.
     action_width
         Units of the full level's map of s.
     dissipation
-        Powers of s that L has beside −γ s, "s^2" and "s^3", each with a learned coefficient: damping that depends on s.
-        At the forced level, and at the level full in the place of its networks.
+        Powers of s in L beside −γ s, "s^2" and "s^3", each with a learned coefficient: damping that depends on s. For
+        the level forced, and for the level full, whose networks they replace.
     coulomb
-        Dry friction beside the viscous one at the forced level.
+        Dry friction beside viscous friction, at the forced level.
     sticking
-        Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
-        are fitted, from a start with smooth friction. None: where a search for named terms finds dry friction and this
-        is as likely (`herglotz.training.search`).
+        Set-valued dry friction, with which a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
+        are fitted, from a start with smooth friction. None: if a search for named terms finds dry friction, and
+        set-valued friction is as likely (`herglotz.training.search`).
     robust
-        Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
-        squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the
+        Loss of trajectory fitting. "on": Student's t, with little influence of outliers. "off": least squares. "auto":
+        Student's t if the residuals of least squares have more outliers than noise explains. Single spikes of the
         training data are left out beforehand, unless "off".
     find_zeros
-        The sensors may read something else in each recording where a coordinate is 0: such zeros are fitted together
-        with the named terms that were found, and kept if the score of held-out blocks is better with them
-        (`herglotz.training.sensor_zeros`). The search for terms is then repeated. None: where named terms miss whole
-        trajectories by more than the noise. True: also where they do not. False: nowhere.
+        The zeros of the sensors may differ from recording to recording. They are fitted together with the named terms
+        and kept if they improve the score of held-out blocks (`herglotz.training.sensor_zeros`); the search for terms
+        is then repeated. None: if named terms miss whole trajectories by more than the noise. True: always. False:
+        never.
     find_input_terms
-        Inputs may act by their square, size or rate as well, or saturate (`herglotz.data.input_terms`): this is tried
-        where named terms miss the data by more than the noise.
+        Try inputs that act by their square, size or rate as well, or saturate (`herglotz.data.input_terms`), if named
+        terms miss the data by more than the noise.
     supervision
-        What the one-step objective is fitted to: "q" (positions), "qs" (s beside them) or "qps" (momenta as well),
-        where they are recorded at every sample. Their unit is fitted. With s known the full level is reliable.
+        Recorded quantities that the one-step objective is fitted to: "q" (positions), "qs" (and s) or "qps" (and
+        momenta), recorded at every sample. The unit of s and p is fitted. With s known the full level is reliable.
     use_inputs
-        Drive the model with the recorded inputs u (forced level); False leaves them out of the fit.
+        Drive the model with the recorded inputs u (forced level); False leaves the inputs out of the fit.
     input_delay, actuator_lag
-        Time by which the inputs act later than they were recorded, and time constant of the actuator behind them, in
-        the data's unit of time (`herglotz.data.actuator`). None: what the data say or, where they say nothing, what
-        explains the accelerations (`herglotz.training.hold`); 0: there is none.
+        Delay of the inputs, and time constant of the actuator, in the data's unit of time (`herglotz.data.actuator`).
+        None: stated in the data, else the values that explain the accelerations best (`herglotz.training.hold`). 0: no
+        delay, no lag.
     input_map
-        The map G from inputs to forces, n · m numbers row by row, where it is known; empty: learned. Forces are in
-        units in which the first coordinate's mass is 1: for one joint of inertia J, a torque has G = 1/J.
+        The map G from inputs to forces, n · m numbers row by row, if known; empty: learned. Forces are in units in
+        which the first coordinate's mass is 1: for one joint of inertia J, a torque has G = 1/J.
     features
-        What L = K − V may be made of beside its terms, as text: `"cos(q1 - q2) v1 v2"`, part of K;
+        Terms of L = K − V beside those of the level, as text: `"cos(q1 - q2) v1 v2"`, part of K;
         `"(q2 - q1)^4 + (q3 - q2)^4"`, without velocities part of V; or one of the names chain, sites, central,
-        pendulums, harmonics, revolute, lengths. Each has one coefficient, learned. See `herglotz.models.features`.
+        pendulums, harmonics, revolute, lengths. Each has one learned coefficient. See `herglotz.models.features`.
     known
-        What is known of K and V, the same way, with its numbers (the first mass is 1): `"-9.81 cos(q1)"` is a
-        pendulum's V. Nothing of it is learned.
+        Known terms of K and V, as text with their numbers (the first mass is 1): `"-9.81 cos(q1)"` is a pendulum's V.
+        They are not learned.
     alike
-        All coordinates have one mass, and their potential is made of features alone: chains.
+        All coordinates share one mass, and their potential has only features: chains.
     diagonal
-        Each coordinate has a mass of its own, and none is between two: bodies, not the joints of one.
+        Each coordinate has its own mass, and the mass matrix is diagonal: separate bodies, no joints.
     coupled
-        Viscous friction of differences of speeds at the forced level: links with hinges between them.
+        Viscous friction of speed differences at the forced level: links with hinges between them.
     terms
         Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
     frequencies
-        Angular frequencies ν, in rad per unit of time, of a periodic force whose amplitude and phase are learned:
-        cos νt and sin νt become the inputs (`herglotz.data.waves`). For data without inputs.
+        Angular frequencies ν, in rad per unit of time, of a periodic force with learned amplitude and phase: cos νt and
+        sin νt become the inputs (`herglotz.data.waves`). For data without inputs.
     translations
-        Symmetries that L_d is to have, each named by what moves together: `"q1 + q2"`, or `"q1"` alone. Nothing that is
-        learned depends on where these coordinates are. `run.symmetries()` finds them (`herglotz.models.translations`).
+        Symmetries of L_d, each a set of coordinates that move together: `"q1 + q2"`, or `"q1"` alone. No learned term
+        depends on their common position. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
-        Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "|v1|" of viscous
-        friction that differs by direction, "|v| v" of a body in air, "(v1 - v2)" of a damper between two coordinates,
-        "load 1", and of dry friction that changes with the position "cos(q1) sgn(v1)" (forced level). See
+        Friction forces beside viscous friction, each with a learned coefficient (forced level): "|v1| v1", "q1^2 v1",
+        "|v1|" (viscous friction that differs by direction), "|v| v" (a body in air), "(v1 - v2)" (a damper between two
+        coordinates), "load 1", and "cos(q1) sgn(v1)" (dry friction that changes with the position). See
         `herglotz.models.drag`.
     order
-        4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
-        motion, and hold at other steps.
+        4: a rule of order 4 from the features, without networks. The parameters are then those of the continuous
+        motion, and remain valid at other steps.
     absent
         Numbers of the model that are 0 and not learned: "potential.tilt[0]" (`herglotz.models.numbers_of`).
     substeps
-        Model steps in a recorded step, in trajectory fitting: for samples further apart than the rule is good for. The
-        model is then stepped at that part of the data's step.
+        Model steps per recorded step, in trajectory fitting, for samples too far apart for one step of the rule.
     """
 
     level: str = "auto"
@@ -207,19 +206,19 @@ class FitConfig:
             f"train fraction must be in (0, 1], got {self.train_fraction:g}": not 0 < self.train_fraction <= 1,
             f"departures must be one or more positive numbers, got {self.departures}":
                 not self.departures or min(self.departures) <= 0,
-            f"supervision '{self.supervision}' is of the one-step objective; set objective='residual', not "
+            f"supervision '{self.supervision}' needs the one-step objective; set objective='residual', not "
             f"'{objective}'": self.supervision != "q" and objective not in ("auto", "residual"),
             f"{self.optimiser} fits the objectives residual and raw, not {objective!r}; use the optimiser lm":
                 self.optimiser != "lm" and objective not in ("residual", "raw"),
-            f"substeps are of trajectory fitting, not of the objective {objective!r}; set it to 'trajectory'":
+            f"substeps need trajectory fitting, not the objective {objective!r}; set it to 'trajectory'":
                 self.substeps > 1 and objective not in ("trajectory", "smoothing"),
             f"sticking friction is fitted to trajectories; leave objective='{objective}' out":
                 self.sticking and objective not in ("auto", "trajectory"),
             f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'":
                 forces and self.level not in ("forced", "auto"),
-            f"dissipation is of L in s; set level='full' or 'forced', not '{self.level}'":
+            f"dissipation adds powers of s to L; set level='full' or 'forced', not '{self.level}'":
                 self.dissipation and self.level not in ("full", "forced", "auto"),
-            "set-valued friction stands in no model with powers of s; leave sticking or dissipation out":
+            "set-valued friction cannot be combined with powers of s; leave sticking or dissipation out":
                 self.dissipation and self.sticking,
             "input_map is given but use_inputs is False; leave one of them out":
                 self.input_map and not self.use_inputs,
@@ -231,7 +230,7 @@ class FitConfig:
         lm, carries_s = self.optimiser == "lm", self.level in ("affine", "full") and self.supervision == "q"
         refuse({
             f"batch must be >= 1, got {self.batch}": self.batch < 1,
-            "batch is of adam and adamw; lm takes all rows: set the optimiser, or leave batch out": lm,
+            "batch applies only to adam and adamw; lm takes all rows: set the optimiser, or leave batch out": lm,
             f"batch: the level '{self.level}' carries s along whole trajectories; leave batch out, or record s and set "
             "supervision='qs'": carries_s,
         })  # fmt: skip
@@ -245,12 +244,12 @@ class FitConfig:
             raise InputError("device cuda was asked for but PyTorch finds no GPU; use cpu")
 
     def resolved(self, data: Trajectories) -> FitConfig:
-        """The settings of a fit to these data, with the level decided.
+        """The settings of a fit to these data, with the level chosen.
 
         Raises
         ------
         InputError
-            If the data hold inputs that the level cannot take, or the map of the inputs has not their size.
+            If the data hold inputs that the level cannot take, or the size of the map of the inputs does not fit.
         """
         where, driven = data.source or "data", self.use_inputs and data.u is not None
         config = self
@@ -265,7 +264,7 @@ class FitConfig:
         refuse({
             f"{where}: holds inputs u, which the level '{config.level}' cannot take; set level='forced' or 'auto', "
             "or use_inputs=False to leave them out": driven and config.level != "forced",
-            f"{where}: one-step errors know nothing of the work of inputs in s; set objective='trajectory', or leave "
+            f"{where}: the one-step objective has no work of inputs in s; set objective='trajectory', or leave "
             "dissipation out": driven and self.dissipation and config.objective == "residual",
             f"{where}: input_map needs n · m = {data.dof} · {inputs} numbers, row by row; got {count}":
                 count not in (0, data.dof * inputs),
@@ -273,12 +272,12 @@ class FitConfig:
         return config
 
     def has_forces(self) -> bool:
-        """Whether the user asked for forces, which the forced level alone has."""
+        """True if the settings ask for forces, which only the forced level has."""
         named = any(TERMS[name].has_force() for name in self.terms if name in TERMS)
         return bool(self.coulomb or self.coupled or self.sticking or self.drag or named)
 
     def changed(self, settings: dict[str, Any]) -> FitConfig:
-        """These settings with some of them replaced; a single text or number counts as a list of one where one is due.
+        """These settings with some replaced; a single text or number stands for a list of one.
 
         Raises
         ------
@@ -291,12 +290,13 @@ class FitConfig:
                 near = get_close_matches(name, known, 1)
                 hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
                 raise InputError(f"unknown setting {name!r} of a fit; {hint}")
-        lists = {name for name in known if isinstance(getattr(self, name), tuple)}
-        return replace(self, **{name: _tuple(x) if name in lists else x for name, x in settings.items()})
+        as_list = lambda x: (x,) if isinstance(x, (str, int, float)) else tuple(x)  # noqa: E731
+        lists = {name for name in settings if isinstance(getattr(self, name), tuple)}
+        return replace(self, **settings | {name: as_list(settings[name]) for name in lists})
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """The dtype as torch knows it."""
+        """The dtype as a `torch.dtype`."""
         return DTYPES[self.dtype]
 
     def to_dict(self) -> dict[str, Any]:
@@ -307,7 +307,3 @@ class FitConfig:
     def from_dict(cls, values: dict[str, Any]) -> FitConfig:
         """Inverse of `to_dict`; unknown keys are an error."""
         return from_plain(cls, values)
-
-
-def _tuple(x: Any) -> tuple:
-    return (x,) if isinstance(x, (str, int, float)) else tuple(x)

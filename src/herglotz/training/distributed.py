@@ -1,8 +1,8 @@
-"""Normal equations and gradients summed over the processes of `torchrun`; a single process is not affected.
+"""Sums of normal equations and gradients over the processes of `torchrun`; a single process is not affected.
 
 Every process holds the data and runs the same optimiser. The work that grows with the data (Jacobians of chunks of
-triples or steps) is dealt out and the sums are all-reduced. The last bits of what a process computes by itself depend
-on where its memory lies; what decides the optimiser's path is therefore taken from the first process.
+triples or steps) is divided among the processes and the sums are all-reduced. The last bits of a process's own results
+depend on the alignment of its memory, so all values that decide the optimiser's path come from the first process.
 """
 
 from __future__ import annotations
@@ -18,9 +18,12 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-PARTS, LEAST = 8, 1024  # rows are divided into at most PARTS parts of at least LEAST rows
-LANES = 2  # part k joins sum k mod 2, so that one process and two add the same numbers in the same order
-TIMEOUT = 60  # seconds that a process waits for the others; they do equal shares of the work between two sums
+# Rows are divided into at most MAX_PARTS parts of at least MIN_ROWS rows.
+MAX_PARTS, MIN_ROWS = 8, 1024
+# Part k is added to sum k mod 2, so that one process and two add the same numbers in the same order.
+LANES = 2
+# Seconds that a process waits for the others, which do equal shares of the work between two sums.
+TIMEOUT = 60
 
 
 def world() -> tuple[int, int]:
@@ -29,7 +32,7 @@ def world() -> tuple[int, int]:
 
 
 def is_first() -> bool:
-    """Whether this process writes files and prints."""
+    """True for the process that writes files and prints."""
     return world()[0] == 0
 
 
@@ -37,10 +40,10 @@ def own_parts(count: int, most: int, device: torch.device) -> Iterator[tuple[int
     """The parts of `count` rows that this process works on, at most `most` rows each: (lane, rows).
 
     Parts and lanes do not depend on the number of processes: batches of another size, and sums in another order, differ
-    in their last bits, and what the data hardly determine then differs in far more.
+    in their last bits, which changes poorly determined numbers far more.
     """
     parts = 1
-    while parts < PARTS and count >= 2 * parts * LEAST:
+    while parts < MAX_PARTS and count >= 2 * parts * MIN_ROWS:
         parts *= 2
     size = max(1, min(most, -(-count // parts)))
     rank, processes = world()
@@ -50,7 +53,7 @@ def own_parts(count: int, most: int, device: torch.device) -> Iterator[tuple[int
 
 
 class LaneSums:
-    """Sums over parts, every second part in the same lane: bit for bit the same for one process and for two."""
+    """Sums over parts in two lanes, part k in lane k mod 2: bit-equal for one process and for two."""
 
     def __init__(self, *zeros: Tensor):
         self.lanes = [tuple(torch.zeros_like(x) for x in zeros) for _ in range(LANES)]
@@ -77,7 +80,7 @@ def add_over_processes(*tensors: Tensor) -> None:
 
 
 def of_first(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """The first process's values of these tensors, everywhere."""
+    """The first process's values of these tensors, in every process."""
     if world()[1] == 1:
         return tensors
     shared = tuple(x.detach().clone() for x in tensors)
@@ -87,7 +90,7 @@ def of_first(*tensors: Tensor) -> tuple[Tensor, ...]:
 
 
 def everywhere(holds: bool) -> bool:
-    """Whether something holds in every process."""
+    """True if `holds` is true in every process."""
     if world()[1] == 1:
         return holds
     flag = torch.tensor(float(holds), device="cuda" if dist.get_backend() == "nccl" else "cpu")
@@ -97,15 +100,15 @@ def everywhere(holds: bool) -> bool:
 
 @contextmanager
 def process_group() -> Iterator[None]:
-    """Join the processes that `torchrun` started (NCCL with a GPU, gloo without), and part from them at the end.
+    """Join the group of processes that `torchrun` started (NCCL with a GPU, gloo without), and leave it at the end.
 
-    Raise RuntimeError if one of them ends, or does not answer for 60 seconds.
+    Raise RuntimeError if another process ends, or does not answer for 60 seconds.
     """
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield
         return
-    # The functions of this module keep the group that is there when the module is first imported, for ever. A fit
-    # imports it (by torch._dynamo): gloo's threads would then outlive the group, and abort while Python ends.
+    # torch.distributed.nn.functional keeps a reference to the group that exists at its first import. A fit imports it
+    # (by torch._dynamo): gloo's threads would then outlive the group, and abort while Python exits.
     importlib.import_module("torch.distributed.nn.functional")
     limit = timedelta(seconds=float(os.environ.get("HERGLOTZ_TIMEOUT", TIMEOUT)))
     dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo", timeout=limit)
@@ -116,7 +119,8 @@ def process_group() -> Iterator[None]:
         if "timed out" in words:
             what = f"has not answered for {limit.total_seconds():g} s: it was stopped, or is slower than that "
             what += "(HERGLOTZ_TIMEOUT sets the seconds)"
-        elif "by peer" in words:  # gloo: the connection was closed or reset
+        # gloo reports a closed connection with these words.
+        elif "by peer" in words:
             what = "has ended: it was killed, or an error of its own ended it"
         else:
             raise

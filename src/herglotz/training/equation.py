@@ -1,9 +1,9 @@
-"""The learned equation of motion in words: every number of a model that moves it, with units and deviations.
+"""The learned equation of motion as text: every number that acts in the motion, with units and standard deviations.
 
-With masses that do not depend on position there is one line a coordinate, m ẍ = forces, in units in which the first
-mass is 1. Other models are printed as L = K − V with the forces beside it, and the law of motion below. Numbers are
-rounded as the motion needs it, and combinations that the data do not determine are named beside the equation: a term
-that is left out moves another model. A network is no formula: the equation says how large its force is.
+If masses do not depend on position there is one line per coordinate, m ẍ = forces, in units in which the first mass
+is 1. Other models are printed as L = K − V, the forces, and the law of motion. Numbers have as many digits as the
+motion needs, and combinations that the data do not determine are listed below the equation. A network has no formula:
+the equation gives the size of its force.
 """
 
 from __future__ import annotations
@@ -24,47 +24,59 @@ from herglotz.training.equation_terms import Line, Reader
 from herglotz.training.equation_words import BESIDE, UNKNOWN, number
 from herglotz.training.fitted_run import FittedRun
 
-WIDTH = 78  # two blanks stand before each line on screen
+# Columns of a line; the screen has two blanks before each line.
+WIDTH = 78
 BRACKETS = "in brackets: standard deviation, of the last digits or as ±, by noise alone"
 WAVE = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<speeds>(?: [^ ()]+′²?)*)")
-FEW = 6  # waves of one form with the same speeds that a line has at most: more are a function that is told below
-TOGETHER = "\N{NO-BREAK SPACE}"  # inside a term: lines break between terms
+# More waves of one form with the same speeds are printed as a function, below the lines.
+MAX_WAVES = 6
+# Lines break between terms, not inside a term.
+TOGETHER = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
 class Term:
-    """value · what, on the right-hand side of the equation of one coordinate."""
+    """value · what, on the right-hand side of the equation of one coordinate.
 
-    left: str  # x″, or L
-    what: str  # x³; empty: a constant
+    `left` is the left-hand side, x″ or L; `what` is for example x³, or "" for a constant. `deviation` is the standard
+    deviation, and `alone` the standard deviation with all other numbers fixed, which decides the digits (None: not
+    computed). A wave of a function has the text of that function, f1(x) x′², in `function`.
+    """
+
+    left: str
+    what: str
     value: float
-    deviation: float | None  # standard deviation; None: it was not computed
+    deviation: float | None
     unit: str
-    alone: float | None = None  # standard deviation with all other numbers held, which rounds the value
-    function: str = ""  # of which this is a wave, as it stands in the line: f1(x) x′²; empty: the term stands there
+    alone: float | None = None
+    function: str = ""
 
     def size(self, digits: int = UNKNOWN) -> str:
-        """The number without its sign, as it is printed; `digits` where nothing tells how many the motion needs."""
+        """The printed number without its sign; `digits` applies if no standard deviation is known."""
         return number(abs(self.value), self.deviation, self.alone or self.deviation, digits)
 
-    def told(self, digits: int = UNKNOWN) -> str:
+    def text(self, digits: int = UNKNOWN) -> str:
         """The term with its sign."""
         return f"{'−' if self.value < 0 else '+'} {self.size(digits)} {self.what}".rstrip()
 
     def wave(self, digits: int = UNKNOWN) -> str:
-        """The same as a part of its function, without a deviation: each of its waves alone says nothing."""
-        return replace(self, what=self.what.partition(")")[0] + ")", deviation=None).told(digits)
+        """The term as a part of its function, without a deviation: a single wave has no meaning of its own."""
+        return replace(self, what=self.what.partition(")")[0] + ")", deviation=None).text(digits)
 
 
 @dataclass(frozen=True, repr=False)
 class Equation:
-    """The learned equation; `str` gives lines of at most 80 columns, with every number of the model."""
+    """The learned equation; `str` gives lines of at most 80 columns, with every number of the model.
+
+    `lefts` are the left-hand sides of the lines, with their masses; `units` reads "x in m, t in s"; `network` describes
+    the networks; `notes` hold what an integration needs beside the lines, and what the data do not determine.
+    """
 
     terms: tuple[Term, ...]
-    lefts: tuple[str, ...]  # what stands on the left of each line, with its mass
-    units: str  # "x in m, t in s"
-    network: str | None  # what a network adds, in words
-    notes: tuple[str, ...] = ()  # what the lines need to be integrated, and what the data do not determine
+    lefts: tuple[str, ...]
+    units: str
+    network: str | None
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = [line for left in self.lefts for line in self._lines_of(left)]
@@ -85,14 +97,15 @@ class Equation:
         return BESIDE if self.network else UNKNOWN
 
     def _lines_of(self, left: str) -> list[str]:
-        """The line with this left side, broken between terms; nothing of a force that is 0."""
+        """The line with this left side, broken between terms; no line for a force of 0."""
         terms = (term for term in self.terms if term.left == left)
-        own = (f"+ {term.function}" if term.function else term.told(self._digits) for term in terms)
-        own = list(dict.fromkeys(own))  # a function once
+        own = (f"+ {term.function}" if term.function else term.text(self._digits) for term in terms)
+        # The waves of one function give its name once.
+        own = list(dict.fromkeys(own))
         return [] if not own and left.startswith("force on ") else _wrapped(left, own)
 
     def __repr__(self) -> str:
-        return f"Equation({' '.join(str(replace(self, notes=())).split())})"  # what stands below it is long
+        return f"Equation({' '.join(str(replace(self, notes=())).split())})"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON: the terms, and the same as text."""
@@ -109,8 +122,7 @@ class Equation:
 def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str] = ()) -> Equation:
     """The equation of a run's model, in the data's units; the first mass is 1.
 
-    Standard deviations, and the digits that the motion needs, come from what the data say of all numbers together.
-    More `notes` stand behind those of the model.
+    Standard deviations and digits come from the joint posterior of all numbers. `notes` follow those of the model.
     """
     network = network_of(run)
     numbers = Numbers(run.model, joint, BESIDE if network else UNKNOWN)
@@ -123,7 +135,7 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
     data = run.data
     labels = (*zip(data.names, data.units, strict=True), *(data.input_labels if run.model.inputs else ()))
     units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1")]
-    if data.degrees:  # the derivatives of sines and powers are those of radians
+    if data.degrees:
         units.append(f"{', '.join(data.degrees)} recorded in deg (1 rad = 57.3 deg)")
     units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []
     every = (*reader.explained(), *notes, *map(str, numbers.trades()))
@@ -133,7 +145,7 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
 
 
 def network_of(run: FittedRun) -> str | None:
-    """What networks add, in words; None without."""
+    """The networks of the model in words, with the share of the force where it is known; None without networks."""
     model, config = run.model, run.model.config
     parts = []
     if not config.baseline:
@@ -157,15 +169,15 @@ def network_of(run: FittedRun) -> str | None:
 
 
 def _functions(lines: Iterable[Line]) -> list[str]:
-    """The function that each line is a wave of, with the speeds beside it; "" of a line that stands by itself."""
+    """The function with its speeds, for each line that is a wave of it; "" for all other lines."""
     found = []
     for line in lines:
         match = WAVE.fullmatch(line.what)
         of = "" if match is None else ", ".join(dict.fromkeys(re.findall(r"[^\W\d]\w*′?", match["form"])))
-        found.append((line.left, of, "" if match is None else match["speeds"]) if of else None)
+        found.append((line.left, of, match["speeds"]) if match and of else None)
     counts, names = Counter(found), {}
     for key in found:
-        if key is not None and counts[key] > FEW and key not in names:
+        if key is not None and counts[key] > MAX_WAVES and key not in names:
             names[key] = f"f{len(names) + 1}({key[1]}){key[2]}"
     return [names.get(key, "") for key in found]
 

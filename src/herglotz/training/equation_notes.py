@@ -1,4 +1,4 @@
-"""What stands below an equation so that it can be integrated: arrival of inputs, zeros of sensors, the model's step."""
+"""Notes below an equation that an integration needs: timing of inputs, zeros of sensors, the model's step and rule."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import free_runs
 from herglotz.training.problems.grid import segment_grid, step_inputs
 
-DIGITS = 7  # of the zero and the scale of a sensor
-# Steps of order 2 leave three quarters of their error when they are halved: forces are of order 2 in rules of order 4.
+# Digits of the zero and the scale of a sensor.
+DIGITS = 7
+# Richardson: halved steps remove three quarters of an error of order 2. Forces are of order 2 in rules of order 4 too.
 HALVED = 4 / 3
 BETWEEN = {
     "zero": "held from each sample to the next",
     "first": "straight between the samples",
     "smooth": "polynomials between the samples",
 }
-# A model's own step, for where exact integration is another motion (`models/terms.py`, `models/order4.py`).
+# The rule of the model, printed if an exact integration departs from its steps (`models/terms.py`, `models/order4.py`).
 RULE = (
     "step it as the model does: c p + ∂L_d/∂q + c (h/2) f = 0, p₊ = ∂L_d/∂q₊ + (h/2) f, s₊ = s + L_d with {parts}, "
     "c = exp(h ∂L/∂s) and L_d = {L_d}; K, ∂L/∂s and f are taken at q̄ = (q + q₊)/2 and v = (q₊ − q)/h{dry}"
@@ -36,7 +37,7 @@ OF_ORDER = {
     4: "(c − 1) s + √c (h K + (h³/24)(K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e)) − (h/6)(c V(q) + 4 √c V(q̄) + V(q₊)), "
     "e = K_q − V_q − K_qv v − γ K_v, M = K_vv",
 }
-# The same with powers of s in L.
+# The rule with powers of s in L.
 BY_POWERS = (
     "step it as the model does: c p + ∂L_d/∂q + c (h/2) f = 0, p₊ = ∂L_d/∂q₊ + (h/2) f, c = 1 + ∂L_d/∂s, f the forces; "
     "L_d is what s gains from − (h/2) V(q), half a step of s′ = −β sᵖ of each power of s, half a step of s′ = −γ s, "
@@ -46,7 +47,7 @@ DRY = ", but dry friction, of q and v, acts by h in place of h/2 in the first of
 
 
 def notes_of(run: FittedRun) -> tuple[str, ...]:
-    """The notes of a run, those that it has something for."""
+    """The notes of a run; empty ones are left out."""
     refuse_own(run.model, "the equation", "herglotz.theory.ContinuousEquation evaluates that of any L_d")
     return tuple(filter(None, (_inputs(run), _sensors(run), _steps(run))))
 
@@ -63,14 +64,13 @@ def _inputs(run: FittedRun) -> str:
 
 
 def _sensors(run: FittedRun) -> str:
-    """What makes a coordinate of the equation of the reading of its sensor."""
-    told, names, found = run.reading, run.data.names, []
-    zeros, drifts = ((run.metrics.get("plan") or {}).get(name) or () for name in ("zeros", "drifts"))
+    """How the reading of a sensor becomes a coordinate of the equation."""
+    names, found, plan = run.data.names, [], run.metrics.get("plan") or {}
     for of, numbers in (
-        ("times the scale", told.get("sensor_scales")),
-        ("less the zero", told.get("sensor_zeros")),
-        ("less the zero", zeros),
-        ("less t since its recording began times the drift", drifts),
+        ("times the scale", run.reading.get("sensor_scales")),
+        ("less the zero", run.reading.get("sensor_zeros")),
+        ("less the zero", plan.get("zeros")),
+        ("less t since its recording began times the drift", plan.get("drifts")),
     ):
         values = [plain(float(x), DIGITS) for x in numbers or ()]
         each = [f"{name} {', '.join(values[i :: len(names)])}" for i, name in enumerate(names)] if values else []
@@ -80,7 +80,7 @@ def _sensors(run: FittedRun) -> str:
 
 
 def _steps(run: FittedRun) -> str:
-    """The model's step and rule, and by how much the exact motion of the equation departs from them."""
+    """The model's step and rule, and the distance of the exact motion of the equation from the model's motion."""
     time, model = "" if run.data.time_unit == "1" else f" {run.data.time_unit}", run.model
     what = f"the model's steps are {run.h:.7g}{time}, its rule of order {model.config.order}"
     found = departure(run)
@@ -105,16 +105,19 @@ def _steps(run: FittedRun) -> str:
 
 
 class Departure(NamedTuple):
-    """RMS over all coordinates, each over its balance."""
+    """RMS over all coordinates, each over its balance.
 
-    moved: float  # by which the model's steps miss the exact motion of its equation
-    missed: float  # by which the model misses the data
+    `moved` is the distance of the model's motion from the exact motion of its equation, `missed` that from the data.
+    """
+
+    moved: float
+    missed: float
 
 
 def departure(run: FittedRun) -> Departure | None:
-    """What the model's steps miss of the exact motion, by free runs of all recordings with these and with halved steps.
+    """Errors of free runs of all recordings; the exact motion is extrapolated from whole and halved steps.
 
-    None where one breaks off, the model meets the data exactly, or is more than its equation.
+    None if a run fails, the model fits the data exactly, or the equation is not the whole model.
     """
     data = run.data.unwrapped()
     if not is_formula(run.model):
@@ -130,12 +133,12 @@ def departure(run: FittedRun) -> Departure | None:
 
 
 def longest_step(run: FittedRun) -> float:
-    """The longest step that the model takes along a recording."""
+    """The longest model step along a recording."""
     return GAP * run.h if run.decided.substeps == 1 else JITTER * run.h
 
 
 def free_run(run: FittedRun, max_step: float) -> Tensor:
-    """Free runs of all recordings from their first states with steps of at most `max_step`, (N, n)."""
+    """Positions of free runs of all recordings from their first states, with steps up to `max_step`, (N, n)."""
     data = run.data.unwrapped()
     grid = segment_grid(data, data.samples, max_step)
     start = run.states.joined[grid.start_sample].detach()

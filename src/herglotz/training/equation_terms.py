@@ -1,7 +1,7 @@
-"""What moves a model, term by term: the left side, the text, the unit and the number of each, as tensors.
+"""The terms of a model's motion: left side, text, unit and coefficient of each term.
 
-A number is a tensor of the model's parameters, so that its derivatives say which of them it is made of. Numbers inside
-a text, such as the width of a tanh or the zero of an input, are rounded by the same rule as those in front of it.
+A coefficient is a tensor made from the parameters, so that autograd gives its derivatives. Numbers inside a text, for
+example the width of a tanh or the zero of an input, are rounded by the same rule as coefficients.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 from herglotz.models import ContactLagrangian
 from herglotz.models.action import ActionFlow, ActionPowers
 from herglotz.models.config import POWERS
-from herglotz.models.drag import DragFeature, parse_drag
+from herglotz.models.drag import parse_drag
 from herglotz.models.feature_grammar import Feature
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import Combination, baseline_is_named, sorted_features
@@ -40,22 +40,22 @@ MORE = "what is no formula moves the model, too: these lines alone are another m
 
 @dataclass(frozen=True)
 class Line:
-    """value · what, on the right-hand side of one line."""
+    """value · what, on the right-hand side of the line of coordinate `of`, or in L if that is ""."""
 
     left: str
     what: str
     unit: str
     value: Tensor  # ()
-    of: str = ""  # the coordinate whose line it is; empty: it stands in L
+    of: str = ""
 
 
 def _mentions(text: str, names: Iterable[str]) -> bool:
-    """Whether a text has one of these names in it."""
+    """True if the text contains one of these names."""
     return any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for name in names)
 
 
 def is_formula(model: ContactLagrangian) -> bool:
-    """Whether the lines are the whole model: no network, and no term by name, which may be anything."""
+    """True if the lines are the whole model: no network, and no `Term`, whose formula is unknown."""
     in_s = model.action if isinstance(model.action, ActionFlow) else None
     networks = (model.potential.network, model.correction, in_s, getattr(model.damping, "network", None))
     named = model.config.baseline and not model.config.mass_width and not model.config.terms
@@ -63,25 +63,26 @@ def is_formula(model: ContactLagrangian) -> bool:
 
 
 def newtonian(model: ContactLagrangian) -> bool:
-    """Whether every coordinate has an equation of its own: one mass each, and no action s in the motion."""
+    """True if every coordinate has its own equation: one mass each, and no action s in the motion."""
     made_of, config = model.capabilities, model.config
     alone = made_of.constant_mass and (config.dof == 1 or config.diagonal or config.alike)
     return config.baseline and alone and not made_of.carries_s
 
 
 class Reader:
-    """The terms of a run's model: M q̈ = forces, a line a coordinate, or L with the forces beside it."""
+    """The terms of a run's model: M q̈ = forces with one line per coordinate, or L and the forces."""
 
     def __init__(self, run: FittedRun, numbers: Numbers):
         self.model, self.data, self.shown = run.model, run.data, numbers.shown
         self.config, self.names, self.time = run.model.config, run.data.names, run.data.time_unit
         self.newton, self.distance = newtonian(run.model), distance(run.data.names)
         self.own = [f"{name}″" if self.newton else f"force on {name}" for name in self.names]
-        self.lefts = self.own if self.newton else ["L", *self.own]  # with their masses once the lines are known
+        # `lines` puts the masses in front.
+        self.lefts = self.own if self.newton else ["L", *self.own]
         self.line_of = dict(zip(self.own, self.names, strict=True))
 
     def lines(self) -> list[Line]:
-        """Those of every term whose number is not 0."""
+        """The lines of all terms with a coefficient other than 0."""
         friction = (*self._friction(), *self._drag())
         parts = (self._kinetic(), self._damping(), friction, self._inputs(), self._springs(), self._features())
         found = [replace(line, of=self.line_of.get(line.left, "")) for part in parts for line in part]
@@ -89,9 +90,9 @@ class Reader:
         return self._over_masses(found) if self.newton else found
 
     def _over_masses(self, lines: Sequence[Line]) -> list[Line]:
-        """The lines of M q̈ = forces, that of a coordinate which moves by itself over its mass: motion says no more.
+        """The lines of M q̈ = forces. If coordinates share a force, their masses stand on the left.
 
-        Other lines share forces, and have their masses on the left.
+        The line of an uncoupled coordinate is divided by its mass, which the motion does not determine.
         """
         found = list(lines)
         for k, (m, own, name) in enumerate(zip(self._masses().diagonal(), self.own, self.names, strict=True)):
@@ -110,7 +111,7 @@ class Reader:
         return kinetic.mass()
 
     def _kinetic(self) -> Iterator[Line]:
-        """½ vᵀ M v with a constant M, and products of speeds, where L is printed as one function."""
+        """½ vᵀ M v with a constant M, and features with velocities, if L is printed as one function."""
         kinetic, names = self.model.kinetic, self.names
         if self.newton or not self.config.baseline:
             return
@@ -127,7 +128,7 @@ class Reader:
                 yield Line("L", feature_in_words(feature, names), "", value)
 
     def _damping(self) -> Iterator[Line]:
-        """Damping by the action, in L; that of a mass of its own stands with its friction."""
+        """Damping by the action, in L; for separate masses `_viscous` has it."""
         damping = self.model.damping
         if not isinstance(damping, (LinearDamping, AffineDamping)) or self.newton:
             return
@@ -146,7 +147,7 @@ class Reader:
             yield from self._dry(i, left)
 
     def _viscous(self, i: int, left: str) -> Iterator[Line]:
-        """What is linear in the speeds: of a mass of its own with what the contact form damps, which is all alike."""
+        """Friction linear in the speeds; for separate masses with the damping of the contact form, −γ m v."""
         model, per_time = self.model, unit_of(self.data.units[i], 0, self.time, 1)
         parts = [] if model.friction is None else [-model.friction.viscous[i]]
         if self.newton and isinstance(model.damping, LinearDamping):
@@ -160,17 +161,18 @@ class Reader:
             yield from (Line(left, f"{self.names[j]}′", per_time, -between[i, j]) for j in others)
 
     def _drag(self) -> Iterator[Line]:
-        """Friction by name, of one coordinate, between two, or through air."""
+        """Drag terms of one coordinate, between two, or of a body in air."""
         for g, text in enumerate(self.config.drag):
             assert self.model.drag is not None
             f = parse_drag(text, self.config.angles)
             for i in (i for i in range(len(self.names)) if f.air or i in (f.on, f.of)):
                 size = unit_of(self.data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)
                 value = self.model.drag.coefficient[g] * (1.0 if f.of == i else -1.0)
-                yield Line(self.own[i], self._drag_in_words(f, i), size, value)
+                words = drag_in_words(f, i, self.names, self._sign(f.on) if f.dry else "")
+                yield Line(self.own[i], words, size, value)
 
     def _dry(self, i: int, left: str) -> Iterator[Line]:
-        """Dry friction of one coordinate: set-valued friction that would push is none."""
+        """Dry friction of one coordinate; a set-valued friction force below 0 counts as 0."""
         friction, name = self.model.friction, self.names[i]
         if friction is None or not friction.dry:
             return
@@ -178,7 +180,7 @@ class Reader:
         if friction.sticking:
             coulomb, excess = coulomb if self._dry_by_position(i) else coulomb.relu(), excess.relu()
         yield Line(left, self._sign(i), unit, -coulomb[i])
-        if float(excess[i].detach()):  # the width of a force that is not there is no number of the equation
+        if float(excess[i].detach()):
             width = (friction.sharpest + friction.log_stribeck.exp())[i]
             width = self.shown(width, f"the speed over which breakaway of {name} fades")
             yield Line(left, f"exp(−({name}′/{width})²) {self._sign(i)}", unit, -excess[i])
@@ -188,19 +190,16 @@ class Reader:
         return any(f.dry and f.on == i for f in found)
 
     def _sign(self, i: int) -> str:
-        """The direction of a speed, as dry friction takes it."""
+        """The direction of a speed in dry friction: sgn if set-valued, else tanh."""
         friction, name = self.model.friction, self.names[i]
-        assert friction is not None  # dry friction is part of it
+        assert friction is not None
         if friction.sticking:
             return f"sgn({name}′)"
         width = self.shown(friction.widths[0][i], f"the speed below which dry friction of {name} is smooth")
         return f"tanh({name}′/{width})"
 
-    def _drag_in_words(self, f: DragFeature, i: int) -> str:
-        return drag_in_words(f, i, self.names, self._sign(f.on) if f.dry else "")
-
     def _inputs(self) -> Iterator[Line]:
-        """Each input less what its sensor shows where nothing acts."""
+        """Each input less the zero of its sensor."""
         friction = self.model.friction
         for j in range(self.config.inputs):
             assert friction is not None
@@ -210,17 +209,18 @@ class Reader:
                 text = self.shown(zero, f"the zero of {what}")
                 what = f"({what} {f'+ {text[1:]}' if text.startswith('−') else f'− {text}'})"
             for i, left in enumerate(self.own):
-                in_L = self.model.action is not None  # the work of inputs
-                at, text = ("L", f"{what} {self.names[i]}") if in_L else (left, what)
+                # With an action, the work of inputs is part of L.
+                at, text = (left, what) if self.model.action is None else ("L", f"{what} {self.names[i]}")
                 yield Line(at, text, "", friction.input_map[i, j])
 
     def _springs(self) -> Iterator[Line]:
-        """The baseline's k (1 − cos x) + b sin x or k x²/2 + b x, x a coordinate or what translations leave of it."""
+        """The baseline's k (1 − cos x) + b sin x or k x²/2 + b x; x is a coordinate, with translations a difference."""
         V, n = self.model.potential, len(self.names)
         if not self.config.baseline:
             return
         k, b = V.stiffness, V.tilt
-        if baseline_is_named(self.config):  # −k, b of an angle; k/2, b of a length
+        # As features the coefficients are −k, b for an angle and k/2, b for a length.
+        if baseline_is_named(self.config):
             assert V.features is not None
             own = V.features.sum.coefficient[: 2 * n].reshape(n, 2)
             k, b = own[:, 0] * own.new_tensor([-1.0 if angle else 2.0 for angle in V.angles]), own[:, 1]
@@ -239,11 +239,12 @@ class Reader:
         for power, value in ((2, k * (1.0 if angle else w**2)), (1, b * (1.0 if angle else w))):
             what, factor = own_term(x, angle, power, False)
             yield Line("L", what, "", value * factor)
-        if angle and self.model.capabilities.carries_s:  # elsewhere a constant moves nothing
+        # A constant in L acts only through s.
+        if angle and self.model.capabilities.carries_s:
             yield Line("L", "", "", -k)
 
     def _features(self) -> Iterator[Line]:
-        """Named features of the potential: their forces on each coordinate, or their part of L."""
+        """Features of the potential: their forces on each coordinate, or their part of L."""
         features, config = self.model.potential.features, self.config
         if features is None:
             return
@@ -264,13 +265,13 @@ class Reader:
     def _numbers(
         of: Combination, learned: list[Feature], known: list[Feature], first: int = 0
     ) -> Iterator[tuple[Feature, Tensor]]:
-        """Each feature with its coefficient; those that are known have theirs in their text."""
+        """Each feature with its coefficient; 1 for known features, whose coefficient is part of their text."""
         yield from zip(learned, of.coefficient[first:], strict=False)
         one = of.coefficient.new_ones(())
         yield from ((feature, one) for feature in known)
 
     def explained(self) -> list[str]:
-        """What the lines need to be integrated: the symbols in them, and how dry friction holds."""
+        """Notes that an integration of the lines needs: symbols, the law of motion, and sticking."""
         model, names = self.model, self.names
         found = [] if is_formula(model) else [MORE]
         if any(p.function == "radius" for p in self._products()):

@@ -1,4 +1,4 @@
-"""How an equation is worded: features and friction forces with the names of their coordinates, units, numbers."""
+"""Text of an equation: features and friction forces with the names of coordinates, units, numbers."""
 
 from __future__ import annotations
 
@@ -9,16 +9,24 @@ from dataclasses import replace
 from herglotz.models.drag import DragFeature
 from herglotz.models.feature_grammar import Feature, Product
 
-SMALL, LARGE = 1e-4, 1e7  # beyond them a number has its power of ten: its zeros are not counted at a glance
-EXACT = 10  # digits of a number that is told, and no more than rounding
-UNKNOWN = 7  # digits of a number of which nothing says how much the motion depends on it
-BESIDE = 4  # digits of a number beside a network, which is no formula: nobody integrates the lines
-LAST = 100  # units of the last digit: larger deviations are told as ±, for brackets of three digits are not read
+# Numbers outside this range are printed with a power of ten, because many zeros are hard to count.
+SMALL, LARGE = 1e-4, 1e7
+# Digits of a number that the user gave: all but rounding errors.
+EXACT = 10
+# Digits of a number if its influence on the motion is unknown.
+UNKNOWN = 7
+# Digits of a number beside a network: without a formula of the network nobody integrates the lines.
+BESIDE = 4
+# A deviation of this many units of the last digit is printed with ±, because brackets of three digits are hard to read.
+LAST = 100
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def own_term(name: str, angle: bool, power: int, newton: bool) -> tuple[str, float]:
-    """Text and factor of a term of the potential k (1 − cos q) + b sin q, or k q²/2 + b q: of its force, or in L."""
+    """Text and factor of a term of the potential k (1 − cos q) + b sin q, or k q²/2 + b q: its force, or its part of L.
+
+    `power` 2 is the term of k, 1 the term of b.
+    """
     if newton:
         return (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else ""), -1.0
     if angle:
@@ -27,7 +35,7 @@ def own_term(name: str, angle: bool, power: int, newton: bool) -> tuple[str, flo
 
 
 def drag_in_words(f: DragFeature, i: int, names: Sequence[str], sign: str = "") -> str:
-    """A friction force on coordinate i with the names of its coordinates; `sign` is the direction of dry friction."""
+    """A friction force on coordinate i with the names of coordinates; `sign` is the text of a direction."""
     if f.air:
         return f"√({' + '.join(f'{name}′²' for name in names)}) {names[i]}′"
     speed = f"{names[f.on]}′" if f.of is None else f"({names[f.on]}′ − {names[f.of]}′)"
@@ -67,7 +75,7 @@ def _slope(p: Product, i: int, names: Sequence[str]) -> tuple[str, float, int]:
 
 
 def distance(names: Sequence[str]) -> str:
-    """What the distance |q| is called."""
+    """The symbol of the distance |q|, which is no name of a coordinate."""
     return "ρ" if "r" in names else "r"
 
 
@@ -79,13 +87,13 @@ def _form(form: tuple[float, ...], names: Sequence[str], phase: float = 0.0) -> 
 
 
 def _inner(form: tuple[float, ...], names: Sequence[str]) -> str:
-    """A form of which a power is taken."""
+    """A form as the base of a power: in brackets unless it is a single name."""
     text = _form(form, names)
     return text if text in names else f"({text})"
 
 
 def feature_in_words(feature: Feature, names: Sequence[str]) -> str:
-    """A feature with the names of the coordinates; x y′ − y x′ has one coefficient, and stands in brackets."""
+    """A feature with the names of the coordinates; a sum such as x y′ − y x′ stands in brackets."""
     texts = [(p.factor, _product(p, names)) for p in feature]
     if len(texts) == 1 and texts[0][0] == 1:
         return texts[0][1]
@@ -96,7 +104,7 @@ def feature_in_words(feature: Feature, names: Sequence[str]) -> str:
 
 
 def _product(p: Product, names: Sequence[str]) -> str:
-    """A product without its factor; nothing of a constant."""
+    """A product without its factor; "" for a constant."""
     speeds = [raised(f"{names[i]}′", p.velocities.count(i)) for i in dict.fromkeys(p.velocities)]
     if p.function == "radius":
         return raised(distance(names), p.power)
@@ -114,28 +122,28 @@ def _arm(p: Product, names: Sequence[str]) -> str:
 
 
 def raised(base: str, power: int) -> str:
-    """x³ of x and 3; nothing of a power of 0."""
+    """Base and exponent, x³; "" for a power of 0."""
     return base if power == 1 else "" if power == 0 else base + str(power).translate(_RAISED)
 
 
 def unit_of(unit: str, power: int, time: str, per: int) -> str:
-    """Power of the coordinate's unit over a power of the unit of time."""
+    """A power of the coordinate's unit over a power of the unit of time."""
     top = "" if unit == "1" else raised(unit, power)
     bottom = "" if time == "1" or not per else f"{time}{str(per).translate(_RAISED) if per > 1 else ''}"
     return (f"{top or '1'}/{bottom}" if bottom else top) or "1"
 
 
 def plain(value: float, digits: int = EXACT) -> str:
-    """A number without a deviation."""
+    """A number without a deviation, with a minus sign in place of a hyphen."""
     return f"{value:.{digits}g}".replace("-", "−", int(value < 0))
 
 
 def number(value: float, deviation: float | None, alone: float | None, digits: int = UNKNOWN) -> str:
-    """A value ≥ 0 with its standard deviation, as the motion needs it: 25.0(3), 2.955(±4.1), 4.7(2)e-8.
+    """A value ≥ 0 with its standard deviation: 25.0(3), 2.955(±4.1), 4.7(2)e-8.
 
-    It is rounded to a digit below `alone`, its deviation with all other numbers held: numbers that make up for each
-    other are known together far better than one by one, and rounding changes one by one. Its own deviation stands in
-    units of the last digit, or as ±.
+    The value is rounded to a digit below `alone`, its deviation with all other numbers fixed: correlated numbers are
+    known together far better than one by one, but rounding changes one at a time. The deviation is printed in units of
+    the last digit, or with ±.
     """
     if alone is None or not 0 < alone < math.inf:
         return plain(value, digits)

@@ -1,4 +1,4 @@
-"""`evaluate`: states at every sample, those of the unseen part by a free run, and their errors."""
+"""`evaluate`: the states of a fit at every sample, with a free run over the unseen part, and their errors."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ from herglotz.training.run import Run
 from herglotz.training.task import Task
 from herglotz.training.verdict import judged
 
-GONE = 1e3  # times the spread: a free run so far away has left the world, however little its start is known
+# Multiple of the spread. A free run with a larger error has diverged, whatever the uncertainty of its start.
+DIVERGED = 1e3
 
 
 def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: FitConfig) -> Run:
-    """Return the finished run: its states, its free run beyond the training part, and the errors of both.
+    """The finished run: states, free run after the training part, and the errors of both.
 
-    `told` are the settings of the fit before anything was decided.
+    `told` are the user's settings, without the decisions of the plan.
     """
     train, data, config = seen.train, seen.data, task.config
     fitted = replace(fitted, states=_with_dropped(fitted, train, seen.spikes))
@@ -45,14 +46,15 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
         dropped[~dropped] = ~fitted.used
     states, status = states_everywhere(fitted, data, train.lengths, task.base.model_step)
     metrics, free = _errors(fitted, task, seen, dropped, states)
-    if free is not None and (metrics["extrapolation_rms"] or 0.0) > GONE * metrics["spread"]:
+    if free is not None and (metrics["extrapolation_rms"] or 0.0) > DIVERGED * metrics["spread"]:
         times = metrics["extrapolation_rms"] / metrics["spread"]
         status = (
             f"the free run over the unseen samples leaves the world: it misses them by {times:.1g} times their spread"
         )
         free, metrics["extrapolation_rms"] = torch.full_like(free, torch.inf), None
     metrics |= judged(task, seen, fitted, states.joined, free, metrics)
-    if metrics["train_rms"] == 0.0:  # where a model follows none, states are the recorded ones
+    # If a model follows no data, its states are the recorded ones, and have no error.
+    if metrics["train_rms"] == 0.0:
         metrics["train_rms"] = metrics["window_rms"]
     metrics |= {
         "extrapolation_status": status,
@@ -74,7 +76,7 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
 
 
 def unseen_errors(run: Run) -> list[Tensor]:
-    """Errors of the free run over unseen complete samples of each trajectory, (K, n); K is 0 if none is held out."""
+    """Errors of the free run at the complete unseen samples of each trajectory, (K, n); K may be 0."""
     error, complete = run.prediction.detach() - run.data.unwrapped().q, run.data.complete
     rows = zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
     spans = (slice(first + trained, first + length) for first, length, trained in rows)
@@ -82,10 +84,11 @@ def unseen_errors(run: Run) -> list[Tensor]:
 
 
 def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
-    """Return states at all training samples; a sample left out of the fit is reached from the sample before."""
+    """States at all training samples; the states of samples left out of the fit are stepped from the sample before."""
     u, out = step_inputs(fitted.model, train), fitted.states.new_empty(train.samples, 2 * train.dof + 1)
     out[~dropped] = fitted.states
-    rows = dropped.nonzero()[:, 0]  # never the first of a trajectory
+    # The first sample of a trajectory is never left out.
+    rows = dropped.nonzero()[:, 0]
     for run in rows.tensor_split((rows.diff() > 1).nonzero()[:, 0] + 1) if len(rows) else ():
         before = run - 1
         inputs, h = None if u is None else u[before], train.t[run] - train.t[before]
@@ -98,7 +101,7 @@ def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tenso
 def _errors(
     fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: State
 ) -> tuple[dict[str, Any], Tensor | None]:
-    """RMS errors in units of q, None where none can be measured, and (M, n) errors of the free run where unseen."""
+    """RMS errors in units of q, None if not measurable, and the errors of the free run at unseen samples, (M, n)."""
     data, train, base, robust = seen.data, seen.train, task.base, task.config.robust != "off"
     training = leading(data.lengths, train.lengths).to(data.t.device)
     error, unit = states.q - data.q, fitted.notes.get("unit_of_s")
@@ -116,7 +119,8 @@ def _errors(
         x = torch.cat([x[: problem.P], x.new_tensor([unit]).log()])
     ratio = (triples.h1 / triples.h0)[:, None]
     unmoved = triples.q2 - triples.q1 - ratio * (triples.q1 - triples.q0)
-    stepped = len(triples) and base.model_step == base.max_step  # a recorded step is one of the model's
+    # True if every recorded step is a model step.
+    stepped = len(triples) and base.model_step == base.max_step
     rate = getattr(fitted.model.damping, "rate", None)
     free = error[beyond] if seen.unseen is not None and bool(beyond.any()) else None
     numbers = {
@@ -138,9 +142,9 @@ def _errors(
 
 
 def _gain(free: Tensor, still: Tensor) -> float | None:
-    """By how many standard errors the free run meets the unseen samples better than the mean of the training part.
+    """Gain of the free run over the mean of the training part as a prediction of unseen samples, in standard errors.
 
-    None where the free run breaks off, or ends so far away that its square is no number.
+    None if the free run fails, or its squares overflow.
     """
     scale = still.square().mean(0).clamp_min(torch.finfo(still.dtype).tiny)
     gain = ((still.square() - free.square()) / scale).flatten()

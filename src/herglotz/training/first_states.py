@@ -1,4 +1,4 @@
-"""States read from samples: at the beginnings of segments, and everywhere for a model that follows no data."""
+"""States from neighbouring samples: at the starts of segments, and at every sample if a model follows no data."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from herglotz.training.problems.grid import step_inputs
 from herglotz.training.problems.robust import robust_fit
 from herglotz.training.problems.shooting import ShootingProblem
 
-START = 8  # samples that a robust start state is estimated from
+# Samples for a robust start state.
+START = 8
 
 
 def first_states(problem: ShootingProblem, theta: Tensor, smooth: Trajectories | None = None) -> Tensor:
-    """Return segment states from the first two samples, p by FL⁻; from a robust cubic beside outliers.
+    """Segment states from the first two samples, with p by FL⁻; with a robust loss from a robust cubic.
 
     `smooth` are the same samples, smoothed.
     """
@@ -31,7 +32,7 @@ def first_states(problem: ShootingProblem, theta: Tensor, smooth: Trajectories |
 
 
 def states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
-    """The recorded positions with the momenta that FL⁺ gives each pair and s = 0, for a model that follows no data."""
+    """The recorded positions with momenta by FL⁺ of each pair and s = 0, (N, 2n+1)."""
     out = data.q.new_zeros(data.samples, 2 * data.dof + 1)
     steps, u = data.steps(), step_inputs(model, data)
     i, zero = steps.index, torch.zeros_like(steps.h)
@@ -50,7 +51,7 @@ def states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
 
 
 def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions at `rows` and at the samples after, (S, n) each, on cubics through eight samples by Student's t."""
+    """Positions at `rows` and at the next samples, (S, n) each, on cubics fitted to eight samples by Student's t."""
     first, second = data.q[rows].clone(), data.q[rows + 1].clone()
     fits = rows + START < data.samples
     inside = data.trajectory[(rows + START - 1).clamp_max(data.samples - 1)] == data.trajectory[rows]

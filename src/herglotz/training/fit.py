@@ -42,7 +42,8 @@ from herglotz.training.stages import Progress, Stages
 from herglotz.training.tensorboard import log_result, tensorboard_log
 from herglotz.training.uncertainty import laplace
 
-ROUNDING = 3.0  # times the σ of exact data: what moves them by less is rounding
+# Multiple of the σ of exact data. Smaller changes of the data are rounding.
+ROUNDING = 3.0
 
 
 @one_thread()
@@ -60,47 +61,48 @@ def fit(
 ) -> Run:
     """Train a discrete contact Lagrangian on positions.
 
-    Angles are unwrapped; each trajectory is split in time; the first part is looked at, a plan is chosen and followed;
-    the rest is predicted by a free run from the states estimated on the first.
+    Angles are unwrapped, and each trajectory is split in time. A first look at the first part chooses a plan, which the
+    fit follows; a free run from the last state of the first part predicts the rest.
 
     Parameters
     ----------
     data
-        Trajectories of positions, and of inputs u where there are any; of s and p as `config.supervision` says. Or what
+        Trajectories of positions, with inputs u if any, and with s and p for `config.supervision`. Or anything that
         `herglotz.data.as_trajectories` reads: a path, a DataFrame, arrays.
     config
         Settings; default `FitConfig()`.
     model
-        An L_d of your own to train in place of the package's model: a `torch.nn.Module` L_d(q0, q1, s0, h), with
-        `at(u)` where there are inputs, its derivatives by `partials` or by autograd. Its parameters are trained in
-        place. Of the settings those that say how to fit apply (`herglotz.training.own_fit.TAKEN`).
+        Your own L_d to train in place of the package's model: a `torch.nn.Module` L_d(q0, q1, s0, h), with `at(u)` for
+        inputs, and derivatives by `partials` or by autograd. Its parameters are trained in place. Only settings of the
+        fit apply (`herglotz.training.own_fit.TAKEN`).
     plan
-        Follow this plan instead of choosing one, or that of a run: the same terms, from its values. Two loads of one
-        machine are fitted so (`herglotz.export.between`); `Plan.from_dict(run.metrics["plan"])` is a plan to change.
+        A plan to follow instead of choosing one, or a run with a plan: the same terms, from the same starting values.
+        This is how two loads of one machine are fitted (`herglotz.export.between`). To change a plan, start from
+        `Plan.from_dict(run.metrics["plan"])`.
     out
         Folder for the checkpoint (`checkpoint.pt`); nothing is written without it. Use `save_run` for the result.
     progress
-        Show one bar; None: on a terminal only; "lines": one line on stderr after every stage; "iterations": after every
-        iteration, too.
+        True: show a bar; None: only on a terminal; "lines": one line on stderr after every stage; "iterations": also
+        after every iteration.
     resume
-        Go on from the checkpoint in `out`, if there is one.
+        Continue from the checkpoint in `out`, if there is one.
     tensorboard
         Folder for a log that TensorBoard shows while the fit runs (extra `herglotz[tensorboard]`).
     **settings
-        Single settings of `FitConfig`, over those of `config` (`level="affine"`), and how data are to be read
+        Single settings of `FitConfig`, which replace those of `config` (`level="affine"`), and options of reading
         (`h=0.01`, `time="t"`, `angles="theta"`, `group="run"`; see `herglotz.data.as_trajectories`).
 
     Returns
     -------
     Run
-        Model, states, metrics and history. Always finite: a prediction that fails says so in
-        `metrics["extrapolation_status"]`.
+        Model, states, metrics and history. All metrics are finite; `metrics["extrapolation_status"]` reports a failed
+        prediction.
 
     Raises
     ------
     InputError
-        If the data cannot be used, the settings are wrong, the plan is of other coordinates, TensorBoard is missing, or
-        another process is fitting into `out`.
+        If the data cannot be used, the settings are wrong, the plan has other coordinates, TensorBoard is missing, or
+        another process fits into `out`.
 
     Examples
     --------
@@ -126,38 +128,39 @@ def fit(
         tell(f"{data.source or 'data'}: {short}")
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     with tensorboard_log(tensorboard) as log, nullcontext() if out is None else locked(out):
-        if checkpoint is not None and is_first():  # only its process holds the lock
+        # Only the first process holds the lock.
+        if checkpoint is not None and is_first():
             remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
-        if any(read.angles) and not any(run.data.angles):  # as it was found: later recordings are read alike
-            reading = {**reading, "angles": False}
-        run = replace(run, reading=reading_told(reading, data.names))
+        # Later recordings have no angles either if the fit found positions on a line.
+        line = {"angles": False} if any(read.angles) and not any(run.data.angles) else {}
+        run = replace(run, reading=reading_told({**reading, **line}, data.names))
         if log is not None:
             log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run
 
 
 def _planned(given: Plan | Run | None, data: Trajectories) -> Plan | None:
-    """The plan that is given, or the one of a run."""
+    """The given plan, or the plan of the given run."""
     plan = Plan.from_dict(given.metrics["plan"]) if isinstance(given, Run) and "plan" in given.metrics else given
     if plan is None:
         return None
     if not isinstance(plan, Plan):
         raise InputError(f"plan must be a Plan, or a run that followed one, got {type(given).__name__}")
     if (count := len(plan.start["stiffness"])) != data.dof:
-        raise InputError(f"{data.source or 'data'}: the plan is of {count} coordinates, the data have {data.dof}")
+        raise InputError(f"{data.source or 'data'}: the plan has {count} coordinates, the data have {data.dof}")
     return plan
 
 
 def weighed(data: Trajectories, objective: str, supervision: str) -> Trajectories:
-    """The data with what an objective can weigh: fits of whole trajectories every position, others whole samples."""
+    """The data that an objective can use: trajectory fits use every position, others only complete samples."""
     return data if supervision == "q" and objective in ("auto", "trajectory") else complete(data)
 
 
 def _fit_own(
     data: Trajectories, model: Any, config: FitConfig, progress: Progress, reading: dict[str, Any], other: Any
 ) -> Run:
-    """A fit of an L_d of one's own."""
+    """A fit of the user's own L_d."""
     refuse({"model= is fitted without plan, out, resume and tensorboard; leave them out": other})
     started = time.perf_counter()
     run = fit_own(data, model, config, Stages(progress))
@@ -166,10 +169,11 @@ def _fit_own(
 
 
 def told_arrival(data: Trajectories, config: FitConfig, planned: Arrival | None) -> Trajectories:
-    """The data with what settings say of their inputs, and what a plan says where the data say nothing."""
+    """The data with the input timing of the settings, else of the data, else of the plan."""
     if data.u is None:
         return data
-    if config.frequencies:  # amplitude and phase are learned
+    # The phase of a periodic force is learned.
+    if config.frequencies:
         return replace(data, delay=0.0, lag=0.0)
     told = Arrival(data.hold, config.input_delay, config.actuator_lag)
     known = [x for x in (told, data.arrival, planned) if x]
@@ -195,17 +199,17 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
 
 
 def _joint(run: Run, plan: Plan, least: float) -> Joint | None:
-    """What the data say of all numbers together, where named terms were fitted to trajectories.
+    """The joint posterior of all numbers, if named terms were fitted to trajectories; else None.
 
-    The data are known no better than to `least`, in units of q: what moves them by less is rounding.
+    Positions are precise only to `least`, in units of q. The posterior needs a model that follows whole trajectories.
     """
     if plan.network == "none" and run.metrics["follows_data"]:
-        with suppress(InputError):  # whole trajectories cannot be followed: no deviations
+        with suppress(InputError):
             return joint_of(laplace(run), least)
     return None
 
 
 def _key(data: Trajectories, config: FitConfig, plan: Plan | None) -> str:
-    """Identifies a fit: its data, its settings and a given plan (the device does not matter)."""
+    """A hash that identifies a fit: its data, its settings except the device, and a given plan."""
     settings = {**config.to_dict(), "device": "", "plan": None if plan is None else plan.to_dict()}
     return hashlib.sha256((data.digest() + json.dumps(settings, sort_keys=True)).encode()).hexdigest()

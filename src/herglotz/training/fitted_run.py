@@ -1,4 +1,4 @@
-"""What equation, summary, motion and prediction read off a `Run`, which imports all of them."""
+"""`FittedRun`: the part of a `Run` that equation, summary, motion and prediction use, which `Run` imports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from herglotz.training.config import FitConfig
 
 
 class FittedRun(Protocol):
-    """The attributes of `herglotz.training.Run` that are told and stepped."""
+    """Attributes of `herglotz.training.Run`, as a protocol against a circle of imports."""
 
     @property
     def model(self) -> ContactLagrangian: ...  # noqa: D102

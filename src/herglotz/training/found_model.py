@@ -1,4 +1,4 @@
-"""A model that a search has found, as settings and starting values of a fit."""
+"""The model found by a search, as settings and starting values of a fit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from herglotz.training.trials import ALIKE, FINER, Trial, is_precise, moved
 
 
 def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
-    """The settings of a model that has what a trial has taken and nothing else, and the baseline it starts from."""
+    """The settings of a model with exactly the numbers of a trial, and the baseline with their values."""
     fitter, data = trial.fitter, trial.problem.data
     base = replace(fitter.base, spreads=_spreads(trial))
     bare = replace(base, start={})
@@ -39,10 +39,12 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     numbers = ParameterVector(build_model(bare, of, "none"))
     value = {fitter.keys[name]: x for name, x in trial.values.items()}
     keys, start = keys_of(numbers.numbers, numbers.model.config), numbers.get().tolist()
-    theta = data.q.new_tensor([value.get(key, x) for key, x in zip(keys, start, strict=True)])  # widths that do not act
+    # The trial lacks the widths of friction without a force; these keep their default.
+    theta = data.q.new_tensor([value.get(key, x) for key, x in zip(keys, start, strict=True)])
     values = values_of(numbers, theta)
+    # A search has no kernel of order 4, and uses short steps of order 2 instead.
     if is_precise(data) and data.dof > 1 and data.u is None and variant.substeps > 1 and not dry:
-        fourth = replace(of, order=4, substeps=1)  # no kernel has it: a search makes do with short steps
+        fourth = replace(of, order=4, substeps=1)
         own = started(base, data, values, fourth)
         grid = segment_grid(data, trial.length, own.model_step)
         problem = ShootingProblem(build_model(own, fourth, "none"), data, grid, sigma=trial.problem.sigma)
@@ -52,7 +54,7 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
 
 
 def _spreads(trial: Trial) -> dict[str, float]:
-    """The prior deviations of the waves that a trial has taken, and of what they could stand for, by their text."""
+    """Prior deviations, by their text, of the waves of a trial and of the terms that waves could replace."""
     numbers, fitter, prior = trial.problem.parameters.numbers, trial.fitter, trial.prior
     return {
         fitter.keys[name]: weight**-0.5

@@ -1,4 +1,4 @@
-"""The states of a fit at every sample: fitted ones on the training part, a free run over the rest."""
+"""Free runs of a model along recordings, and the states of a fit at every sample."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from herglotz.training.solvers.lifted_newton import solve_path
 def states_everywhere(
     fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
 ) -> tuple[State, str]:
-    """States at every sample, those of the training part and a free run from the last of them; and "ok", or why not."""
+    """States at every sample: fitted ones, then a free run from the last fitted state; and "ok" or the failure."""
     out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
     out[leading(data.lengths, train_lengths)] = fitted.states
     before = [k - 1 if k < length else length for k, length in zip(train_lengths, data.lengths, strict=True)]
@@ -44,8 +44,8 @@ def states_everywhere(
 def free_runs(stepper: Stepper, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None) -> Tensor:
     """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1); NaN from a failed step on.
 
-    A model that follows the data has its free runs near them: all steps are then solved at once, from the data. Else
-    one after the other. Where a start is not a number, so is its run.
+    Near the data all steps are solved at once, with the data as initial guess; else one by one. If a start is NaN, its
+    run is NaN.
     """
     known, model = torch.isfinite(start).all(-1), cast(ContactLagrangian, stepper.L_d)
     nodes = near_data(model, data, grid, start, u) if bool(known.all()) else None
@@ -65,7 +65,7 @@ def near_data(
 ) -> Tensor | None:
     """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1), all steps solved at once.
 
-    Newton's iteration starts from the recorded positions; None where that does not converge: the runs are elsewhere.
+    Newton's method starts from the recorded positions; None if it does not converge, when the runs are not near them.
     """
     found = motion(model, start, grid.h, u)
     if found is not None:
@@ -81,10 +81,10 @@ def near_data(
 
 
 def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor:
-    """The free runs from `start`, (S, 2n+1), (S, K+1, 2n+1); NaN from a failed step of a run on.
+    """The free runs from `start`, (S, 2n+1), as (S, K+1, 2n+1); NaN after a failed step of a run.
 
-    Blocks of steps are solved at once from straight lines: a block that converges doubles the next one, and after one
-    that does not a single step is taken. A few batched evaluations stand for each step's own.
+    Blocks of steps are solved at once, with straight lines as initial guess. After a block that converges the next is
+    twice as long; after a failure one single step is taken. Batched evaluations are faster than single steps.
     """
     found = motion(model, start, h, u)
     if found is not None:

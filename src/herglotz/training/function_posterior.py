@@ -1,19 +1,21 @@
-"""The posterior of functions: of a run's numbers together with all waves that its functions could have.
+"""The posterior of learned functions: of a run's numbers together with all waves (Fourier terms) of its functions.
 
-A fit keeps the waves that are worth their price, and a posterior of these alone takes all others for known to be 0: its
-bands of a function are far too narrow. Here every function (potential, damping, mass, friction) has all its waves. They
-stand for powers and other named terms of the function, too, which come from a dictionary and are not known. Waves have
+A fit keeps only the waves that improve its score. A posterior of these waves alone treats all others as known to be 0,
+and its bands are far too narrow. Here every function (potential, damping, mass, friction) has all its waves, which also
+replace the powers and other named terms of the function. The model of the posterior is
 
-* a prior N(0, α_f τ_k²), τ_k the deviations of `prior_spreads`, a strength α_f of each function. It maximises the
-  marginal likelihood times a prior of √α_f, ∝ √α exp(−α/2), that keeps it from 0 (Chung et al. 2013, A nondegenerate
-  penalized likelihood estimator for variance parameters): with γ_f = Σ (1 − C_kk/(α_f τ_k²)) numbers that the data tell
-  of a function (MacKay 1992), α_f = α_f (Σ θ_k²/(α_f τ_k²) + 1) / (γ_f + α_f) at the maximum;
-* the σ of the noise at which the residuals are likeliest;
-* the mean of the first mass over the data as it is, which positions leave free (trap 3 of `docs/mathematics.md`).
+* a prior N(0, α_f τ_k²) of the waves, with τ_k of `prior_spreads` and a strength α_f for each function. α_f maximises
+  the marginal likelihood times a prior of √α_f, ∝ √α exp(−α/2), that keeps α_f from 0 (Chung et al. 2013, A
+  nondegenerate penalized likelihood estimator for variance parameters). At the maximum
+  α_f = α_f (Σ θ_k²/(α_f τ_k²) + 1) / (γ_f + α_f), with γ_f = Σ (1 − C_kk/(α_f τ_k²)) the effective number of
+  parameters of the function (MacKay 1992);
+* the σ of the noise that maximises the likelihood of the residuals;
+* the mean of the first mass over the data fixed, because positions do not determine it (trap 3 of
+  `docs/mathematics.md`).
 
-The motion is linearised once, at the fit. Functions are compared with those of continuous motion, from which those of a
-rule of order p differ by h^p: Jᵀr of model steps h and h/2 is extrapolated (Richardson). What held-out blocks of time
-are missed by widens the bands as it does all others (head of `herglotz.training.uncertainty`).
+The motion is linearised once, at the fit. The functions are those of continuous motion: a rule of order p differs by
+h^p, and Jᵀr of model steps h and h/2 is extrapolated (Richardson). Held-out errors widen the bands, as in
+`herglotz.training.uncertainty`.
 """
 
 from __future__ import annotations
@@ -41,30 +43,35 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import inverse_of
 from herglotz.training.uncertainty import Laplace, inflation_of
 
-FALLS = (0, 1, 2)  # Matérn processes of ν = 3/2, 5/2, 7/2: the one at which the data are likeliest
-ROUNDS, SETTLED = 200, 0.01  # of strengths, and the relative change that ends them
-HELD = 1e-4  # of the first mass, to which its mean is known
-SAMPLES = 200  # of the data at most, that the mean of the mass is made of
-LEFT = 1e-6  # of a coefficient, where waves stand for its term
+# Matérn processes of ν = 3/2, 5/2, 7/2: the prior deviation of wave k falls by these further powers of k.
+FALLS = (0, 1, 2)
+# Iterations of the strengths, and the relative change that ends the iteration.
+MAX_ITERATIONS, TOLERANCE = 200, 0.01
+# Relative prior deviation of the mean of the first mass.
+MASS_DEVIATION = 1e-4
+# Most samples of the data for the mean of the mass.
+SAMPLES = 200
+# Prior deviation, over its value, of the coefficient of a term that the waves replace.
+REPLACED = 1e-6
 
 
 @dataclass(frozen=True)
 class FunctionPosterior:
-    """𝒩(θ, f² covariance) of the numbers of a model with all waves."""
+    """𝒩(θ, f² covariance) of the numbers of a model with all waves; `factor` is f, inf if held-out blocks fail."""
 
     model: ContactLagrangian
     theta: Tensor  # (P,)
     covariance: Tensor  # (P, P) float64, on the CPU
-    factor: float  # f, infinite where left-out blocks of time cannot be foretold
+    factor: float
 
     def std(self, J: Tensor) -> Tensor:
-        """Standard deviations (K,) of values whose derivatives by θ are J (K, P)."""
+        """Standard deviations (K,) of values with derivatives J (K, P) by θ."""
         found = ((J.double().cpu() @ self.covariance) * J.double().cpu()).sum(-1).clamp_min(0).sqrt()
         return found * self.factor if self.factor < math.inf else torch.full_like(found, math.inf)
 
 
 def function_posterior(posterior: Laplace) -> FunctionPosterior:
-    """The posterior of a run's functions; of a model that takes no waves (networks, symmetries) that of its numbers."""
+    """The posterior of a run's functions; for a model without waves (networks, symmetries) of its numbers alone."""
     every = bands(posterior.problem.data, posterior.base, fine=True)
     model = _with_waves(posterior.run.model, every)
     found = None if model is None else _linear(posterior, model, every)
@@ -80,7 +87,7 @@ def mass_at(model: ContactLagrangian, q: Tensor, h: float) -> Tensor:
 
 
 def by_numbers(model: ContactLagrangian, function: Callable[[ContactLagrangian], Tensor], theta: Tensor) -> Tensor:
-    """∂f/∂θ, (..., P), of a function f of a model at the numbers θ (P,), which are those of the model after it."""
+    """∂f/∂θ, (..., P), of a function f of a model at the numbers θ (P,), which are written into the model."""
     numbers, of = ParameterVector(model), _Of(model, function)
     numbers.set(theta)
 
@@ -104,7 +111,7 @@ class _Of(nn.Module):
 
 
 def _with_waves(model: ContactLagrangian, every: list[Band]) -> ContactLagrangian | None:
-    """The model with all waves, which are 0 where it has none; None where its kind takes none."""
+    """The model with all waves, 0 for those it lacks; None if this kind of model has no waves."""
     c, own = model.config, ParameterVector(model)
     if c.networks or c.translations or c.terms or c.level in ("affine", "full"):
         return None
@@ -127,39 +134,51 @@ def _with_waves(model: ContactLagrangian, every: list[Band]) -> ContactLagrangia
 
 @dataclass(frozen=True)
 class _Known:
-    """What data say of numbers, whatever the starts are: ½ (c + 2 bᵀδ + δᵀAδ) at θ + δ; residuals are over a σ."""
+    """The misfit over σ², minimal over the start states: ½ (c + 2 bᵀδ + δᵀAδ) at θ + δ.
+
+    `count` is the number of residuals minus the number of start states, `scale` the derivatives of the logarithm of the
+    first mass; a `robust` loss fixes its own scale.
+    """
 
     A: Tensor  # (P, P)
     b: Tensor  # (P,)
     c: float
-    count: int  # of residuals less starts
-    scale: Tensor  # (P,) derivatives of the logarithm of the first mass
-    robust: bool  # the loss has a scale of its own
+    count: int
+    scale: Tensor  # (P,)
+    robust: bool
 
 
 @dataclass(frozen=True)
 class _Waves:
-    """The prior 𝒩(mean, 1/weight) of numbers less θ; that of waves is times the strength of their function."""
+    """The prior 𝒩(mean, 1/weight) of numbers minus θ; the variance of a wave is times the strength of its function.
+
+    `of` is the index of the function, F = `functions` for other numbers; `rate` is the frequency of a wave over the
+    lowest one of its function, 1 for other numbers.
+    """
 
     mean: Tensor  # (P,)
     weight: Tensor  # (P,)
-    of: Tensor  # (P,) number of the function; F: of none
-    rate: Tensor  # (P,) of a wave over that of the longest one of its function, 1 of others
-    functions: int  # F
+    of: Tensor  # (P,)
+    rate: Tensor  # (P,)
+    functions: int
 
 
 @dataclass(frozen=True)
 class _Likeliest:
-    """The strengths of one prior at which the data are likeliest."""
+    """The strengths of one prior with the highest marginal likelihood.
 
-    likelihood: float  # log marginal likelihood, but for a constant
-    step: Tensor  # (P,) from θ to the posterior's mean
-    weight: Tensor  # (P, P) of the prior
-    variance: float  # of residuals
+    `likelihood` is its logarithm up to a constant, `step` the posterior's mean minus θ, `weight` the inverse covariance
+    of the prior, `variance` that of the residuals.
+    """
+
+    likelihood: float
+    step: Tensor  # (P,)
+    weight: Tensor  # (P, P)
+    variance: float
 
 
 def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> FunctionPosterior | None:
-    """The posterior of a model with all waves, linear about the fit; None where the model cannot be run there."""
+    """The posterior of a model with all waves, linearised at the fit; None if a step fails there."""
     theta, problem = ParameterVector(model).get(), _problem(posterior, model, 2)
     P, d, start = problem.P, problem.d, posterior.path.x[:, 0, : problem.d]
     coarse, fine = (_sums(x, problem.pack(theta, start)) for x in (_problem(posterior, model, 1), problem))
@@ -191,7 +210,7 @@ def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> 
 
 
 def _problem(posterior: Laplace, model: ContactLagrangian, parts: int) -> ShootingProblem:
-    """Each trajectory as one segment, without a prior, in model steps that are so many times shorter than the fit's."""
+    """Each trajectory as one segment, without a prior, with the model steps of the fit divided into `parts`."""
     of = posterior.problem
     grid = segment_grid(of.data, max(of.data.lengths), posterior.base.model_step / parts)
     settings = {"sigma": of.sigma, "freedom": of.freedom, "used": of.used, "compiled": False}
@@ -207,14 +226,14 @@ def _sums(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _prior(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> _Waves:
-    """That of the fit, of all waves, and around 0 of the terms that these stand for."""
+    """The prior of the fit and of all waves, with terms that the waves replace near 0."""
     numbers, data = ParameterVector(model), posterior.problem.data
     spreads = {**posterior.base.spreads, **prior_spreads(every, posterior.base, data.balance, [])}
     keys, known = keys_of(numbers.numbers, model.config), {*numbers.numbers}
     spreads = {key: spread for key, spread in spreads.items() if key in keys or key in known}
     gone = replaced(model.config.features, model.config.drag, model.config.angles)
     theta = numbers.get().tolist()
-    spreads |= {key: LEFT * abs(x) for key, x in zip(keys, theta, strict=True) if key in gone and x}
+    spreads |= {key: REPLACED * abs(x) for key, x in zip(keys, theta, strict=True) if key in gone and x}
     prior = prior_of(model, replace(posterior.base, spreads=spreads), None)
     names = list(dict.fromkeys(band.name.rsplit(" ", 1)[0] for band in every))
     place = {text: names.index(band.name.rsplit(" ", 1)[0]) for band in every for text in band.texts}
@@ -227,11 +246,12 @@ def _prior(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> _
 
 
 def _likeliest(known: _Known, prior: _Waves, fall: int) -> _Likeliest:
-    """The posterior of numbers whose waves k fall as by so many more powers of k, with its strengths and variance."""
-    F, own, fixed = prior.functions, prior.weight * prior.rate ** (2 * fall), known.scale.outer(known.scale) / HELD**2
+    """The posterior with a prior deviation of wave k that falls by `fall` more powers of k."""
+    F, own = prior.functions, prior.weight * prior.rate ** (2 * fall)
+    fixed = known.scale.outer(known.scale) / MASS_DEVIATION**2
     strength, variance, rest = torch.ones(F + 1, dtype=torch.float64), 1.0, known.c
     step, weight, spent = prior.mean, own, torch.zeros_like(own)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         weight = own / strength[prior.of]
         C = inverse_of(known.A / variance + weight.diag() + fixed)
         step = C @ (weight * prior.mean - known.b / variance)
@@ -239,11 +259,12 @@ def _likeliest(known: _Known, prior: _Waves, fall: int) -> _Likeliest:
         rows = torch.stack([spent, (1 - weight * C.diagonal()).clamp_min(0.0)])
         size, told = torch.zeros(2, F + 1, dtype=torch.float64).index_add_(1, prior.of, rows)
         factor = (size + 1) / (told + strength)
-        factor[F] = 1.0  # the prior of numbers that are no waves
+        # Numbers that are no waves keep their prior.
+        factor[F] = 1.0
         strength = strength * factor
         rest = known.c + float(2 * known.b @ step + step @ known.A @ step)
         variance = variance if known.robust else rest / (known.count - float(told.sum()))
-        if float((factor - 1).abs().max()) < SETTLED:
+        if float((factor - 1).abs().max()) < TOLERANCE:
             break
     H, waves = known.A / variance + weight.diag() + fixed, prior.of < F
     size = H.diagonal().sqrt()

@@ -1,8 +1,8 @@
-"""What held-out blocks of time would be missed by, of any set of the numbers of a fit, to first order.
+"""Errors of held-out blocks of time for any subset of the numbers of a fit, to first order.
 
-The motion is linearised once, by all numbers that a model may have; leaving out a block, taking a number in and
-leaving one out are then linear algebra. The start of a segment is told by its other samples or, where all of them are
-left out, by its own. What joints say of parameters is left out.
+The motion is linearised once, by all numbers that a model may have. Leaving out a block, adding a number and removing
+a number are then linear algebra. The start of a segment is estimated from its samples outside the block or, if there
+are none, from all its samples. The joints between segments do not enter.
 """
 
 from __future__ import annotations
@@ -17,22 +17,30 @@ from herglotz.data import Trajectories
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
-BLOCKS = 10  # of time, at least, over all trajectories
-STAY = 20  # first samples of a trajectory, and a tenth of it at most, that are never left out: they tell its start
-RIDGE = 1e-12  # of a unit diagonal: what is added to curvatures, directions of which no sample may tell
+# Least number of blocks of time over all trajectories.
+BLOCKS = 10
+# Leading samples of a trajectory, at most a tenth of it, that are never left out, because they determine its start.
+STAY = 20
+# Added to curvatures with a unit diagonal, which may be singular.
+RIDGE = 1e-12
 
 
 class HeldOut:
-    """A fit that is linear in its numbers, with the states of segments following."""
+    """A fit linearised at `theta`; the start states of segments follow the numbers.
+
+    `fitted` are the numbers at their optimum, which do not move unless a block is left out (None: all). `leaving` is
+    the step of a number that is left out (None: 0). `waves` are the prior weights of the waves of functions, 0 for
+    other numbers.
+    """
 
     def __init__(
         self,
         problem: ShootingProblem,
         path: Path,
-        theta: Tensor,  # (P,) where the motion was linearised
-        fitted: Sequence[int] | None = None,  # numbers that have been fitted, and would stay were no block left out
-        leaving: Tensor | None = None,  # (P,) by how much numbers move that are left out; 0 without it
-        waves: Tensor | None = None,  # (P,) weights of the prior of the waves of functions; 0 of other numbers
+        theta: Tensor,  # (P,)
+        fitted: Sequence[int] | None = None,
+        leaving: Tensor | None = None,  # (P,)
+        waves: Tensor | None = None,  # (P,)
     ):
         self.block, self.sigma, P = blocks(problem.data).to(theta.device), problem.sigma, problem.P
         self.complete = problem.data.complete
@@ -42,7 +50,7 @@ class HeldOut:
         by = (problem.weight * problem.root_weights(problem.weight * r))[..., None]
         slopes = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
         order = torch.tensor([*range(P), P + problem.d, *range(P, P + problem.d)], device=r.device)
-        rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d): numbers, residual, start
+        rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d) of numbers, residual, start
         segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
         piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
         grams = _grams(rows * by, of, len(piece))  # (Q, P + 1 + d, P + 1 + d)
@@ -50,23 +58,26 @@ class HeldOut:
         self.following, each = _following(whole, P), _reduced(whole, P)
         _, A, b = problem.prior_equations(theta)
         self.equations = (each.sum(0) + torch.cat([A, b[:, None]], 1)).repeat(int(self.block.max()) + 2, 1, 1)
-        if not problem.jointed:  # else joints hold a fit whose samples alone would send it on
+        # With joints the samples alone have another optimum.
+        if not problem.jointed:
             self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
-        self.rows = rows[..., : P + 1].clone()  # [J, r] where a block is left out and the states follow
+        # [J, r] with the states following, each sample for the fit without its block.
+        self.rows = rows[..., : P + 1].clone()
         for k in range(len(self.equations) - 1):
             mine = (piece[:, 1] == k).nonzero()[:, 0]
             s, own = piece[mine, 0], grams[mine]
             kept = whole[s] - own
-            gone = torch.isin(s, piece[piece[:, 1] != k, 0], invert=True)[:, None, None]  # nothing of it is left
+            # Segments that lie inside the block.
+            gone = torch.isin(s, piece[piece[:, 1] != k, 0], invert=True)[:, None, None]
             self.equations[k] += torch.where(gone, 0.0, _reduced(kept, P)).sum(0) - each[s].sum(0)
             at, place = (self.block == k).nonzero()[:, 0], torch.zeros(len(piece), dtype=torch.long, device=r.device)
             place[mine] = torch.arange(len(mine), device=r.device)
             self.rows[at] -= rows[at][..., P + 1 :] @ _following(torch.where(gone, own, kept), P)[place[of[at]]]
 
     def residuals(self, sets: Sequence[Sequence[int]]) -> Tensor:
-        """(C, N, n) over the balance, of C sets of numbers; NaN where a set has no solution.
+        """Held-out residuals over the balance, (C, N, n), for C sets of numbers; NaN if a set has no solution.
 
-        Samples that are in no block have their own residuals.
+        Samples in no block keep the residuals of the fit.
         """
         P = self.rows.shape[-1] - 1
         out = self.rows[..., P].repeat(len(sets), 1, 1)
@@ -76,12 +87,12 @@ class HeldOut:
         return out * self.sigma
 
     def steps(self, own: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """By how much numbers (P,) and starts of segments (S, d) move in a model of these numbers; NaN: no solution."""
+        """Steps of the numbers (P,) and of the starts of segments (S, d) in a model of `own`; NaN: no solution."""
         ((step,),) = self._steps(self.equations[-1:], [own])
         return step, -self.following @ torch.cat([step, step.new_ones(1)])
 
     def _steps(self, equations: Tensor, sets: Sequence[Sequence[int]]) -> Tensor:
-        """By how much all numbers move by each of these equations (B, P, P + 1) with each of C sets, (B, C, P)."""
+        """Steps of all numbers, (B, C, P), for each of the equations (B, P, P + 1) and each of C sets."""
         P, index = self.rows.shape[-1] - 1, self._index(sets)
         inside = torch.zeros(len(sets), P + 1, dtype=torch.bool, device=index.device).scatter_(1, index, True)[:, :P]
         moved = torch.where(inside, 0.0, self.leaving)  # (C, P)
@@ -91,9 +102,9 @@ class HeldOut:
         return moved.repeat(len(equations), 1, 1).scatter_add(2, at, torch.where(index < P, x, 0.0))
 
     def told(self, sets: Sequence[Sequence[int]]) -> Tensor:
-        """How much of each number the data tell, (C, P); 0 of those that are in no set, 1 of those that are no waves.
+        """The effective share of each number, (C, P): 1 − σ²/τ² for a wave with prior and posterior deviations τ and σ.
 
-        Of a number with the prior deviation τ and the posterior one σ that is 1 − σ²/τ² (MacKay 1992).
+        0 for a number outside the set, 1 for a number of the set that is no wave (MacKay 1992).
         """
         P, index = self.rows.shape[-1] - 1, self._index(sets)
         found = torch.zeros(len(sets), P + 1, dtype=self.rows.dtype, device=index.device).scatter_(1, index, 1.0)[:, :P]
@@ -105,22 +116,22 @@ class HeldOut:
         return found
 
     def _index(self, sets: Sequence[Sequence[int]]) -> Tensor:
-        """(C, k) numbers of each set, and behind the last one P, which is none."""
+        """The numbers of each set, (C, k), padded with P, which is no number."""
         P, width = self.rows.shape[-1] - 1, max(len(own) for own in sets)
         padded = [[*own, *[P] * (width - len(own))] for own in sets]
         return torch.tensor(padded, device=self.rows.device).reshape(len(sets), width)
 
 
 def _factors(equations: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cholesky factors (B, C, k, k) of the curvatures of sets scaled to a unit diagonal, the scales, and places.
+    """Cholesky factors (B, C, k, k) of the curvatures of sets scaled to a unit diagonal, the scales, and the places.
 
-    Of a curvature that is none the factor is NaN.
+    The factor is NaN if the curvature is not positive definite.
     """
     P = equations.shape[1]
     A = equations[..., :P]
     size = A.diagonal(dim1=-2, dim2=-1)
     size = torch.where(size > 0, size, 1.0).sqrt()
-    A = pad((A / size[..., None] / size[..., None, :]).nan_to_num(nan=-1.0), (0, 1, 0, 1))  # P is no number
+    A = pad((A / size[..., None] / size[..., None, :]).nan_to_num(nan=-1.0), (0, 1, 0, 1))
     A, there = A[:, index[:, :, None], index[:, None, :]], index < P
     A.diagonal(dim1=-2, dim2=-1).add_(torch.where(there, RIDGE, 1.0))
     factor, info = torch.linalg.cholesky_ex(A)
@@ -129,7 +140,7 @@ def _factors(equations: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def blocks(data: Trajectories) -> Tensor:
-    """The block of time of every sample, (N,); −1: it stays. Every trajectory has two at least."""
+    """The block of time of every sample, (N,); −1: never left out. Every trajectory has at least two blocks."""
     each, parts, first = max(2, -(-BLOCKS // len(data))), [], 0
     for length in data.lengths:
         part = torch.arange(length) * each // length + first
@@ -140,14 +151,14 @@ def blocks(data: Trajectories) -> Tensor:
 
 
 def _grams(rows: Tensor, of: Tensor, count: int) -> Tensor:
-    """Σ row rowᵀ of each piece, (Q, w, w): pieces are runs of samples."""
+    """Σ row rowᵀ of each piece, (Q, w, w); a piece is a run of consecutive samples."""
     counts = torch.bincount(of, minlength=count).tolist()
     parts = [part.flatten(0, 1) for part in rows.split(counts)]
     return torch.stack([part.T @ part for part in parts])
 
 
 def _following(grams: Tensor, P: int) -> Tensor:
-    """T⁻¹ [B, b_x] of each segment alone, (S, d, P + 1): by how much its start moves with a number, and by itself."""
+    """T⁻¹ [B, b_x] of each segment, (S, d, P + 1): minus (derivatives of its start by the numbers, own step)."""
     T = grams[:, P + 1 :, P + 1 :]
     size = T.diagonal(dim1=-2, dim2=-1)
     T = T + torch.diag_embed(RIDGE * size + torch.finfo(T.dtype).tiny ** 0.5)
@@ -155,5 +166,5 @@ def _following(grams: Tensor, P: int) -> Tensor:
 
 
 def _reduced(grams: Tensor, P: int) -> Tensor:
-    """[C − Bᵀ T⁻¹ B, b_θ − Bᵀ T⁻¹ b_x] of each segment alone, its start being eliminated, (S, P, P + 1)."""
+    """[C − Bᵀ T⁻¹ B, b_θ − Bᵀ T⁻¹ b_x] of each segment, with its start eliminated, (S, P, P + 1)."""
     return grams[:, :P, : P + 1] - grams[:, :P, P + 1 :] @ _following(grams, P)

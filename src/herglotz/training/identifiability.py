@@ -1,8 +1,8 @@
-"""Combinations of physical parameters that the data do not determine, because one can replace another.
+"""Combinations of physical parameters that the data do not determine, because one parameter can replace another.
 
-With A = JᵀJ of the fit, prior included, the information that the data hold on the parameters φ of interest, whatever
-the networks and the states are, is the Schur complement M = A_φφ − A_φr A_rr⁻¹ A_rφ less the prior of φ. Its small
-eigenvalues are what one of them can make up for in another (`herglotz.training.trades`).
+With A = JᵀJ of the fit, prior included, the information of the data on the parameters φ of interest, marginal over all
+other unknowns r, is the Schur complement M = A_φφ − A_φr A_rr⁻¹ A_rφ minus the prior of φ. Eigenvectors with small
+eigenvalues are the combinations (`herglotz.training.trades`).
 """
 
 from __future__ import annotations
@@ -19,10 +19,7 @@ PHYSICAL = ("kinetic.log", "kinetic.off", "potential.stiffness", "potential.tilt
 
 
 def traded(posterior: Laplace) -> list[Trade]:
-    """The combinations of physical parameters that these data do not determine, the worst first; [] if there is none.
-
-    `posterior` is that of a fit (`herglotz.training.laplace`).
-    """
+    """The combinations of physical parameters that the data of a fit do not determine, the worst first; [] if none."""
     names = posterior.problem.parameters.numbers
     rows = torch.tensor([i for i, name in enumerate(names) if name.startswith(PHYSICAL)], dtype=torch.long)
     M = information_of(posterior, rows)
@@ -30,10 +27,7 @@ def traded(posterior: Laplace) -> list[Trade]:
 
 
 def information_of(posterior: Laplace, rows: Tensor) -> Tensor:
-    """What the data alone say of these parameters, whatever the others and the starts are; see the head of this module.
-
-    `rows` are their places, (K,); returns (K, K).
-    """
+    """The information M (K, K) of the data on the parameters at the places `rows` (K,); see the head of this module."""
     A = posterior.information
     rest = torch.ones(len(A), dtype=torch.bool)
     rest[rows] = False
@@ -45,10 +39,7 @@ def information_of(posterior: Laplace, rows: Tensor) -> Tensor:
 
 
 def joint_of(posterior: Laplace, least: float) -> Joint:
-    """What the data say of all numbers together, if they are known no better than to `least`, in units of q.
-
-    On the CPU, wherever the fit was: these are a few numbers that words are made of.
-    """
+    """The joint posterior of all numbers, on the CPU, if positions are precise only to `least`, in units of q."""
     P, sigma = len(posterior.theta), posterior.sigma
     rounding = max(1.0, least / (sigma * posterior.inflation)) ** 2
     alone = posterior.information.diagonal()[:P].clamp_min(1e-300).rsqrt() * max(1.0, least / sigma)

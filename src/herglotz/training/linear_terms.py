@@ -1,4 +1,4 @@
-"""The linear problem that a search for named terms starts from: smoothed positions, every candidate, then pruned."""
+"""The linear start of a search for named terms: all candidates fitted to smoothed positions, then pruned."""
 
 from __future__ import annotations
 
@@ -19,27 +19,34 @@ from herglotz.training.linear_start import SHARED, LinearFit
 from herglotz.training.named_terms import MOVING, STILL, NamedTerms, by_term, central, chains, holders, own_terms
 from herglotz.training.pruning import prune
 
-ROWS = 4000  # triples in the linear problem
+# Most triples in the linear problem.
+MAX_TRIPLES = 4000
 SPRINGS = ("potential.stiffness", "potential.tilt")
-SINGULAR, SMALLER = 0.1, 20  # least eigenvalue of a mass matrix of unit diagonal; tenths taken off until it is larger
-ENOUGH = 5  # residuals for each coefficient: fewer leave its smallest singular value to noise
+# Least eigenvalue of a mass matrix scaled to a unit diagonal, and the most reductions by a tenth to reach it.
+MIN_EIGENVALUE, MAX_REDUCTIONS = 0.1, 20
+# Least number of residuals per coefficient: with fewer, noise determines the smallest singular value.
+MIN_RESIDUALS = 5
 
 
 class LinearStart(NamedTuple):
-    """What a linear problem gives a fit to start from."""
+    """The solution of a linear problem: terms, and values by the name of a term or of a parameter.
+
+    `error` is the RMS of J⁻¹R over the triples, in units of q; `size` the number of all coefficients, with masses,
+    springs and friction.
+    """
 
     terms: NamedTerms
-    values: dict  # by the name of a term or of a parameter
-    error: float  # J⁻¹R, RMS over the triples, in units of q
-    size: int  # coefficients of the linear problem, those of masses, springs and friction included
+    values: dict
+    error: float
+    size: int
 
 
 def start_of(data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials) -> LinearStart | None:
-    """The likeliest start of all candidates or of the fewer terms of chains of joints; None where no mass fits.
+    """The likeliest start, from all candidates or from the smaller families of chains; None if no mass fits.
 
-    The Bayesian information criterion decides: of many candidates noise determines some so poorly that no mass fits,
-    or that they stay for nothing. The best start with one power of the distance stands in for the first where it errs
-    less, or as little with fewer coefficients.
+    The Bayesian information criterion chooses. With many candidates noise leaves some so poorly determined that no mass
+    fits, or that useless terms stay. The best start with one power of the distance replaces the chosen one if its error
+    is smaller, or about equal with fewer coefficients.
     """
     families = (every, *(replace(every.only(x.names), apart=x.apart) for x in chains(data)))
     one_of = central(data, every)
@@ -53,7 +60,7 @@ def start_of(data: Trajectories, base: Baseline, every: NamedTerms, local: Local
 
 
 def _better(first: LinearStart, other: LinearStart) -> bool:
-    """Whether the first start errs less, by more than a 20th where it has more coefficients."""
+    """True if the error of the first start is smaller; with more coefficients it has to be smaller by a twentieth."""
     return first.error * (MARGIN if first.size > other.size else 1 / MARGIN) < other.error
 
 
@@ -67,13 +74,15 @@ class LinearTerms:
         self.overlap = max(1.0, local.width / 2)
         self.fit = self._problem(local)
         terms = {parameter: iter(names) for parameter, names in self.held.items()}
-        self.names = [next(terms[x]) if x in terms else x for x in self.fit.names]  # of terms, or of parameters
-        self.count = max(3, int(self.fit.R[..., 0].numel() / self.overlap))  # residuals that do not say the same
+        # Names of the columns: terms, or parameters.
+        self.names = [next(terms[x]) if x in terms else x for x in self.fit.names]
+        # Number of independent residuals.
+        self.count = max(3, int(self.fit.R[..., 0].numel() / self.overlap))
 
     def start(self, of: NamedTerms) -> LinearStart | None:
-        """The terms of a family that the linear problem needs, their values and its error; None where no mass fits."""
+        """The terms of a family that the linear problem needs, with their values; None if no mass fits."""
         fit, columns = self.fit, self._columns(of)
-        if fit.R[..., 0].numel() < ENOUGH * int(columns.sum()):
+        if fit.R[..., 0].numel() < MIN_RESIDUALS * int(columns.sum()):
             return None
         x = fit.solve(columns)
         if float(x[0]) == 0:
@@ -91,38 +100,38 @@ class LinearTerms:
         return None
 
     def likeliest(self, starts: Sequence[LinearStart]) -> int:
-        """The place of the start that the Bayesian information criterion prefers; 0 of none."""
+        """The place of the start with the best Bayesian information criterion."""
         of = [self.count * math.log(max(x.error, 1e-300)) + x.size * math.log(self.count) / 2 for x in starts]
-        return min(range(len(of)), key=of.__getitem__, default=0)
+        return min(range(len(of)), key=of.__getitem__)
 
     def _regular(self, x: Tensor) -> Tensor:
-        """With masses that turn with angles made smaller until no mass matrix of the data is nearly singular.
+        """The coefficients with smaller masses that depend on angles, until no mass matrix is nearly singular.
 
-        Smoothing may leave these too large, and no step is solved from there. x stays where other masses are the cause.
+        Smoothing may make these masses too large for steps to have a solution. If other masses are the cause, keep x.
         """
         less, moving = x.clone(), torch.tensor([name == MOVING for name in self.fit.names])
-        for _ in range(SMALLER if bool(moving.any()) else 0):
+        for _ in range(MAX_REDUCTIONS if bool(moving.any()) else 0):
             M = -(self.fit.J @ less) * x[0].sign()
             size = M.diagonal(dim1=-2, dim2=-1).abs().clamp_min(1e-300).sqrt()
             M = (M + M.mT) / 2 / size[:, :, None] / size[:, None, :]
-            if bool(torch.isfinite(M).all()) and float(torch.linalg.eigvalsh(M).min()) > SINGULAR:
+            if bool(torch.isfinite(M).all()) and float(torch.linalg.eigvalsh(M).min()) > MIN_EIGENVALUE:
                 return less
             less[moving] *= 0.9
         return x
 
     def _problem(self, local: LocalPolynomials) -> LinearFit:
-        """The linear problem of every candidate over the smoothed samples."""
+        """The linear problem of all candidates over the smoothed samples."""
         t, u = smooth_triples(self.data, local)
-        if len(t) > ROWS:
-            rows = torch.linspace(0, len(t) - 1, ROWS).round().long()
-            t, u = t.spread_out(ROWS), None if u is None else u[rows]
+        if len(t) > MAX_TRIPLES:
+            rows = torch.linspace(0, len(t) - 1, MAX_TRIPLES).round().long()
+            t, u = t.spread_out(MAX_TRIPLES), None if u is None else u[rows]
         features, dry = (*self.held[STILL], *self.held[MOVING]), self.base.speed if self.all.dry else ()
         return LinearFit.of(self.data.angles, features, t, self.data.balance, drag=self.all.drag, dry=dry, u=u)
 
     def _pruned(self, of: NamedTerms, columns: Tensor, x: Tensor, r: Tensor) -> tuple[NamedTerms, Tensor, Tensor]:
-        """The terms whose absence the errors r would show, their columns, and their coefficients without the others.
+        """The terms that the errors r justify, the remaining columns, and coefficients refitted without the others.
 
-        Smoothed samples that share half a window say the same: N is over the overlap.
+        Samples that share half a smoothing window are dependent: the number of samples is divided by the overlap.
         """
         fit, overlap = self.fit, self.overlap
         X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
@@ -148,7 +157,7 @@ class LinearTerms:
         return values | {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
 
     def _columns(self, of: NamedTerms) -> Tensor:
-        """Columns of a family, and all masses, springs and friction of joints; none between lengths, or `apart`."""
+        """Columns of a family, masses, springs and friction; joints are coupled unless `apart`."""
         joints = any(self.data.angles) and not of.apart
 
         def used(name: str) -> bool:
@@ -159,7 +168,7 @@ class LinearTerms:
         return torch.tensor([used(name) for name in self.names])
 
     def _linear_places(self, columns: Tensor) -> dict[str, list[int]]:
-        """Columns of each term among those that are used, the first mass not counted."""
+        """Places of each term among the columns in use, without the first mass."""
         own = {parameter: term for term, (parameter, _) in self.own.items()}
         left = [own.get(self.names[k], self.names[k]) for k in columns.nonzero()[1:, 0].tolist()]
         at: dict[str, list[int]] = {}

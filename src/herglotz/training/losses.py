@@ -1,8 +1,8 @@
-"""Losses for a training loop of one's own: functions of tensors, differentiable in all that L_d is made of.
+"""Losses for your own training loop: functions of tensors, differentiable by all parameters of L_d.
 
-`herglotz_residual` compares three neighbouring positions at a time and needs no state; `shooting` compares whole
-trajectories, whose starts are unknowns beside the parameters, as noise of q asks for: a residual of noisy positions
-is least for another model than that of the motion.
+`herglotz_residual` compares three neighbouring positions and needs no state. `shooting` compares whole trajectories,
+whose start states are unknowns beside the parameters. Noisy positions need `shooting`: noise biases the minimum of the
+residual.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ def herglotz_residual(
     u: Tensor | None = None,  # (..., K, m)
     preconditioned: bool = True,
 ) -> Tensor:
-    """Return J⁻¹R at every inner sample of recorded motions: the error of each next position, to first order.
+    """J⁻¹R at every inner sample of recorded motions: the error of each next position, to first order.
 
     R_k = D1 L_d(q_k, q_{k+1}, s_k) + c_k D2 L_d(q_{k−1}, q_k, s_{k−1}), J = ∂R_k/∂q_{k+1}, which is the mixed Hessian M
-    where R = 0, and s_{k+1} = s_k + L_d(q_k, q_{k+1}, s_k). Train on the mean of its square. R alone is no loss: an L_d
-    times 0.1 has a tenth of it and the same motion, so that an optimiser shrinks L_d and learns nothing; J⁻¹R does not
+    where R = 0, and s_{k+1} = s_k + L_d(q_k, q_{k+1}, s_k). Train on the mean of (J⁻¹R)². R alone is no loss: 0.1 L_d
+    has a tenth of the residual and the same motion, so an optimiser shrinks L_d and learns nothing; J⁻¹R does not
     change. Minibatches are windows of at least three samples, stacked along the first axis.
 
     Parameters
     ----------
     L_d
-        A module or function L_d(q0, q1, s0, h) → (...); with inputs one that has `at(u)`.
+        A module or function L_d(q0, q1, s0, h) → (...); with inputs it needs a method `at(u)`.
     q
         (..., K+1, n) positions, in their own units, K ≥ 2, of any float dtype and device.
     h
         () or (..., K) time steps between them, in the unit of time: `t.diff(dim=-1)`.
     s0
-        (...) action at the first sample, in the unit of L_d; left out: 0. Where L_d depends on s by more than −γs, make
-        it a parameter that is trained, too.
+        (...) action at the first sample, in the unit of L_d; default 0. If L_d depends on s by more than −γs, train s0
+        as a parameter.
     u
         (..., K, m) input of each step, in its own units.
     preconditioned
@@ -67,11 +67,11 @@ def herglotz_residual(
     Raises
     ------
     InputError
-        If shapes do not fit, a number is not finite, h is not positive, or J is singular: L_d does not join q0 to q1.
+        If shapes do not fit, a number is not finite, h is not positive, or J is singular: L_d does not couple q0 to q1.
 
     Source: discrete Herglotz equations; erratum E4 of `docs/mathematics.md`.
     """
-    h, s0, u = _checked(q, h, s0, u, 2)
+    h, s0, u = _checked(q, h, s0, u)
     q0, q1 = q[..., :-1, :], q[..., 1:, :]
     s, axis = _action(L_d, q, h, s0, u), q.ndim - 2
     P = partials(driven_by(L_d, u), q0, q1, s, h, 2)
@@ -79,12 +79,17 @@ def herglotz_residual(
     after = P.map(lambda x: x.narrow(axis, 1, h.shape[-1] - 1))
     R = momentum_residual(after, p)
     r = solve(momentum_jacobian(after, p), R) if preconditioned else R
-    _refuse_infinite(r)
+    if len(bad := (~torch.isfinite(r)).nonzero()):
+        *sample, k, _ = bad[0].tolist()
+        raise InputError(
+            f"J = ∂R/∂q1 is singular, or L_d not finite, at step {k + 1} of window {tuple(sample)}: a discrete "
+            "Lagrangian must join q0 to q1, as m |q1 - q0|² / 2h does; add this term, or start from smaller weights"
+        )
     return r
 
 
 def _action(L_d: DiscreteLagrangian, q: Tensor, h: Tensor, s0: Tensor, u: Tensor | None) -> Tensor:
-    """The action at the start of every step, (..., K): step after step, unless no derivative of L_d depends on it."""
+    """The action at the start of every step, (..., K); s0 throughout if no derivative of L_d depends on s."""
     q0, q1, L = q[..., :-1, :], q[..., 1:, :], driven_by(L_d, u)
     with torch.no_grad():
         first = s0[..., None].expand(h.shape).contiguous()
@@ -102,30 +107,37 @@ def _action(L_d: DiscreteLagrangian, q: Tensor, h: Tensor, s0: Tensor, u: Tensor
 
 
 class Starts(NamedTuple):
-    """The first two positions of each of S segments and the action at the first, to be trained beside L_d."""
+    """The first two positions of each of S segments and the action at the first: unknowns to train beside L_d.
 
-    q0: Tensor  # (..., S, n) at the samples 0, length, 2 length, …
-    q1: Tensor  # (..., S, n) one sample later
+    q0 are the positions at the samples 0, length, 2 length, …; q1 the positions one sample later.
+    """
+
+    q0: Tensor  # (..., S, n)
+    q1: Tensor  # (..., S, n)
     s: Tensor  # (..., S)
 
 
 class Shooting(NamedTuple):
-    """What segments of motion miss, in units of q."""
+    """Errors of segments of motion, in units of q.
 
-    misfit: Tensor  # (..., K+1, n) model less recording, at every sample
-    joints: Tensor  # (..., S−1, 2n+1) end of a segment less the start of the next: two positions, and s (rescaled)
+    `misfit` is model minus recording at every sample; `joints` is the end of a segment minus the start of the next
+    (two positions, and s rescaled).
+    """
+
+    misfit: Tensor  # (..., K+1, n)
+    joints: Tensor  # (..., S−1, 2n+1)
 
     @property
     def loss(self) -> Tensor:
-        """(Σ misfit² + Σ joints²) over the number of recorded numbers, ()."""
+        """(Σ misfit² + Σ joints²) / (number of recorded values), ()."""
         return (self.misfit.square().sum() + self.joints.square().sum()) / self.misfit.numel()
 
 
 def starts(
     q: Tensor,  # (..., K+1, n)
-    length: int,  # steps of a segment
+    length: int,
 ) -> Starts:
-    """Return the starts of segments from the recorded positions, s = 0, as leaves that want gradients.
+    """The starts of segments from the recorded positions, with s = 0, as leaf tensors that require gradients.
 
     Source: section 1 of `docs/mathematics.md`: two positions and s are a state.
 
@@ -134,7 +146,7 @@ def starts(
     q
         (..., K+1, n) positions, in their own units, K ≥ 2.
     length
-        Steps of a segment; more than K − 1: one segment, the whole recording. The last one takes what is left.
+        Steps of a segment; more than K − 1: one segment, the whole recording. The last segment takes the rest.
 
     Returns
     -------
@@ -146,7 +158,7 @@ def starts(
     InputError
         If q has fewer than three samples, or length is not positive.
     """
-    _checked(q, 1.0, None, None, 2)
+    _checked(q, 1.0, None, None)
     refuse({f"length must be a whole number >= 1, got {length}": length < 1})
     at = torch.arange(max((q.shape[-2] - 2) // length, 1), device=q.device) * length
     found = Starts(q[..., at, :], q[..., at + 1, :], q.new_zeros((*q.shape[:-2], len(at))))
@@ -157,17 +169,17 @@ def shooting(
     L_d: DiscreteLagrangian,
     q: Tensor,  # (..., K+1, n)
     h: Tensor | float,  # () or (..., K)
-    starts: Starts,  # S segments, of `starts`
+    starts: Starts,
     *,
     u: Tensor | None = None,  # (..., K, m)
-    length: int | None = None,  # that of `starts`
+    length: int | None = None,
 ) -> Shooting:
-    """Return what motions of L_d over segments miss of a recording, and of the start of the next (multiple shooting).
+    """Errors of segments of motions of L_d against a recording, and against the start of the next (multiple shooting).
 
-    Each segment starts from two positions and an action of its own, (q1, p1, s1) = FL⁺(q0, q1, s), and steps by
-    D1 L_d + c p = 0. Train L_d and the starts together on `.loss`, segments short at first; one segment is the whole
-    trajectory, without joints. All steps of all segments are solved at once, by Newton's method from the recorded
-    positions; gradients come by the implicit-function theorem, once.
+    Each segment has its own start, two positions and an action, (q1, p1, s1) = FL⁺(q0, q1, s), and steps by
+    D1 L_d + c p = 0. Train L_d and the starts together on `.loss`, with short segments first; a single segment is the
+    whole trajectory, without joints. Newton's method solves all steps of all segments at once, from the recorded
+    positions; the implicit function theorem gives the gradients.
 
     Parameters
     ----------
@@ -178,11 +190,11 @@ def shooting(
     h
         () or (..., K) time steps between them, in the unit of time.
     starts
-        Of `starts(q, length)`.
+        S segments, from `starts(q, length)`.
     u
         (..., K, m) input of each step, in its own units.
     length
-        Steps of a segment, as there; left out: one segment.
+        Steps of a segment, as for `starts`; default: one segment.
 
     Returns
     -------
@@ -194,11 +206,11 @@ def shooting(
     InputError
         If shapes do not fit, or as `herglotz_residual`.
     StepError
-        If a step has no solution: shorter segments, or a fit of `herglotz_residual` first, lead there.
+        If a step has no solution. Use shorter segments, or first train on `herglotz_residual`.
 
     Source: multiple shooting (Bock 1984) on Φ̃ of section 1 of `docs/mathematics.md`.
     """
-    h, _, u = _checked(q, h, None, u, 2)
+    h, _, u = _checked(q, h, None, u)
     K, (*batch, S, n) = h.shape[-1], starts.q0.shape
     length = min(K - 1 if length is None else length, K - 1)
     fitting = max((K - 1) // length, 1) == S and tuple(batch) == tuple(q.shape[:-2]) and n == q.shape[-1]
@@ -206,7 +218,7 @@ def shooting(
             "make them by starts(q, length), with the same length": not fitting})  # fmt: skip
     in_first, whole = slice(0, (S - 1) * length + 1, length), slice(1, S * length + 1)
     start = Stepper(L_d).init(*starts, h=h[..., in_first], u=None if u is None else u[..., in_first, :])
-    cut = lambda x, axis: x.unflatten(axis, (S, length))  # noqa: E731  into segments
+    cut = lambda x, axis: x.unflatten(axis, (S, length))  # noqa: E731
     near = q[..., 1 : S * length + 2, :].unfold(-2, length + 1, length).mT
     x = _motions(L_d, start.joined, cut(h[..., whole], -1), None if u is None else cut(u[..., whole, :], -2), near)
     parts = [torch.cat([starts.q0[..., None, :], x[..., : length - 1, :n]], -2).flatten(-3, -2), x[..., -1, -2:, :n]]
@@ -219,7 +231,7 @@ def shooting(
 def _motions(L_d: DiscreteLagrangian, start: Tensor, h: Tensor, u: Tensor | None, near: Tensor) -> Tensor:
     """The states (..., K+1, 2n+1) of motions from `start` (..., 2n+1), with their derivatives.
 
-    All steps at once, from the positions `near` (..., K+1, n); one after the other where that does not converge.
+    All steps are solved at once, from the positions `near` (..., K+1, n); one by one if that does not converge.
     """
     K, d = h.shape[-1], start.shape[-1]
     first, steps = start.reshape(-1, d), h.reshape(-1, K)
@@ -236,7 +248,7 @@ def _motions(L_d: DiscreteLagrangian, start: Tensor, h: Tensor, u: Tensor | None
 
 
 def _joints(x: Tensor, starts: Starts) -> Tensor:
-    """End of each segment less the start of the next; s by the spread of q over its own change along segments."""
+    """End of each segment minus the start of the next; s is scaled by (spread of q) / (change of s along segments)."""
     q, s = x[..., : starts.q0.shape[-1]], x[..., -1]
     ends = q[..., :-1, :, :]
     positions = [ends[..., -2, :] - starts.q0[..., 1:, :], ends[..., -1, :] - starts.q1[..., 1:, :]]
@@ -246,15 +258,13 @@ def _joints(x: Tensor, starts: Starts) -> Tensor:
     return torch.cat([*positions, ((s[..., :-1, -2] - starts.s[..., 1:]) * by)[..., None]], -1)
 
 
-def _checked(
-    q: Tensor, h: Tensor | float, s0: Tensor | None, u: Tensor | None, least: int
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """H (..., K), s0 (...) and u, as the losses take them."""
+def _checked(q: Tensor, h: Tensor | float, s0: Tensor | None, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Check the arguments of a loss and expand them: h (..., K), s0 (...) and u (..., K, m)."""
     refuse({f"q must be a tensor (..., K+1, n), got a {type(q).__name__}; torch.as_tensor makes one":
             not isinstance(q, Tensor)})  # fmt: skip
     refuse({
-        f"q needs shape (..., K+1, n) with at least {least + 1} samples, got {tuple(q.shape)}; "
-        "one coordinate is q[:, None]": q.ndim < 2 or q.shape[-2] <= least,
+        f"q needs shape (..., K+1, n) with at least 3 samples, got {tuple(q.shape)}; "
+        "one coordinate is q[:, None]": q.ndim < 2 or q.shape[-2] < 3,
         f"q must hold float numbers, got {q.dtype}; convert it with .double()": not q.is_floating_point(),
     })  # fmt: skip
     if len(bad := (~torch.isfinite(q)).nonzero()):
@@ -273,15 +283,6 @@ def _checked(
 
 
 def _fits(shape: torch.Size | tuple[int, ...], whole: tuple[int, ...]) -> bool:
-    """Whether a shape spreads to the whole one."""
+    """True if a shape broadcasts to the shape `whole`."""
     short = len(shape) <= len(whole)
     return short and all(a in (1, b) for a, b in zip(reversed(shape), reversed(whole), strict=False))
-
-
-def _refuse_infinite(r: Tensor) -> None:
-    if len(bad := (~torch.isfinite(r)).nonzero()):
-        *sample, k, _ = bad[0].tolist()
-        raise InputError(
-            f"J = ∂R/∂q1 is singular, or L_d not finite, at step {k + 1} of window {tuple(sample)}: a discrete "
-            "Lagrangian must join q0 to q1, as m |q1 - q0|² / 2h does; add such a term, or start from smaller weights"
-        )

@@ -1,4 +1,4 @@
-"""`Run.rollout`: numbers in, numpy arrays out."""
+"""`Run.rollout`: a free motion of the model as numpy arrays."""
 
 from __future__ import annotations
 
@@ -27,22 +27,21 @@ Numbers = float | Sequence | np.ndarray | Tensor
 
 @dataclass(frozen=True, repr=False)
 class Motion:
-    """A motion of a model as numpy arrays: K + 1 samples, the start first. Everything after a failed step is NaN.
+    """A motion of a model as numpy arrays: K + 1 samples with the start first. All values after a failed step are NaN.
 
     Parameters
     ----------
     t, q, v
-        (K+1,) time; (..., K+1, n) position and velocity, in the units of the data and these over that of t. v is NaN
-        where p belongs to no velocity (`Stepper.velocity`).
+        (K+1,) time; (..., K+1, n) position and velocity, in the units of the data and these over the unit of t. v is
+        NaN if no velocity belongs to p (`Stepper.velocity`).
     p, s
-        (..., K+1, n) momentum, of which the first mass is 1, and (..., K+1) action, in the units of
-        `herglotz.State`.
+        (..., K+1, n) momentum, for which the first mass is 1, and (..., K+1) action, in the units of `herglotz.State`.
     status
-        (..., K) of every step, dimensionless, 0 where it was solved (`herglotz.Status`).
+        (..., K) status of every step, 0 if it was solved (`herglotz.Status`), dimensionless.
     names, units, time_unit
-        Of the coordinates, and of t.
+        Names and units of the coordinates, and the unit of t.
     beyond
-        What leaves the range of the fit: the model extrapolates there.
+        Quantities that leave the range of the fit, where the model extrapolates.
     """
 
     t: np.ndarray
@@ -58,7 +57,7 @@ class Motion:
 
     @property
     def ok(self) -> bool:
-        """Whether every step was solved."""
+        """True if every step was solved."""
         return not self.status.any()
 
     def __repr__(self) -> str:
@@ -106,7 +105,7 @@ def free_motion(
 def _given(
     run: FittedRun, q0: Numbers, moving: tuple[Numbers | None, Numbers | None], s0: Numbers | None, h: Tensor
 ) -> State:
-    """The state of a position, and a velocity or a momentum."""
+    """The state from a position, and a velocity or a momentum."""
     like, n, name = run.last_fitted()[0].q, run.data.dof, "p0" if moving[0] is None else "v0"
     q, x = (torch.atleast_1d(torch.as_tensor(y, dtype=like.dtype)) for y in (q0, moving[name == "p0"]))
     if q.shape[-1] != n or x.shape != q.shape:
@@ -120,7 +119,7 @@ def _given(
 def _inputs(
     run: FittedRun, inputs: Any, span: tuple[float, int, float | None], recording: tuple[int, bool]
 ) -> tuple[Tensor | None, Tensor]:
-    """Inputs (K, m) and times (K + 1,): recorded ones at their own times, others step by step or held."""
+    """Inputs (K, m) and times (K + 1,) of a rollout, from a recording, an array of steps, or constants."""
     (time, steps, h), (trajectory, from_first) = span, recording
     if isinstance(inputs, (str, Path, Trajectories)):
         found = input_recording(inputs, trajectory, run.data.time_unit, run.arrival, run.data.columns)

@@ -1,8 +1,8 @@
-"""The terms that a model may be made of by name, and their values by name while terms come and go."""
+"""Named terms: the candidates of a search, and parameter values by the names of terms."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,64 +18,74 @@ from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import HIGHEST, WAVES, drag_of, features_of
 from herglotz.training.parameter_vector import ParameterVector
 
-SIDE = 0.1  # of the way to the farther side of 0: motion that goes less far on the other tells nothing of a bend there
-BACK = 50  # a turn back that is shorter than this part of a recording says next to nothing of dry friction
-NEAR = 0.02  # of the RMS distance: powers of r are candidates where the data stay farther from 0
+# Minimum ratio of the smaller to the larger excursion from 0. Below it the data say nothing about a kink at 0.
+MIN_EXCURSION_RATIO = 0.1
+# A turn back shorter than 1/50 of a recording says little about dry friction.
+PARTS_OF_RECORDING = 50
+# Minimum distance over RMS distance. Closer to 0 the powers of r are no candidates.
+MIN_DISTANCE_RATIO = 0.02
 STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
 IN_S = "action.coefficient"
 DRY = "friction.coulomb"
-CONSTANT = "q1"  # the potential of a constant force on a length
+# The potential of a constant force on a length.
+CONSTANT = "q1"
 
 
 @dataclass(frozen=True)
 class NamedTerms:
-    """Terms of L and of the forces beside masses, stiffness, tilt and viscous friction."""
+    """Terms of L and of the forces beside masses, stiffness, tilt and viscous friction.
+
+    `dissipation` are powers of s in L, `absent` the numbers of the model that are 0. `one_rate`: several coordinates
+    have one damping rate, by the contact form, and no forces. `springs`: each coordinate has the baseline's spring (not
+    with translations). `apart`: joints have no constant mass and no viscous friction between them.
+    """
 
     features: tuple[str, ...] = ()
     drag: tuple[str, ...] = ()
-    dissipation: tuple[str, ...] = ()  # powers of s in L
+    dissipation: tuple[str, ...] = ()
     dry: bool = False
-    one_rate: bool = False  # of several coordinates: damped alike, by the contact form alone, and no forces
-    springs: bool = True  # the baseline's own of every coordinate; translations leave them out
-    apart: bool = False  # joints have no constant mass and no viscous friction between them
-    absent: tuple[str, ...] = ()  # numbers of the model that are 0
+    one_rate: bool = False
+    springs: bool = True
+    apart: bool = False
+    absent: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All of them, each once."""
+        """Names of all terms."""
         return (*self.features, *self.drag, *self.dissipation, *((DRY,) if self.dry else ()))
 
     def joined(self, other: NamedTerms) -> NamedTerms:
-        """These and the other ones, each once."""
-        own = ("features", "drag", "dissipation")
-        every = {name: tuple(dict.fromkeys(getattr(self, name) + getattr(other, name))) for name in own}
-        return replace(self, **every)
+        """These terms and the terms of `other`, each once."""
+        return self._each(lambda name, own: dict.fromkeys(own + getattr(other, name)))
 
     def only(self, names: Collection[str]) -> NamedTerms:
-        """Those of them that are among `names`."""
-        every = {name: getattr(self, name) for name in ("features", "drag", "dissipation")}
-        kept = {name: tuple(x for x in own if x in names) for name, own in every.items()}
-        return replace(self, **kept, dry=self.dry and DRY in names)
+        """The terms with one of these names."""
+        return replace(self._each(lambda _, own: (x for x in own if x in names)), dry=self.dry and DRY in names)
+
+    def _each(self, chosen: Callable[[str, tuple[str, ...]], Iterable[str]]) -> NamedTerms:
+        kinds = ("features", "drag", "dissipation")
+        return replace(self, **{name: tuple(chosen(name, getattr(self, name))) for name in kinds})
 
 
 def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTerms:
-    """The terms that these coordinates are tried with: with translations those of L that do not see them."""
+    """The candidate terms for these coordinates; with translations only terms of L that they leave unchanged."""
     if translations:
         return _unmoved(data, directions(translations, data.angles))
     angles = data.angles
     features = tuple(_of_one(data)) if len(angles) == 1 else features_of(angles)
-    one_unit = len(set(data.units)) == 1  # else there is no length of a velocity
+    # The length |v| of a velocity needs one unit.
+    one_unit = len(set(data.units)) == 1
     drag = tuple(text for text in drag_of(angles) if one_unit or text != AIR)
     return NamedTerms((*features, *special(data)), drag, dry=True)
 
 
 def special(data: Trajectories) -> tuple[str, ...]:
-    """Powers of the distance, and bends at 0: what the other terms are much alike to where it is not the law."""
+    """Powers of the distance, and kinks at 0: terms that are nearly collinear with the others."""
     return (*distances(data), *kinks(data))
 
 
 def _of_one(data: Trajectories) -> list[str]:
-    """Potentials of one coordinate; a constant force on a driven length is the zero of its input already."""
+    """Potentials of one coordinate; with inputs no constant force on a length, which the zero of the input gives."""
     waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
     powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
     every = [*own_terms(data.angles), *(waves if data.angles[0] else powers)]
@@ -83,17 +93,17 @@ def _of_one(data: Trajectories) -> list[str]:
 
 
 def turns_one_way(data: Trajectories, i: int) -> bool:
-    """Whether an angle never turns back for a fiftieth of a recording: dry friction is then a constant force, too."""
+    """True if an angle never turns back for 1/50 of a recording: dry friction is then a constant force."""
     signs = []
     for one in data:
-        lag = max(1, one.samples // BACK)
+        lag = max(1, one.samples // PARTS_OF_RECORDING)
         signs.append((one.q[lag:, i] - one.q[:-lag, i]).sign())
     seen = torch.cat(signs)
     return data.angles[i] and bool((seen == seen[0]).all()) and float(seen[0]) != 0
 
 
 def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTerms:
-    """What the directions leave alone: no forces beside L, whose momenta along them would not be kept."""
+    """Terms that are unchanged along the directions; no forces, which would change the momenta along the directions."""
     zero = (0.0,) * data.dof
     pairs = [f"{form}^{power}" for form in differences(data.angles, moved) for power in range(1, 5)]
     every = (*baseline_features(data.angles, zero, zero)[0], *pairs, *candidates(data).features)
@@ -102,28 +112,28 @@ def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTer
 
 
 def distances(data: Trajectories) -> tuple[str, ...]:
-    """Potentials of the distance r = |q|, where the coordinates have one unit of length and stay away from r = 0."""
+    """Potentials of the distance r = |q|, if the coordinates have one unit of length and stay away from r = 0."""
     if any(data.angles) or data.dof < 2 or len(set(data.units)) > 1:
         return ()
     r = data.q.norm(dim=1)
-    away = float(r.min()) > NEAR * float(r.square().mean().sqrt())
+    away = float(r.min()) > MIN_DISTANCE_RATIO * float(r.square().mean().sqrt())
     return tuple(name for name in lengths(data.angles) if name.startswith("r^")) if away else ()
 
 
 def kinks(data: Trajectories) -> tuple[str, ...]:
-    """Potentials of one length whose force bends at 0: |x| of a spring that is stiffer on one side, and x |x|.
+    """Potentials of one length with a kink of the force at 0: |x| x (a spring stiffer on one side) and |x|³.
 
-    On one side of 0 they are powers.
+    A motion on one side of 0 cannot distinguish them from powers.
     """
     away, beyond = sorted((abs(float(data.q.min())), abs(float(data.q.max()))))
-    crossed = float(data.q.min()) < 0 < float(data.q.max()) and away > SIDE * beyond
+    crossed = float(data.q.min()) < 0 < float(data.q.max()) and away > MIN_EXCURSION_RATIO * beyond
     return ("|q1| q1", "|q1|^3") if data.dof == 1 and not any(data.angles) and crossed else ()
 
 
 def central(data: Trajectories, every: NamedTerms) -> list[NamedTerms]:
-    """One power of the distance each, with the friction and the forces across the velocity of `every`.
+    """Families with one power of the distance each, and the friction and the forces across the velocity of `every`.
 
-    Powers of r are so much alike over most motions that a linear problem of all of them says little of each.
+    Over most motions the powers of r are nearly collinear: a linear problem with all of them determines none.
     """
     across = tuple(x for x in every.features if "v" in x)
     of_r = distances(data) if every.springs else ()
@@ -131,12 +141,12 @@ def central(data: Trajectories, every: NamedTerms) -> list[NamedTerms]:
 
 
 def chains(data: Trajectories) -> list[NamedTerms]:
-    """Fewer terms for joints: those of a planar chain of links, by the angles between neighbours and by absolute ones.
+    """Smaller families for joints: planar chains of links, in relative and in absolute angles, and joints with springs.
 
-    Between neighbours the mass of speeds i and j turns with sums of the angles behind the first of the two, and weight
-    with the sums of all angles up to a joint; by absolute angles the mass turns with q_i − q_j alone. Where the chain
-    hangs on slides, the mass of a slide and a joint turns with the angle of a link; by absolute angles no other mass
-    and no friction is shared. Joints that springs alone connect have potentials of q_i − q_j, and no mass between them.
+    In relative angles the mass M_ij depends on sums of the angles after joint i < j, the weight on sums of all angles
+    up to a joint. In absolute angles M_ij depends only on q_i − q_j. If the chain hangs on slides, the mass between a
+    slide and a joint depends on the angle of a link; in absolute angles there is no other coupling by mass or friction.
+    Joints that only springs connect have potentials of q_i − q_j and no mass between them.
     """
     if data.dof < 2 or not any(data.angles):
         return []
@@ -155,12 +165,12 @@ def _where(rule: Callable[[Product], bool], terms: Sequence[tuple[str, Product]]
 
 
 def _of_springs(f: Product) -> bool:
-    """Whether it is a potential of the difference of two angles."""
+    """True for a potential of the difference of two angles."""
     return not f.velocities and sorted(_form(f).values()) == [-1.0, 1.0]
 
 
 def _by_slides(angles: Sequence[bool]) -> tuple[list[tuple[str, Product]], list[tuple[str, Product]]]:
-    """The dictionary of joints: terms of the speeds of a slide and a joint, and those of joints alone."""
+    """The dictionary of joints in two parts: terms with the speeds of a slide and a joint, and of joints alone."""
     every = [(name, parse(name, angles)[0]) for name in revolute(angles)]
     across = [(name, f) for name, f in every if len({angles[i] for i in f.velocities}) == 2]
     return across, [(name, f) for name, f in every if all(angles[i] for i in f.velocities)]
@@ -171,30 +181,30 @@ def _form(f: Product) -> dict[int, float]:
 
 
 def _row(f: Product, joints: Sequence[int]) -> bool:
-    """Whether the angle is a sum of all joints up to one: that of a link, by the angles between neighbours."""
+    """True if the angle is the sum of all relative angles up to a joint: the absolute angle of a link."""
     return list(_form(f).items()) == [(i, 1.0) for i in joints[: len(_form(f))]]
 
 
 def _of_own(f: Product) -> bool:
-    """Whether the angle is that of the one joint whose speed a term has beside a slide's."""
+    """True if the only angle is that of the joint whose speed stands beside the speed of a slide."""
     return len(_form(f)) == 1 and set(_form(f)) <= set(f.velocities) and set(_form(f).values()) == {1.0}
 
 
 def _of_neighbours(f: Product, joints: Sequence[int]) -> bool:
-    """Whether a chain has this term by the angles between neighbours: a sum of neighbouring angles."""
+    """True if a chain has this term in relative angles: a sum of neighbouring angles."""
     on = [joints.index(i) for i in _form(f)]
     row = set(_form(f).values()) == {1.0} and on == list(range(on[0], on[-1] + 1))
     return row and on[0] == (joints.index(min(f.velocities)) + 1 if f.velocities else 0)
 
 
 def _difference(f: Product) -> dict[int, float]:
-    """q_i − q_j of the two speeds of a term."""
+    """The form q_i − q_j for the two speeds i < j of a term; {} without two speeds."""
     i, j = sorted(f.velocities) if len(set(f.velocities)) == 2 else (0, 0)
     return {} if i == j else {i: 1.0, j: -1.0}
 
 
 def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
-    """The baseline's terms of one coordinate as features: the parameter of each, and its factor; of more none."""
+    """The baseline's terms of a single coordinate as features, each with its parameter and factor; else {}."""
     if len(angles) > 1:
         return {}
     if angles[0]:
@@ -203,27 +213,28 @@ def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
 
 
 def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:
-    """The settings of a model that is made of these terms."""
+    """The settings of a model with these terms."""
     driven = data.u is not None and config.use_inputs
     forced = bool(terms.drag) or terms.dry or driven or (data.dof > 1 and not terms.one_rate)
     lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
-    own = data.dof > 1 and not config.translations  # the baseline's potential
-    order = order if still or own else 2  # of a potential: without one it would add a spring
+    # A model of order 4 without any potential would get the baseline's spring.
+    order = order if still or (data.dof > 1 and not config.translations) else 2
     several, apart = data.dof > 1, lengths or terms.apart
     level = "forced" if forced else "full" if terms.dissipation else "linear"
     return replace(
         config, level=level, features=terms.features, drag=terms.drag, coulomb=terms.dry,
         diagonal=several and apart, coupled=forced and several and not apart, order=2 if terms.dissipation else order,
         substeps=substeps, objective="trajectory", absent=terms.absent, dissipation=terms.dissipation,
-        alike=data.dof == 1,  # the potential holds features alone
+        alike=data.dof == 1,
     )  # fmt: skip
 
 
 def started(base: Baseline, data: Trajectories, values: dict, of: FitConfig) -> Baseline:
-    """The baseline with values by the name of a term or of a parameter as starts, for a model of these settings."""
+    """The baseline with starting `values`, by the name of a term or of a parameter, for a model of these settings."""
     rest = {name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")}
     rate = rest.pop("damping.rate", (0.0,))[0]
-    if data.dof == 1 or of.level == "linear":  # viscous friction of the first mass, 1, is the rate
+    # Viscous friction of the first mass, which is 1, acts as the rate.
+    if data.dof == 1 or of.level == "linear":
         rate += rest.pop("friction.viscous", (0.0,))[0]
     for parameter, names in holders(of.features, of.drag, of.dissipation).items():
         rest[parameter] = tuple(values.get(name, 0.0) for name in names)
@@ -234,13 +245,13 @@ def started(base: Baseline, data: Trajectories, values: dict, of: FitConfig) -> 
 
 
 def holders(features: Sequence[str], drag: Sequence[str] = (), dissipation: Sequence[str] = ()) -> dict[str, list[str]]:
-    """The terms whose coefficients each of four parameters holds, in its order."""
+    """The terms whose coefficients each of four parameters holds, in the order of the parameter."""
     still, moving = ([x for x in features if ("v" in x) == moves] for moves in (False, True))
     return {STILL: still, MOVING: moving, DRAG: list(drag), IN_S: list(dissipation)}
 
 
 def by_term(start: Mapping[str, Tensor], held: Mapping[str, Sequence[str]]) -> dict:
-    """Values of parameters as plain numbers, those of coefficients by the names of their terms (`holders`)."""
+    """Values of parameters as plain numbers; coefficients by the names of their terms (`holders`)."""
     values: dict = {name: tuple(x.reshape(-1).tolist()) for name, x in start.items()}
     for parameter, names in held.items():
         values |= zip(names, values.pop(parameter, ()), strict=True)
@@ -248,7 +259,7 @@ def by_term(start: Mapping[str, Tensor], held: Mapping[str, Sequence[str]]) -> d
 
 
 def _name_in(of: FitConfig, name: str) -> str:
-    """The name that a parameter has in a model of these settings; "" where it has none."""
+    """The name of a parameter in a model of these settings; "" if the model lacks the parameter."""
     if name.startswith("kinetic.") and name != MOVING:
         name = name.replace("kinetic.base.", "kinetic.")
         if of.diagonal and name == "kinetic.off_diagonal":
@@ -262,9 +273,10 @@ def _name_in(of: FitConfig, name: str) -> str:
 
 
 def values_of(parameters: ParameterVector, theta: Tensor) -> dict:
-    """Values by the name of a term or, as a tuple, of a parameter."""
+    """Values by the name of a term, or as tuples by the name of a parameter."""
     named, of = parameters.unflatten(theta), parameters.model.config
-    if baseline_is_named(of):  # −k, b of each angle; k/2, b of the others
+    # As features the baseline's coefficients are −k, b for an angle and k/2, b for a length.
+    if baseline_is_named(of):
         own, named[STILL] = named[STILL][: 2 * of.dof], named[STILL][2 * of.dof :]
         turn = own.new_tensor([-1.0 if angle else 2.0 for angle in of.angles])
         named |= {"potential.stiffness": own[::2] * turn, "potential.tilt": own[1::2]}
@@ -272,7 +284,7 @@ def values_of(parameters: ParameterVector, theta: Tensor) -> dict:
 
 
 def places(parameters: ParameterVector) -> dict[str, list[int]]:
-    """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
+    """Places in the parameter vector of the coefficients of each term; dry friction has one per coordinate."""
     of, at = parameters.model.config, {}
     for parameter, names in holders(of.features, of.drag, of.dissipation).items():
         at |= zip(names, ([i] for i in parameters.index(parameter).tolist()), strict=True)
@@ -282,5 +294,5 @@ def places(parameters: ParameterVector) -> dict[str, list[int]]:
 
 
 def shapes_of_dry(parameters: ParameterVector) -> Tensor:
-    """Places of the numbers that shape dry friction: where its force is 0 they have no effect."""
+    """Places of the numbers that shape dry friction; with a force of 0 they have no effect."""
     return torch.cat([parameters.index(name) for name in ("friction.breakaway", "friction.log")])

@@ -1,4 +1,4 @@
-"""Fitting an L_d of one's own: one-step errors, then whole trajectories where the data are noisy."""
+"""Fit your own L_d: one-step errors, then whole trajectories if the data are noisy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import NOISY, Task
 from herglotz.training.trajectory_fit import fit_states, fit_trajectories
 
-# Settings that say how to fit; all others say what the model is made of, or look for terms.
+# Settings of the fit; all others choose terms of the package's model.
 TAKEN = ("objective", "optimiser", "train_fraction", "seed", "dtype", "device", "iterations", "learning_rate", "batch",
          "robust", "use_inputs", "substeps")  # fmt: skip
 OBJECTIVES = ("auto", "residual", "trajectory")
@@ -38,9 +38,9 @@ OBJECTIVES = ("auto", "residual", "trajectory")
 def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> Run:
     """Train the parameters of L_d, in place, and return the run; see `fit`.
 
-    One-step errors J⁻¹R come first. They are the whole fit where they are no larger than those of exact data
-    (`NOISY`), or `config.objective` says so; else multiple shooting goes on from there. That is done on
-    `config.device`; the data are looked at and the run is judged on the CPU, where it stays.
+    One-step errors J⁻¹R come first. They are the whole fit if they are as small as for exact data (`NOISY`), or if
+    `config.objective` is "residual"; else multiple shooting follows. The fit uses `config.device`; the first look at
+    the data and the evaluation use the CPU, where the run stays.
     """
     model, seen = _prepared(data, L_d, config)
     task = seen.task(stages)
@@ -52,15 +52,16 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
     return run
 
 
-def _fitted(task: Task, model: Any) -> Fitted:  # it stands in for a `ContactLagrangian`
-    """The model as it was found, and the states at the samples, on the CPU."""
+def _fitted(task: Task, model: Any) -> Fitted:
+    """The fitted model, an `OwnLagrangian`, and the states at the samples, on the CPU."""
     config = task.config
     problem = ResidualProblem(model, task.data, max_step=task.base.max_step, sigma=task.exact)
     refuse({
-        "batch: the motion of this L_d depends on s, which is carried along whole trajectories; leave batch out, "
-        "or train in a loop of your own (herglotz.losses)": config.batch and problem.carries_s,
+        "batch: the motion of this L_d depends on s, which needs whole trajectories; leave batch out, "
+        "or train in your own loop (herglotz.losses)": config.batch and problem.carries_s,
     })  # fmt: skip
-    # A rule of its own leaves errors far above rounding, whose last digits would take hundreds of iterations.
+    # The discretisation errors of an arbitrary rule are far above rounding; their last digits would take hundreds of
+    # iterations.
     result, rms = fit_one_step(replace(task, hurried=True), problem, "one-step error", config.iterations)
     notes = {"iterations": result.iterations, "reason": result.reason}
     sigma = max(rms / NOISE_OF_R, task.exact)
@@ -79,12 +80,12 @@ def _fitted(task: Task, model: Any) -> Fitted:  # it stands in for a `ContactLag
 
 
 def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagrangian, Look]:
-    """The module as a model, and what is known of the data, on the CPU."""
+    """The module as a model, and the first look at the data, on the CPU."""
     default = FitConfig()
     other = [f.name for f in fields(config) if getattr(config, f.name) != getattr(default, f.name)]
     wrong = ", ".join(name for name in other if name not in TAKEN)
     refuse({
-        f"{wrong}: model= says what the model is made of; leave it out": wrong,
+        f"{wrong}: model= says what the model is; leave this setting out": wrong,
         f"an L_d of your own is fitted to the objectives {', '.join(OBJECTIVES)}, not {config.objective}":
             config.objective not in OBJECTIVES,
     })  # fmt: skip
@@ -104,7 +105,7 @@ def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagra
 
 
 def own_model(L_d: DiscreteLagrangian, data: Trajectories, base: Baseline) -> OwnLagrangian:
-    """L_d as a model of these data; refused if it has nothing to train, or parameters that stay as they are."""
+    """L_d as a model of these data; InputError if it has no parameters, or frozen parameters."""
     inputs = 0 if data.u is None else data.u.shape[1]
     model = OwnLagrangian(L_d, data.dof, inputs=inputs, angles=data.angles, scale=base.scale, speed=base.speed)
     frozen = [name for name, x in model.named_parameters() if x.numel() and not x.requires_grad]
@@ -118,7 +119,7 @@ def own_model(L_d: DiscreteLagrangian, data: Trajectories, base: Baseline) -> Ow
 
 
 def s_enters_motion(model: Any, data: Trajectories) -> bool:
-    """Whether a derivative of L_d depends on s, at drawn parameters: those at the start of a fit may hide it by a 0."""
+    """True if a derivative of L_d depends on s at random parameters; at the start of a fit a coefficient may be 0."""
     make = torch.Generator().manual_seed(0)
     drawn = {
         name: torch.randn(x.shape, generator=make, dtype=torch.float64).to(x) for name, x in model.named_parameters()
@@ -135,7 +136,7 @@ def s_enters_motion(model: Any, data: Trajectories) -> bool:
 
 
 def _try_derivatives(model: Any, data: Trajectories) -> None:
-    """Refuse an L_d whose derivatives by parameters cannot be had sample by sample, or that joins no positions."""
+    """Refuse an L_d that torch.func cannot differentiate sample by sample, or with a singular ∂²L_d/∂q0∂q1."""
     t = data.triples()
     rows: list[Tensor] = [x[:2] for x in (t.q0, t.q1, t.h0)]
     theta: dict[str, Tensor] = dict(model.named_parameters())
@@ -153,8 +154,8 @@ def _try_derivatives(model: Any, data: Trajectories) -> None:
         first = str(error).strip().splitlines()[0]
         raise InputError(
             f"{model.config.name}: torch.func cannot differentiate it sample by sample ({first}); write it as a pure "
-            "function of tensors, without .item(), numpy, `if` on values or writing in place, or train it in a loop of "
-            "your own (herglotz.losses)"
+            "function of tensors, without .item(), numpy, `if` on values or writing in place, or train it in your own "
+            "loop (herglotz.losses)"
         ) from None
     if not bool((torch.linalg.det(D12) != 0).all()):
         raise InputError(

@@ -1,4 +1,4 @@
-"""A model seen as a function of one vector of its parameters, for Gauss–Newton."""
+"""A model as a function of one vector of its parameters, for Gauss–Newton."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from herglotz.models import Capabilities, ContactLagrangian, numbers_of
 
 
 class ParameterVector:
-    """Partials of a model at any vector of parameters, without touching the model; usable inside vmap and jacrev.
+    """Partials of a model at any vector of parameters, without changing the model; usable inside vmap and jacrev.
 
-    Numbers that the model's configuration calls `absent` are 0 and no part of the vector. Of the others `free` may name
-    those that are: the rest are what they are in the model.
+    `numbers` are the names of the P numbers in the vector, `entries` the parameter and the index of each. Numbers that
+    are `absent` by the model's configuration are 0 and no part of the vector. `free` names the numbers in the vector;
+    the others keep their values in the model (None: all are in the vector).
     """
 
     def __init__(self, model: ContactLagrangian, free: Collection[str] | None = None):
@@ -27,10 +28,11 @@ class ParameterVector:
         self.shapes = [p.shape for p in named.values()]
         absent = set(model.config.absent)
         wanted = [name for name in every if name not in absent and (free is None or name in free)]
-        self.numbers = wanted  # (P,) by name
-        self.entries = [every[name] for name in self.numbers]  # parameter and entry of each
+        self.numbers = wanted
+        self.entries = [every[name] for name in self.numbers]
         self.learned = None if len(wanted) == len(every) else torch.tensor([name in wanted for name in every])  # (N,)
-        self.held: Tensor | None = None  # (N,) what is no part of the vector; None: 0
+        # (N,) values of the numbers outside the vector; None: 0.
+        self.held: Tensor | None = None
         if free is not None:
             still = torch.tensor([name not in absent for name in every])
             self.held = torch.where(still, nn.utils.parameters_to_vector(model.parameters()).detach().cpu(), 0.0)
@@ -60,15 +62,15 @@ class ParameterVector:
     def partials(
         self, theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int, u: Tensor | None = None
     ) -> Partials:
-        """`herglotz.mechanics.partials` of the model with parameters theta, at the inputs u (..., m) of its steps."""
+        """`herglotz.mechanics.partials` of the model with parameters theta, for steps with inputs u (..., m)."""
         return cast(Partials, functional_call(self.model, self.unflatten(theta), (q0, q1, s0, h, order, u)))
 
     def at(self, theta: Tensor, u: Tensor | None = None) -> FixedModel:
-        """The discrete Lagrangian with parameters theta, of steps whose inputs are u."""
+        """The discrete Lagrangian with parameters theta, for steps with inputs u."""
         return FixedModel(self, theta, u)
 
     def index(self, prefix: str) -> Tensor:
-        """Positions in the vector of the numbers whose name starts with `prefix`."""
+        """Positions in the vector of all numbers with this prefix."""
         return torch.tensor([i for i, name in enumerate(self.numbers) if name.startswith(prefix)], dtype=torch.long)
 
 
@@ -80,11 +82,11 @@ class FixedModel:
 
     @property
     def capabilities(self) -> Capabilities:
-        """The model's."""
+        """The capabilities of the model."""
         return self.parameters.model.capabilities
 
     def at(self, u: Tensor) -> FixedModel:
-        """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
+        """The discrete Lagrangian of a step with inputs u, (..., m)."""
         return FixedModel(self.parameters, self.theta, u)
 
     def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from herglotz.data.units import size
@@ -13,8 +13,10 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.trades import listed
 
-COLUMNS = 80  # of a table for people
-STARTS = ("stiffness", "tilt", "rate")  # of the baseline; `start` holds all other parameters
+# Columns of a printed table.
+COLUMNS = 80
+# Starting values of the baseline; all other names in `Plan.start` are parameters of the model.
+STARTS = ("stiffness", "tilt", "rate")
 
 
 @dataclass(frozen=True)
@@ -22,37 +24,65 @@ class Plan:
     """The decisions of a fit. Every field but the last has its reason, in words and numbers, in `reasons`.
 
     A plan is plain values: `metrics.json` holds it, and `fit(data, plan=Plan.from_dict(...))` follows it again.
+
+    Parameters
+    ----------
+    level, objective, order, features, drag, dissipation, absent, substeps, departures
+        As in `FitConfig`; the objective is residual, trajectory, smoothing or raw.
+    network
+        correction, covered (one wide layer), potential, plain or none.
+    hold, delay, lag
+        Inputs between samples (zero, first or smooth; "" without inputs); their delay and the time constant of the
+        actuator, in the data's unit of time.
+    forces
+        Settings of masses and friction by name: coulomb, sticking, coupled, diagonal, alike.
+    start, fitted_before
+        Starting values of parameters by name; whether these and `sigma` come from an earlier fit of the same model.
+    sigma
+        Noise of q that the first stage assumes, in its unit; None: a one-step fit measures it.
+    outliers, continues_probe, restarts
+        Of the one-step fit: whether Student's t is its first loss, whether it continues the short fit that measured the
+        noise, and the number of its random initialisations.
+    turning
+        True: angles turn. False: they are positions on a line, for example of a free spring.
+    spreads
+        Prior deviations of the waves of functions.
+    input_terms
+        Terms of the recorded inputs, which act beside the inputs.
+    zeros, drifts
+        Zeros of the sensors, B · n numbers, if recordings differ in them (empty: 0), and their drifts, n numbers, in
+        units of q per unit of time since the start of a recording.
     """
 
-    level: str  # of the ladder of models
-    objective: str  # residual, trajectory, smoothing or raw
-    network: str  # correction, covered (one wide layer), potential, plain or none
-    order: int  # of the rule, 2 or 4
-    features: tuple[str, ...]  # what L may hold beside its terms
-    hold: str  # of the inputs between samples: zero, first or smooth; "" without inputs
-    delay: float  # with which recorded inputs act, in the data's unit of time
-    lag: float  # time constant of the actuator
-    drag: tuple[str, ...]  # friction forces beside the viscous one
-    substeps: int  # model steps in a recorded one
-    forces: dict[str, bool]  # coulomb, sticking, coupled; diagonal: which masses and friction there are
-    start: dict[str, tuple[float, ...]]  # starting values of parameters by name
-    outliers: bool  # the first one-step fit takes Student's t
-    continues_probe: bool  # the one-step fit goes on from the short one that measured the noise
-    sigma: float | None  # noise of q that the first stage assumes; None: a one-step fit measures it
-    fitted_before: bool  # starting values and sigma are those of an earlier fit of the same model
-    restarts: int  # random initialisations of the one-step fit
-    departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
-    turning: bool = True  # angles turn; False: they are positions on a line, as of a free spring
-    absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
-    spreads: dict[str, float] = field(default_factory=dict)  # prior deviations of the waves that make functions
-    dissipation: tuple[str, ...] = ()  # powers of s in L beside −γ s
-    input_terms: tuple[str, ...] = ()  # of recorded inputs, which act beside them
-    zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
-    drifts: tuple[float, ...] = ()  # of these zeros, n numbers, in units of q per time since a recording began
+    level: str
+    objective: str
+    network: str
+    order: int
+    features: tuple[str, ...]
+    hold: str
+    delay: float
+    lag: float
+    drag: tuple[str, ...]
+    substeps: int
+    forces: dict[str, bool]
+    start: dict[str, tuple[float, ...]]
+    outliers: bool
+    continues_probe: bool
+    sigma: float | None
+    fitted_before: bool
+    restarts: int
+    departures: tuple[float, ...]
+    turning: bool = True
+    absent: tuple[str, ...] = ()
+    spreads: dict[str, float] = field(default_factory=dict)
+    dissipation: tuple[str, ...] = ()
+    input_terms: tuple[str, ...] = ()
+    zeros: tuple[float, ...] = ()
+    drifts: tuple[float, ...] = ()
     reasons: dict[str, str] = field(default_factory=dict)
 
     def applied(self, settings: FitConfig) -> FitConfig:
-        """The settings with what this plan decides."""
+        """The settings with the decisions of this plan."""
         return replace(
             settings, level=self.level, objective=self.objective, order=self.order, features=self.features,
             departures=self.departures, drag=self.drag, substeps=self.substeps, absent=self.absent,
@@ -60,12 +90,10 @@ class Plan:
         )  # fmt: skip
 
     def started(self, base: Baseline) -> Baseline:
-        """The first look's sizes with this plan's starting values."""
-        own = {name: self.start[name] for name in STARTS}
-        rest = {name: values for name, values in self.start.items() if name not in STARTS}
-        return replace(
-            base, stiffness=own["stiffness"], tilt=own["tilt"], rate=own["rate"][0], start=rest, spreads=self.spreads
-        )
+        """The baseline with this plan's starting values."""
+        rest = dict(self.start)
+        stiffness, tilt, (rate,) = (rest.pop(name) for name in STARTS)
+        return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, spreads=self.spreads)
 
     def _has_effect(self, name: str) -> bool:
         one_step = self.objective in ("residual", "raw")
@@ -79,9 +107,9 @@ class Plan:
         return needed.get(name, name not in IF_ANY or bool(getattr(self, name)))
 
     def by_reason(self, unit: str = "") -> list[tuple[list[str], str]]:
-        """Decisions in words (`order of the time step: 2`) that have an effect, with the reason that they share.
+        """The decisions with an effect, in words (`order of the time step: 2`), grouped by their common reason.
 
-        `unit` is that of the coordinates, where they have one in common.
+        `unit` is the common unit of the coordinates, if they have one.
         """
         found: dict[str, list[str]] = {}
         for name in filter(self._has_effect, DECISIONS):
@@ -90,7 +118,7 @@ class Plan:
         return [(decisions, reason) for reason, decisions in found.items()]
 
     def table(self, unit: str = "") -> str:
-        """The decisions, those of one reason together, and the reason below them, for people."""
+        """The decisions as a text table, each group with its reason below."""
         lines = []
         for decisions, reason in self.by_reason(unit):
             lines += [textwrap.fill(x, COLUMNS, initial_indent="  ", subsequent_indent="    ") for x in decisions]
@@ -99,7 +127,7 @@ class Plan:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        return dict(vars(self))
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Plan:
@@ -110,7 +138,8 @@ class Plan:
         return replace(plan, start={name: tuple(x) for name, x in plan.start.items()})
 
 
-WORDS = {  # what a decision is called; the starting values are too many to be told
+# Decisions in words. The starting values are too many for a table.
+WORDS = {
     "level": "level",
     "objective": "fitted to",
     "network": "network",
@@ -136,8 +165,9 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "departures": "strengths of the prior that are compared",
 }
 DECISIONS = tuple(WORDS)
+# Decisions that are listed only if they are not empty, 0 or False.
 IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drifts", "drag", "absent", "dissipation",
-          "continues_probe", "fitted_before")  # fmt: skip  # told if not 0
+          "continues_probe", "fitted_before")  # fmt: skip
 MEANINGS = {
     "level": {
         "conservative": "no damping",
@@ -160,7 +190,7 @@ MEANINGS = {
     },
     "hold": {"zero": "constant", "first": "straight lines", "smooth": "polynomials"},
 }
-FORCES = {  # of `Plan.forces`
+FORCES = {
     "coulomb": "dry friction",
     "sticking": "dry friction that can hold a joint still",
     "coupled": "friction between coordinates",

@@ -1,9 +1,8 @@
-"""A trained model on a recording it has not seen: the first samples give the state, the rest is a free run."""
+"""Predict a new recording with a trained model: a warm-up gives the state, a free run the rest."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,8 +15,7 @@ from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.sensors import measured
 from herglotz.data.splits import leading, leading_rows
 from herglotz.data.waves import with_waves
-from herglotz.errors import InputError
-from herglotz.models import ContactLagrangian
+from herglotz.errors import InputError, refuse
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
@@ -29,25 +27,31 @@ from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
 from herglotz.training.sensor_zeros import zeros_of_one
-from herglotz.training.smoother import smoothed_states
+from herglotz.training.smoother import process_noise, smoothed_states
 
-WARMUP = 20  # samples from which the state is estimated
-BELIEVED = 0.1  # noise of a radian of motion over that of the data, as of steps in `smooth`: states follow the model
+# Leading samples that the state is estimated from.
+WARMUP = 20
 
 
 @dataclass(frozen=True, repr=False)
 class Prediction:
-    """A recording beside the model's free run. With windows, each window is one trajectory of `data`."""
+    """A recording beside the model's free run. With windows, each window is one trajectory of `data`.
 
-    data: Trajectories  # what was scored, angles unwrapped; every `every`-th sample of the recording
-    states: State  # (N, n), (N, n), (N,) smoothed in the warm-up, then free; NaN from a failed step on
-    warmup: int  # leading samples of each trajectory that the state was estimated from
-    every: int  # stride by which the recording was thinned, so that its steps are not shorter than the model's
-    most_substeps: int  # largest number of model steps in a recorded step
-    outside: float  # share of model steps that are shorter or longer than those of the training data
-    zeros: tuple[float, ...] = ()  # of the sensors, (n,), that were taken off the recording; empty: 0
-    beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit, farthest first: the model extrapolates there
-    v: Tensor | None = None  # (N, n) velocities of the states, in units of q over that of t
+    `states` are smoothed in the `warmup` leading samples of each trajectory, then a free run; NaN after a failed step.
+    `every` is the stride by which the recording was thinned, `most_substeps` the largest number of model steps in a
+    recorded step, `outside` the share of model steps shorter or longer than those of the training data. `zeros` of the
+    sensors were subtracted (empty: none). `beyond` lists what leaves the range of the fit, farthest first.
+    """
+
+    data: Trajectories
+    states: State  # (N, n), (N, n), (N,)
+    warmup: int
+    every: int
+    most_substeps: int
+    outside: float
+    zeros: tuple[float, ...] = ()  # (n,)
+    beyond: tuple[Beyond, ...] = ()
+    v: Tensor | None = None  # (N, n) velocities, in units of q over that of t
 
     def __repr__(self) -> str:
         rms = "failed" if self.rms is None else f"{self.rms:.3g}"
@@ -60,34 +64,34 @@ class Prediction:
 
     @property
     def train_lengths(self) -> tuple[int, ...]:
-        """Samples of each trajectory that the model was shown: the warm-up."""
+        """Number of leading samples of each trajectory that the model saw: the warm-up."""
         return (self.warmup,) * len(self.data)
 
     @property
     def free(self) -> Tensor:
-        """Whether a sample is in the free run, (N,) bool."""
+        """True at samples of the free run, (N,) bool."""
         return ~leading(self.data.lengths, self.train_lengths)
 
     @property
     def failed_steps(self) -> float:
-        """Share of the samples of the free run that it did not reach."""
+        """Share of the samples after a failed step of the free run."""
         return 1.0 - float(torch.isfinite(self.states.q[self.free]).all(-1).double().mean())
 
     @property
     def rms_per_coordinate(self) -> tuple[float, ...] | None:
-        """RMS error of each coordinate over the samples that the free run reached; None where it reached none."""
+        """RMS error of each coordinate over the samples before a failed step; None if there is none."""
         error = (self.states.q - self.data.q)[self.free & self.data.complete]
         error = error[torch.isfinite(error).all(-1)]
         return tuple(error.square().mean(0).sqrt().tolist()) if len(error) else None
 
     @property
     def rms(self) -> float | None:
-        """RMS error over all coordinates."""
+        """RMS error over all coordinates, as `rms_per_coordinate`."""
         each = self.rms_per_coordinate
         return None if each is None else (sum(x * x for x in each) / len(each)) ** 0.5
 
     def motion(self) -> Trajectories | None:
-        """The predicted motion as far as it was reached; None where no trajectory has three samples."""
+        """The predicted motion up to the first failed step; None if no trajectory has three samples."""
         reached = torch.isfinite(torch.cat([self.states.q, self.states.p], -1)).all(-1)
         counts = [int(reached[a : a + k].sum()) for a, k in zip(self.data.offsets, self.data.lengths, strict=True)]
         counts = [k if k >= 3 else 0 for k in counts]
@@ -99,7 +103,7 @@ class Prediction:
         return whole.rows(leading_rows(self.data.lengths, counts), tuple(filter(None, counts)))
 
     def metrics(self) -> dict[str, Any]:
-        """The numbers, for JSON."""
+        """Plain numbers for JSON."""
         each = self.rms_per_coordinate
         return {
             "rms": self.rms,
@@ -129,9 +133,9 @@ def predict(
 ) -> Prediction:
     """Score a run on another recording.
 
-    The state at sample `warmup` of each trajectory is smoothed from the samples up to it, with the model held. From
-    there the model steps alone, driven by the inputs of the recording. A recorded step that is longer than those of the
-    training data is crossed in equal model steps; a recording sampled faster is thinned, its inputs averaged.
+    The states of each warm-up are smoothed with the model fixed. From the last of these states the model steps alone,
+    driven by the recorded inputs. A recorded step longer than the steps of the training data is divided into equal
+    model steps; a recording that was sampled faster is thinned, its inputs averaged.
 
     Parameters
     ----------
@@ -142,25 +146,26 @@ def predict(
     warmup
         Number of samples K that the state is estimated from, at least 3.
     windows, horizon
-        Score this many windows, spread evenly over the recording, of K samples and then a free run over the time
-        `horizon`, instead of one free run to the end of each trajectory.
+        Score this many windows, spread evenly over the recording, instead of one free run to the end of each
+        trajectory. A window has K samples of warm-up and a free run over the time `horizon`.
     same_zeros
-        The sensors read what those of the run's reference read. False: where the recordings of the fit differ in it,
-        the zeros that suit the warm-up best are taken off, the same for all of these trajectories: those of one of
-        them, or what the warm-ups tell of the sensors by the model.
+        True: the sensors have the zeros of the run's reference recording. False: if recordings of the fit differ in
+        their zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
 
     Returns
     -------
     Prediction
-        A free run that fails says so in `failed_steps`.
+        `failed_steps` is above 0 if a free run fails.
 
     Raises
     ------
     InputError
-        If the coordinates, units or inputs are not those of the run, or a trajectory is too short.
+        If the coordinates, units or inputs differ from those of the run, or a trajectory is too short.
     """
-    if isinstance(warmup, bool) or not isinstance(warmup, int) or warmup < 3:
-        raise InputError(f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}")
+    refuse({
+        f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}":
+            type(warmup) is not int or warmup < 3,
+    })  # fmt: skip
     data = of_the_run(run, data).unwrapped().to(dtype=next(run.model.parameters()).dtype, device="cpu")
     data = measured(data, drifts=(run.metrics.get("plan") or {}).get("drifts") or ())
     low, high = run.h_range
@@ -173,35 +178,27 @@ def predict(
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)
     grid = _free_run(run.stepper, data, states, warmup, high)
-    inside = torch.arange(grid.longest) < grid.end[:, None]
-    h = grid.h[inside]
+    h = grid.h[inside := torch.arange(grid.longest) < grid.end[:, None]]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
-    model, x = run.model, state_of(states)
-    # Where a recorded step is crossed in several, p is that of the last of them.
-    step = run.h if most == 1 else float(h.median())
-    v = velocities(model, x, torch.tensor(step))
-    found = Prediction(data, x, warmup, every, most, outside, zeros, v=v)
-    return replace(found, beyond=_beyond(run.box, found))
-
-
-def _beyond(box: Mapping[str, Sequence[float]], found: Prediction) -> tuple[Beyond, ...]:
-    """What the free runs leave the range of the fit by."""
-    rows = [found.free.nonzero()[:, 0][found.data.trajectory[found.free] == b] for b in range(len(found.data))]
-    return farthest(
-        quantities_outside(box, found.data, found.data.t[r], found.states.q[r], found.states.p[r]) for r in rows
-    )
+    x = state_of(states)
+    # p at a sample belongs to the last model step before the sample, which is shorter than the recorded step.
+    v = velocities(run.model, x, torch.tensor(run.h if most == 1 else float(h.median())))
+    free = ~leading(data.lengths, (warmup,) * len(data))
+    rows = [(free & (data.trajectory == b)).nonzero()[:, 0] for b in range(len(data))]
+    beyond = farthest(quantities_outside(run.box, data, data.t[r], x.q[r], x.p[r]) for r in rows)
+    return Prediction(data, x, warmup, every, most, outside, zeros, beyond, v)
 
 
 def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:
-    """The zeros of the sensors in the recordings of the fit, each once, those of the reference first."""
+    """The distinct zeros of the sensors in the recordings of the fit; first (), the zeros of the reference."""
     zeros, n = (run.metrics.get("plan") or {}).get("zeros") or (), run.data.dof
     every = dict.fromkeys(tuple(zeros[i : i + n]) for i in range(0, len(zeros), n))
     return [(), *(zero for zero in every if any(zero))]
 
 
 def of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
-    """The coordinates of the run among those of the data, by name; a single one may be called otherwise."""
+    """The data with the coordinates of the run, found by name; a single coordinate may have another name."""
     wanted, where = run.data, data.source or "data"
     if data.dof == wanted.dof == 1:
         at = [0]
@@ -225,20 +222,20 @@ def of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
         angles=wanted.angles,
         columns=tuple((called.get(name, name), role, unit) for name, role, unit in data.columns),
     )  # fmt: skip
-    return acting(data, run.arrival)  # other recordings that say nothing are like those of the fit
+    # Hold, delay and lag of the fit apply unless the recording states its own.
+    return acting(data, run.arrival)
 
 
 def _check_lengths(data: Trajectories, warmup: int, every: int) -> None:
-    """Raise unless every trajectory goes on for two samples after its warm-up."""
+    """Raise unless every trajectory has two samples after its warm-up."""
     length = min(data.lengths)
-    if length >= warmup + 2:
-        return
     thinned = f", every {every} of the recording" if every > 1 else ""
-    shorter = f"use --warmup {max(3, length // 2)} or a longer recording"
-    raise InputError(
+    shorter, remedy = max(3, length // 2), "leave it out, as no warm-up is short enough"
+    remedy = f"use --warmup {shorter} or a longer recording" if length >= 5 else remedy
+    refuse({
         f"{data.source or 'data'}: trajectory {data.lengths.index(length)} has {length} samples{thinned}; a warm-up of "
-        f"{warmup} needs at least {warmup + 2}: {shorter if length >= 5 else 'leave it out, for none is short enough'}"
-    )
+        f"{warmup} needs at least {warmup + 2}: {remedy}": length < warmup + 2,
+    })  # fmt: skip
 
 
 def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:
@@ -247,13 +244,16 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
         raise InputError("windows and horizon go together: how many windows, and the time that each is predicted")
     if count < 1 or not 0 < horizon < float("inf"):
         raise InputError(f"windows must be >= 1 and horizon a time > 0, got {count} and {horizon:g}")
-    found: list[tuple[int, int]] = []  # first row, and the row after the last
+    # First row of each window, and the row after its last.
+    found: list[tuple[int, int]] = []
     for first, length in zip(data.offsets, data.lengths, strict=True):
         t = data.t[first : first + length]
         ends = torch.searchsorted(t, t[warmup - 1 :] + horizon * (1 + 1e-9), right=True).tolist()
         reach = (t[warmup - 1 :] + horizon * (1 - 1e-9) <= t[-1]).tolist()
-        found += [(first + k, first + end) for k, (end, ok) in enumerate(zip(ends, reach, strict=True)) if ok]
-    found = [(a, b) for a, b in found if b - a >= warmup + 2]
+        found += [
+            (first + k, first + end)
+            for k, (end, ok) in enumerate(zip(ends, reach, strict=True)) if ok and end - k >= warmup + 2
+        ]  # fmt: skip
     if not found:
         raise InputError(
             f"{data.source or 'data'}: no trajectory holds {warmup} samples and a time of {horizon:g} after them (at "
@@ -266,7 +266,7 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
 
 
 def _shorter(data: Trajectories, warmup: int, horizon: float) -> str:
-    """The largest warm-up and the longest time that the recording has room for, as a remedy."""
+    """The remedy: the largest warm-up, or the longest horizon, that fits into the recording."""
     times = [data.t[a : a + k] for a, k in zip(data.offsets, data.lengths, strict=True)]
     most = max(min(int((t + horizon * (1 - 1e-9) <= t[-1]).sum()), len(t) - 2) for t in times)
     left = max((float(t[-1] - t[warmup - 1]) for t in times if len(t) >= warmup + 2), default=0.0)
@@ -281,34 +281,34 @@ def _shorter(data: Trajectories, warmup: int, horizon: float) -> str:
 def _started(
     run: FittedRun, data: Trajectories, warmup: int, zeros: list[tuple[float, ...]]
 ) -> tuple[Tensor, tuple[float, ...]]:
-    """States over the warm-ups, and the zeros that suit them best: one of these, or one with more of their own."""
+    """States over the warm-ups, and the zeros of smallest cost: a candidate, or the best one plus a correction."""
     ways = [_warmed_up(run, measured(data, zero), warmup) for zero in zeros]
     best = min(range(len(ways)), key=lambda i: ways[i][1])
     if len(zeros) > 1 and any(own := _own_zeros(run, measured(data, zeros[best]), warmup)):
         both = tuple(a + b for a, b in zip(zeros[best] or (0.0,) * data.dof, own, strict=True))
         states, cost = _warmed_up(run, measured(data, both), warmup)
-        if cost <= MARGIN**2 * ways[best][1]:  # the noise of steps hides much of what zeros do within a warm-up
+        # The correction has to lower the cost clearly: process noise can absorb a wrong zero within a warm-up.
+        if cost <= MARGIN**2 * ways[best][1]:
             return states, both
     return ways[best][0], zeros[best]
 
 
 def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
-    """States (N, 2n+1), NaN beyond the warm-up of each trajectory, and how badly they suit it."""
+    """States (N, 2n+1), NaN after the warm-up of each trajectory, and the cost ½|r|² of all warm-ups."""
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
-    sigma, (every, parts) = _sigma(run), _warm_ups(data, warmup)
-    freedom = FREEDOM if run.metrics.get("outliers") else None  # what the fit has met may come again
-    together = _smoothed(run.model, parts, sigma, run.h_range[1], freedom)
+    every, parts = _warm_ups(data, warmup)
+    together = _smoothed(run, parts)
     if together is not None:
         states[every.flatten()], cost = together
         return states, cost
+    # Smoothing failed in at least one warm-up. Each failure is given the largest cost of the others.
     costs = []
-    for rows in every:  # one of them at least has no step near it
-        alone = _smoothed(run.model, data.rows(rows, (warmup,)), sigma, run.h_range[1], freedom)
+    for rows in every:
+        alone = _smoothed(run, data.rows(rows, (warmup,)))
         if alone is not None:
             states[rows] = alone[0]
             costs.append(alone[1])
-    lost = len(every) - len(costs)  # each counts as the worst of the others
-    return states, sum(costs) + lost * max(costs, default=math.inf)
+    return states, sum(costs) + (len(every) - len(costs)) * max(costs, default=math.inf)
 
 
 def _warm_ups(data: Trajectories, warmup: int) -> tuple[Tensor, Trajectories]:
@@ -318,29 +318,28 @@ def _warm_ups(data: Trajectories, warmup: int) -> tuple[Tensor, Trajectories]:
     return rows.reshape(-1, warmup), data.rows(rows, lengths)
 
 
+def _own_zeros(run: FittedRun, data: Trajectories, warmup: int) -> tuple[float, ...]:
+    """The correction of the zeros that the warm-ups suggest, (n,)."""
+    return zeros_of_one(run.model, _warm_ups(data, warmup)[1], _sigma(run), run.h_range[1])
+
+
 def _sigma(run: FittedRun) -> float:
     return run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
 
 
-def _own_zeros(run: FittedRun, data: Trajectories, warmup: int) -> tuple[float, ...]:
-    """What the warm-ups tell of zeros of the sensors that no recording of the fit had, (n,)."""
-    return zeros_of_one(run.model, _warm_ups(data, warmup)[1], _sigma(run), run.h_range[1])
-
-
-def _smoothed(
-    model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float, freedom: float | None
-) -> tuple[Tensor, float] | None:
-    """States at every sample of warm-ups, (N, 2n+1), the model held, and ½|r|²; None where it has no step near them."""
-    turn = max_step * max(v / x for v, x in zip(model.config.speed, model.config.scale, strict=True))
-    process = BELIEVED * min(1.0, turn) ** 0.5  # a random force adds as much in many short steps as in a long one
-    grid = segment_grid(data, data.samples, max_step)
-    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process, freedom=freedom)
+def _smoothed(run: FittedRun, data: Trajectories) -> tuple[Tensor, float] | None:
+    """Smoothed states of warm-ups, (N, 2n+1), with the model fixed, and ½|r|²; None if a step near the data fails."""
+    max_step = run.h_range[1]
+    # If the training data had outliers, new recordings may have outliers too.
+    freedom = FREEDOM if run.metrics.get("outliers") else None
+    grid, process = segment_grid(data, data.samples, max_step), process_noise(run.model, max_step)
+    problem = SmoothingProblem(run.model, data, grid, sigma=_sigma(run), process=process, freedom=freedom)
     found = smoothed_states(problem)
     return None if found is None else (problem.states(found[0]), found[1])
 
 
 def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:
-    """Fill in the states after the warm-up of every trajectory, all of them stepped as one batch; return the grid."""
+    """Fill in the states after the warm-up of every trajectory, stepped as one batch; return the grid of steps."""
     rows = (~leading(data.lengths, (warmup - 1,) * len(data))).nonzero()[:, 0]
     rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
     grid = segment_grid(rest, rest.samples, max_step)

@@ -22,19 +22,19 @@ DIMENSIONS = {
     "friction.breakaway": (1, 2),
     "friction.log_smooth": (1, 1),
     "friction.log_stribeck": (1, 1),
-    INPUT_MAP: (1, 2),  # per unit of the input
+    INPUT_MAP: (1, 2),
 }
-# Stored as logarithms, and how often each is in the exponent: the entry C of the mass's factor counts as C².
+# Parameters stored as logarithms, with the power of the exponential: the mass is the square of its factor's entry C.
 LOGARITHMS = {"kinetic.log_diagonal": 2, "friction.log_smooth": 1, "friction.log_stribeck": 1}
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number of the model that has a meaning of its own."""
+    """One physical number: name of the parameter, words with the coordinate, unit ("" if none), value, deviation."""
 
-    name: str  # of the parameter, for programs
-    words: str  # for people, with the coordinate it belongs to
-    unit: str  # "" where it has none
+    name: str
+    words: str
+    unit: str
     value: float
     std: float
 
@@ -51,7 +51,7 @@ def rounded(value: float, std: float) -> str:
 
 
 def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
-    """Every entry of the physical parameters that was learned, those of a coordinate with its name."""
+    """Every learned entry of the physical parameters, with the name of its coordinate."""
     std, found = posterior.standard_deviations(), []
     for name, i in posterior.problem.parameters.entries:
         if not name.startswith(PHYSICAL):
@@ -59,7 +59,8 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
         values = run.model.get_parameter(name).detach().reshape(-1)
         words = WORDS.get(name, name)
         whose = f" of {run.data.names[i]}" if len(values) == run.data.dof > 1 else ""
-        if name == "kinetic.log_diagonal":  # the first coordinate's is 1
+        # The first mass is 1 and no parameter.
+        if name == "kinetic.log_diagonal":
             words, whose = _mass(run, i + 1)
         if name == INPUT_MAP and len(values) > 1:
             whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
@@ -73,7 +74,7 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
 
 
 def _mass(run: Run, i: int) -> tuple[str, str]:
-    """What C_ii² of m = C Cᵀ is: the mass, or what of it moves where the coordinates before it are free."""
+    """C_ii² of m = C Cᵀ in words: the mass, or the effective mass while the coordinates before i are free."""
     names = run.data.names
     free = "" if run.model.config.diagonal else f" while {', '.join(names[:i])} {'is' if i == 1 else 'are'} free"
     return WORDS["kinetic.log_diagonal"], f" of {names[i]}{free}, over that of {names[0]}"
@@ -96,5 +97,5 @@ def _unit(name: str, run: Run, i: int) -> str:
 
 
 def _source(run: Run, i: int) -> tuple[str, str]:
-    """Name and unit of the input that entry i of the map from inputs to forces, row by row, belongs to."""
+    """Name and unit of the input of entry i of the map from inputs to forces, counted row by row."""
     return run.data.input_labels[i % run.model.inputs]

@@ -1,4 +1,4 @@
-"""Where a motion leaves the range of positions and momenta that a fit was trained on: there the model extrapolates."""
+"""Positions and momenta of a motion outside the range of the training data, where the model extrapolates."""
 
 from __future__ import annotations
 
@@ -12,59 +12,60 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.units import size, span
 
-MARGIN = 0.01  # of the width: recordings of fits predicted again leave their own range by up to 0.006 of it
-HAIR = 1e-6  # of a step: recorded times are rounded
-QUANTITIES = {"q": "position", "p": "momentum"}  # the first coordinate's mass is 1: its momentum is its velocity
+# Share of the width of the range. Predictions of training recordings leave their own range by up to 0.006 of its width.
+MARGIN = 0.01
+# Relative tolerance of a step, because recorded times are rounded.
+ROUNDING = 1e-6
+QUANTITIES = {"q": "position", "p": "momentum"}
 
 
 @dataclass(frozen=True)
 class Beyond:
-    """One quantity that leaves its recorded range."""
+    """One quantity, position or momentum, that leaves its recorded range from `low` to `high`.
+
+    `by` is the largest distance from the range over its width (inf for width 0), `since` the time of the first sample
+    outside. `unit` is that of a position, "" for a momentum; `degrees`: the file has degrees.
+    """
 
     coordinate: str
-    quantity: str  # "position" or "momentum"
-    by: float  # largest distance from the range, over its width; infinite where that is 0
-    since: float  # time of the first sample outside
-    low: float  # the recorded range
+    quantity: str
+    by: float
+    since: float
+    low: float
     high: float
-    unit: str  # of a position; "" of a momentum
-    degrees: bool = False  # whether it was recorded in degrees
+    unit: str
+    degrees: bool = False
     trajectory: int = 0
 
     def words(self, time_unit: str) -> str:
-        """One clause for people: what leaves which range, how far, and since when."""
-        moved = self.low < self.high
-        ends = (
-            span((self.low, self.high), self.unit, self.degrees)
-            if moved
-            else f"{size(self.high, self.unit, self.degrees)} throughout"
-        )
+        """One clause: the quantity, its range, the distance from the range, and the time."""
+        ends, by = f"{size(self.high, self.unit, self.degrees)} throughout", ""
+        if self.low < self.high:
+            ends = span((self.low, self.high), self.unit, self.degrees)
+            by = f" by {100 * self.by:.2g} % of its width"
         time = size(self.since, time_unit, digits=4)
         where = f" in trajectory {self.trajectory}" if self.trajectory else ""
-        by = f" by {100 * self.by:.2g} % of its width" if moved else ""
         return f"the {self.quantity} of {self.coordinate} ({ends}){by}, since t = {time}{where}"
 
 
 def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:
     """Lowest and highest q, p and s over a set of states."""
-    columns = {"q": q, "p": p, "s": s[:, None]}
-    return {
-        f"{name}_{end}": (x.amin(0) if end == "low" else x.amax(0)).tolist()
-        for name, x in columns.items()
-        for end in ("low", "high")
-    }
+    ends = {name: x.aminmax(dim=0) for name, x in (("q", q), ("p", p), ("s", s[:, None]))}
+    return {f"{name}_{end}": x.tolist() for name, (a, b) in ends.items() for end, x in (("low", a), ("high", b))}
 
 
 def quantities_outside(
-    box: Mapping[str, Sequence[float]],  # lowest and highest q and p of the fit; nothing is beyond an empty one
-    like: Trajectories,  # names, units and angles of the coordinates
+    box: Mapping[str, Sequence[float]],
+    like: Trajectories,
     t: Tensor,  # (N,)
-    q: Tensor,  # (..., N, n) motions at the same times; NaN after a failed step
+    q: Tensor,  # (..., N, n)
     p: Tensor,  # (..., N, n)
 ) -> list[Beyond]:
-    """Every position and momentum that leaves its range by more than `MARGIN`, of the motion that leaves it farthest.
+    """Every position and momentum that leaves its range by more than `MARGIN`, for the motion that leaves it farthest.
 
-    Angles are taken modulo 2π.
+    `box` holds the lowest and highest q and p of the fit; an empty box has no range. `like` has the names, units and
+    angles of the coordinates. q and p are motions at the same times t, NaN after a failed step. Angles are compared
+    modulo 2π.
     """
     found = []
     for key, x in (("q", q), ("p", p)) if box else ():
@@ -85,7 +86,7 @@ def quantities_outside(
 
 
 def farthest(motions: Iterable[Sequence[Beyond]]) -> tuple[Beyond, ...]:
-    """Of trajectories with times of their own, for each quantity the one that leaves its range farthest."""
+    """For each quantity the trajectory that leaves its range farthest; `motions` are trajectories with own times."""
     every = [replace(each, trajectory=b) for b, found in enumerate(motions) for each in found]
     first: dict[tuple[str, str], Beyond] = {}
     for each in sorted(every, key=lambda each: -each.by):
@@ -94,7 +95,7 @@ def farthest(motions: Iterable[Sequence[Beyond]]) -> tuple[Beyond, ...]:
 
 
 def warning(found: Sequence[Beyond], time_unit: str) -> str:
-    """One sentence; "" where nothing leaves its range."""
+    """One sentence; "" if no quantity leaves its range."""
     if not found:
         return ""
     each = "; ".join(one.words(time_unit) for one in found)
@@ -102,16 +103,16 @@ def warning(found: Sequence[Beyond], time_unit: str) -> str:
 
 
 def other_steps(times: Tensor, h_range: tuple[float, float], time_unit: str) -> str:
-    """One sentence where steps are shorter or longer than those of the fit; "" where none is."""
+    """One sentence if steps are shorter or longer than those of the fit, else ""."""
     (low, high), steps = h_range, times.diff()
-    if low * (1 - HAIR) <= float(steps.min()) and float(steps.max()) <= high * (1 + HAIR):
+    if low * (1 - ROUNDING) <= float(steps.min()) and float(steps.max()) <= high * (1 + ROUNDING):
         return ""
     mean = f"steps of {size(float(steps.mean()), time_unit, digits=6)}"
     return f"{mean} are outside of those that the model was fitted to, {span(h_range, time_unit)}"
 
 
 def range_in_words(box: Mapping[str, Sequence[float]], like: Trajectories) -> str:
-    """The range that a fit was trained on, in words; "" where it is not known."""
+    """The range of the training data in words; "" if unknown."""
     if not box:
         return ""
     parts = []

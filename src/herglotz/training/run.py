@@ -35,35 +35,35 @@ if TYPE_CHECKING:
 class Run:
     """A trained model with everything that is needed to judge it.
 
-    `prediction` is the model's free run at every sample: on the training part from the fitted states, and from the last
-    training sample on without another look at the data. `rollout`, `predict`, `plot`, `export` and `verify` take and
-    return plain numbers, arrays and files; `stepper` is the differentiable stepper behind them.
+    `prediction` holds the model's positions at every sample: the fitted states on the training part, then one free run
+    from the last training sample. `rollout`, `predict`, `plot`, `export` and `verify` take and return plain numbers,
+    arrays and files; `stepper` is the differentiable stepper behind them.
 
     Parameters
     ----------
     model, config
-        The discrete Lagrangian L_d, and the settings that `fit` was told: `fit(data, run.config)` gives the same fit.
-        `decided` holds them with what the plan decided.
+        The discrete Lagrangian L_d, and the user's settings: `fit(data, run.config)` gives the same fit.
     metrics, history
         Errors in the data's units, verdict, plan and equation (`docs/trajectory.md`, section 8); cost by iteration.
     data, train_lengths
-        All N samples, and how many leading ones of each trajectory were trained on.
+        All N samples, and the number of leading samples of each trajectory that were trained on.
     states
-        q (N, n), p (N, n) and s (N,) at every sample; `stepper.velocity(states, h)` has v.
+        q (N, n), p (N, n) and s (N,) at every sample; `stepper.velocity(states, h)` gives v.
     h, box, reading
-        Typical step, in the data's unit of time; lowest and highest q, p, s of the training part; how data were read.
+        Typical model step, in the data's unit of time; lowest and highest q, p, s of the training part, beyond which
+        the model extrapolates; the user's options of reading the data (`herglotz.training.run_folder.Reading`).
     """
 
     model: ContactLagrangian
     config: FitConfig
     metrics: dict[str, Any]
-    data: Trajectories  # all samples, training and test
-    train_lengths: tuple[int, ...]  # leading samples of each trajectory that were trained on
-    states: State  # (N, n), (N, n), (N,) at every sample
-    h: float  # typical model step
-    box: dict[str, list[float]]  # range of q, p, s over the training part: where the model can be trusted
-    history: list[dict[str, Any]]  # stage, iteration, cost
-    reading: dict[str, Any] = field(default_factory=dict)  # what was told of reading the data (`Reading`)
+    data: Trajectories
+    train_lengths: tuple[int, ...]
+    states: State  # (N, n), (N, n), (N,)
+    h: float
+    box: dict[str, list[float]]
+    history: list[dict[str, Any]]
+    reading: dict[str, Any] = field(default_factory=dict)
 
     @property
     def prediction(self) -> Tensor:
@@ -71,21 +71,21 @@ class Run:
         return self.states.q
 
     def states_at_end(self) -> State:
-        """Return the state at the last sample of every trajectory, (B, n), (B, n), (B,), to go on from."""
-        last = [first + length - 1 for first, length in zip(self.data.offsets, self.data.lengths, strict=True)]
-        return State(*(x[last] for x in self.states))
+        """The state at the last sample of every trajectory, (B, n), (B, n), (B,): the start of a forecast."""
+        ends = torch.tensor(self.data.lengths).cumsum(0) - 1
+        return State(*(x[ends] for x in self.states))
 
     @property
     def decided(self) -> FitConfig:
-        """The settings with what the plan decided: level, objective, terms, friction, order, substeps."""
+        """The settings with the decisions of the plan: level, objective, terms, friction, order, substeps."""
         plan = self.metrics.get("plan")
         return Plan.from_dict(plan).applied(self.config) if plan else self.config
 
     @property
     def h_range(self) -> tuple[float, float]:
-        """The shortest and the longest step that the model was fitted to, with a hair for rounded time stamps.
+        """The shortest and the longest model step of the fit, widened by 1e-7 for rounded time stamps.
 
-        A tuned model is made for one step.
+        A tuned model has one step.
         """
         steps, m = self.data.steps().h, self.decided.substeps
         fitted = steps[steps <= GAP * m * self.h]
@@ -96,18 +96,18 @@ class Run:
 
     @property
     def arrival(self) -> Arrival:
-        """What happens to recorded inputs before they act: hold, delay and lag; `data.u` is what acts."""
+        """How recorded inputs become the acting inputs `data.u`: hold, delay and lag."""
         plan = self.metrics.get("plan") or {}
         return Arrival(plan.get("hold") or self.data.hold, plan.get("delay", 0.0), plan.get("lag", 0.0))
 
     @property
     def setting(self) -> dict[str, Any]:
-        """Return the setting of a run that `herglotz tune` wrote (artefact, dtype, tol, …); empty for any other run."""
+        """The setting of a run that `herglotz tune` wrote (artefact, dtype, tol, …); empty for any other run."""
         return (self.metrics.get("tuned") or {}).get("chosen", {})
 
     @property
     def stepper(self) -> Stepper:
-        """The trained time stepper, with Newton's tolerance as tuned."""
+        """The trained time stepper, with the tuned tolerance of Newton's method if the run was tuned."""
         return Stepper(self.model, tol=self.setting.get("tol"))
 
     @property
@@ -115,13 +115,13 @@ class Run:
         """The continuous equation of the model at its typical step: field, energy H̃, modified Lagrangian L̃."""
         if isinstance(self.model, Driven) and self.data.u is not None:
             raise InputError("the model takes inputs: give them, ContinuousEquation(run.model.at(u), run.h)")
-        return _asked("theory").ContinuousEquation(self.model, self.h)
+        return _module("theory").ContinuousEquation(self.model, self.h)
 
     def at_step(self, h: float) -> OneStepMethod:
-        """The model's motion at any step h > 0: a stepper, exact for the motion that the model has at its own step.
+        """A stepper for any step h > 0 that reproduces the motion of the model at its own step.
 
-        Inside `h_range` it is `stepper`. Elsewhere Φ̃_h = Φ̃_r ∘ Φ̃_H^k for h = kH + r: steps of the typical H and a part
-        (`theory.FractionalStepper`, docs/theory.md), UNRESOLVED where the recorded step is too long for the motion.
+        Inside `h_range` that is `stepper`. Elsewhere Φ̃_h = Φ̃_r ∘ Φ̃_H^k for h = kH + r: k typical steps H and a part r
+        (`theory.FractionalStepper`, docs/theory.md). UNRESOLVED if the recorded step is too long for the motion.
 
         Parameters
         ----------
@@ -142,12 +142,12 @@ class Run:
         if self.h_range[0] <= h <= self.h_range[1]:
             return self.stepper
         tolerance = {torch.float32: 1e-3, torch.float64: 1e-6}[self.states.q.dtype]
-        return _asked("theory").FractionalStepper(self.continuous, tolerance=tolerance)
+        return _module("theory").FractionalStepper(self.continuous, tolerance=tolerance)
 
     def energy(self, state: State) -> Tensor:
-        """The energy H̃(q, p, s) of the model at states; dH̃/dt = −(∂H̃/∂s) H̃.
+        """The energy H̃(q, p, s) of the model at the given states; dH̃/dt = −(∂H̃/∂s) H̃.
 
-        With friction or other forces H̃ changes by their power, too (section 1 of `docs/mathematics.md`).
+        The power of friction and of other forces changes H̃ as well (section 1 of `docs/mathematics.md`).
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ class Run:
         Raises
         ------
         InputError
-            If the neighbours of a state cannot be stepped to.
+            If a step from a state to its neighbours fails.
         """
         H = self.continuous.hamiltonian(*state)
         if len(lost := (~torch.isfinite(H)).nonzero()):
@@ -170,7 +170,7 @@ class Run:
         return H
 
     def equation(self) -> Equation:
-        """M q̈ = forces as learned, in the data's units; ± where all terms are named (docs/tutorials/duffing.md)."""
+        """The learned M q̈ = forces, in the data's units; with ± if all terms are named (docs/tutorials/duffing.md)."""
         known = self.metrics.get("equation")
         return Equation.from_dict(known) if known else equation_of(self, None, notes_of(self))
 
@@ -198,20 +198,20 @@ class Run:
         return State(*(x[row].detach() for x in self.states)), float(self.data.t[row])
 
     def rollout(self, steps: int, **start: Any) -> Motion:
-        """Step the model alone; numpy arrays come out, without gradients (`run.stepper.rollout` has gradients).
+        """Step the model without data. The result is numpy arrays; `run.stepper.rollout` has gradients.
 
         Parameters
         ----------
         steps
             Number of steps K.
         q0, v0, s0, trajectory
-            Start, (..., n), (..., n), (...); left out, the last fitted state of this trajectory (0). s0 is 0 by
-            default; a momentum `p0` may stand in the place of the velocity v0.
+            Start, (..., n), (..., n), (...); default: the last fitted state of `trajectory` (0). s0 is 0 by default; a
+            momentum `p0` may replace the velocity v0.
         t0, h
-            Time of the start; left out, that of the fitted state, or 0. Step, in the data's unit of time; left out, the
-            model's own, or those of recorded inputs.
+            Time of the start; default: the time of the fitted state, or 0 if q0 is given. Step, in the data's unit of
+            time; default: the model's step, or the steps of recorded inputs.
         inputs
-            Held (m,), a step each (K, m), or a recording (path or trajectories) whose inputs act at their own times.
+            Constant (m,), one per step (K, m), or a recording (path or trajectories) with its own times.
 
         Returns
         -------
@@ -221,7 +221,7 @@ class Run:
         Raises
         ------
         InputError
-            If shapes do not fit the model, or a recording does not cover the rollout.
+            If a shape does not fit the model, or the recording is shorter than the rollout.
         """
         return free_motion(self, steps, **start)
 
@@ -233,8 +233,8 @@ class Run:
         data
             Anything that `fit` takes: a path, a DataFrame, arrays, trajectories.
         **settings
-            How to read it (`herglotz.data.as_trajectories`; with `sensor_zeros` no others are taken off), and `warmup`,
-            `windows`, `horizon`, `same_zeros` (`herglotz.training.predict`).
+            Options of reading (`herglotz.data.as_trajectories`; `sensor_zeros` replaces the zeros that prediction would
+            estimate), and `warmup`, `windows`, `horizon`, `same_zeros` (`herglotz.training.predict`).
 
         Returns
         -------
@@ -244,7 +244,7 @@ class Run:
         Raises
         ------
         InputError
-            If the recording is not of the same coordinates, units and inputs, or is too short.
+            If the recording has other coordinates, units or inputs, or is too short.
         """
         reading, others = split_options(settings)
         others.setdefault("same_zeros", "sensor_zeros" in reading)
@@ -268,25 +268,25 @@ class Run:
         InputError
             If there is no figure of that name.
         """
-        known = _asked("plots.theory").NAMED
+        known = _module("plots.theory").NAMED
         refuse({f"there is no figure {name!r}; choose one of {', '.join(known)}": name not in known})
         return known[name](self)
 
     def save(self, folder: str | Path) -> None:
-        """Write the run into a folder, made if missing, as `save_run` does; `herglotz.load_run` reads it."""
-        _asked("training.run_folder").save_run(self, folder)
+        """Write the run into a folder with `save_run`, which creates the folder; `herglotz.load_run` reads the run."""
+        _module("training.run_folder").save_run(self, folder)
 
     def export(self, path: str | Path, kind: str | None = None, **settings: Any) -> Path:
-        """Write one file that steps without this package (`herglotz.export.export_run`).
+        """Write one file that steps the model without this package (`herglotz.export.export_run`).
 
         Parameters
         ----------
         path
-            The file; .pt2, .onnx, .h, .c and .fmu say what is written.
+            The file; the suffix .pt2, .onnx, .h, .c or .fmu chooses the format.
         kind
-            pt2, onnx, aoti, c, casadi, acados, fmu or fmu2, where the name of the file does not say it.
+            pt2, onnx, aoti, c, casadi, acados, fmu or fmu2; needed if the suffix does not choose the format.
         **settings
-            Of the writer of that kind, such as `name` in C.
+            Settings of the writer of that format, for example `name` in C.
 
         Returns
         -------
@@ -296,28 +296,28 @@ class Run:
         Raises
         ------
         InputError
-            If the kind is not known, or its extra is missing.
+            If the kind is unknown, or the optional packages for this kind are not installed.
         """
-        return _asked("export").export_run(self, path, kind, **settings)
+        return _module("export").export_run(self, path, kind, **settings)
 
     def verify(self, **settings: Any) -> Any:
         """Measure every identity; `print(run.verify().table())` (`herglotz.verify.verify`)."""
-        return _asked("verify").verify(self, **settings)
+        return _module("verify").verify(self, **settings)
 
     def symmetries(self, **settings: Any) -> Any:
-        """Find translations, rotations and other affine symmetries, and what they keep; `print(run.symmetries())`.
+        """Find affine symmetries (translations, rotations, …) and their momenta J; `print(run.symmetries())`.
 
         J_{k+1} = c_k J_k within the error of the run's own free run (section 6 of `docs/mathematics.md`).
         """
-        return _asked("verify").symmetries(self, **settings)
+        return _module("verify").symmetries(self, **settings)
 
     def report(self, folder: str | Path, against: Any = None) -> list[Path]:
-        """Write report.html, which fetches nothing, and its twin report.md.
+        """Write report.html, which loads nothing from the network, and the same report as report.md.
 
         Parameters
         ----------
         folder
-            Where to write; made if missing.
+            Where to write; created if missing.
         against
             Another recording to score the model on: anything that `fit` takes.
 
@@ -329,13 +329,13 @@ class Run:
         Raises
         ------
         InputError
-            If the recording cannot be read, or is not of the same coordinates.
+            If the recording cannot be read, or has other coordinates.
         """
         other = None if against is None else as_trajectories(against, like=self.data)
-        return _asked("report").write_report(self, folder, other, name=str(folder))
+        return _module("report").write_report(self, folder, other, name=str(folder))
 
     def summary(self) -> str:
-        """What was reached, in a few lines."""
+        """Data, settings, errors, equation and verdict, in a few lines."""
         return summary(self)
 
     def __repr__(self) -> str:
@@ -345,6 +345,6 @@ class Run:
         return as_html(self)
 
 
-def _asked(module: str) -> Any:
-    """A module that fits do without, loaded when a run is asked for something of it; most of them know runs."""
+def _module(module: str) -> Any:
+    """Import a module of the package on first use: most of these modules import `Run`, and a fit needs none of them."""
     return import_module(f"herglotz.{module}")

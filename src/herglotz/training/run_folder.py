@@ -1,4 +1,4 @@
-"""A finished fit on disk: four files, and the manifest that says which four belong together."""
+"""A finished fit on disk: four files, and a manifest with their checksums."""
 
 from __future__ import annotations
 
@@ -26,14 +26,17 @@ from herglotz.training.equation import Equation
 from herglotz.training.plan import Plan
 from herglotz.training.run import Run
 
-FORMAT = 1  # of the folder; a change that older versions cannot read raises it
+# Version of the folder's format; a change that older versions cannot read increments it.
+FORMAT = 1
 FILES = ("model.pt", "config.json", "metrics.json", "fit.npz")
 MANIFEST = "manifest.json"
-LOG = "history.csv"  # for people; nothing reads it back
+# Costs for the reader of the folder; the package does not read this file.
+LOG = "history.csv"
+REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"
 
 
 class Manifest(TypedDict):
-    """What manifest.json holds: the sha256 of every file of the run."""
+    """Entries of manifest.json, with the sha256 of every file of the run."""
 
     format: int
     herglotz: str
@@ -41,7 +44,7 @@ class Manifest(TypedDict):
 
 
 class StoredModel(TypedDict):
-    """What model.pt holds."""
+    """Entries of model.pt."""
 
     format: int
     model: dict[str, Any]
@@ -55,7 +58,7 @@ class StoredModel(TypedDict):
 
 
 class Metrics(TypedDict, total=False):
-    """What later commands take from metrics.json, where it is there."""
+    """Entries of metrics.json that later commands read, if present."""
 
     plan: Plan
     equation: Equation
@@ -80,14 +83,14 @@ class Metrics(TypedDict, total=False):
 def save_run(run: Run, folder: str | Path) -> None:
     """Write model.pt, config.json, metrics.json, fit.npz, manifest.json with the sha256 of these, and history.csv.
 
-    Each file appears whole or not at all; a folder whose writing was interrupted does not fit its manifest.
+    Each file is written atomically; a folder from an interrupted write does not match its manifest.
 
     Parameters
     ----------
     run
-        What `fit` returned.
+        The result of `fit`.
     folder
-        Where to write; made if missing.
+        Where to write; created if missing.
 
     Raises
     ------
@@ -143,7 +146,7 @@ def load_run(folder: str | Path) -> Run:
     Raises
     ------
     InputError
-        If a file is missing, damaged, changed, of another run or of another format.
+        If a file is missing, damaged or changed, or belongs to another run or format.
     """
     folder = Path(folder)
     if folder.is_file():
@@ -155,7 +158,8 @@ def load_run(folder: str | Path) -> Run:
     path = folder / "model.pt"
     try:
         stored = torch.load(BytesIO(contents["model.pt"]), weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file
+    # torch raises many kinds of errors for a damaged file.
+    except Exception as error:
         raise InputError(f"{path}: cannot be read ({type(error).__name__}); {REMEDY}") from None
     check_entries(StoredModel, stored, str(path), REMEDY)
     if stored["format"] != FORMAT:
@@ -169,7 +173,8 @@ def load_run(folder: str | Path) -> Run:
         model = ContactLagrangian(ModelConfig.from_dict(stored["model"])).to(config.torch_dtype)
         model.load_state_dict(stored["parameters"])
         states = State(**stored["states"])
-    except (InputError, RuntimeError, TypeError) as error:  # another version's settings or parameters
+    # Settings or parameters may be those of another version.
+    except (InputError, RuntimeError, TypeError) as error:
         line = " ".join(str(error).split())
         raise InputError(f"{folder}: its settings and parameters are of no model ({line[:200]}); {REMEDY}") from None
     data = trajectories_of(contents["fit.npz"], folder / "fit.npz")
@@ -183,7 +188,7 @@ def load_run(folder: str | Path) -> Run:
 
 
 def _bound(folder: Path) -> dict[str, bytes]:
-    """The four files, each with the sha256 that the manifest says."""
+    """Contents of the four files, checked against the sha256 in the manifest."""
     path = folder / MANIFEST
     if not path.is_file():
         raise InputError(
@@ -209,7 +214,7 @@ def _bound(folder: Path) -> dict[str, bytes]:
 
 
 def _check_sizes(run: Run, digest: str, folder: Path) -> None:
-    """Refuse states, lengths, box or data that are not of one another."""
+    """Refuse states, lengths, box and data that do not fit together."""
     N, n, path = run.data.samples, run.model.config.dof, folder / "model.pt"
     shapes = {"q": (N, n), "p": (N, n), "s": (N,)}
     bad = [name for name, x in run.states._asdict().items() if tuple(x.shape) != shapes[name]]
@@ -224,7 +229,7 @@ def _check_sizes(run: Run, digest: str, folder: Path) -> None:
 
 
 def _check_metrics(run: Run, path: Path) -> None:
-    """Refuse numbers of samples, or zeros of sensors, that the data have not."""
+    """Refuse outlier samples, or zeros of sensors, that do not fit the data."""
     outliers, zeros = run.metrics.get("outlier_samples", ()), run.metrics.get("plan", {}).get("zeros", ())
     if not all(0 <= k < run.data.samples for k in outliers) or len(zeros) not in (0, len(run.data) * run.data.dof):
         raise InputError(f"{path}: outlier_samples or the plan's zeros are not those of the run's data; {REMEDY}")
@@ -233,9 +238,9 @@ def _check_metrics(run: Run, path: Path) -> None:
 def _log(history: list[dict[str, Any]]) -> bytes:
     """Stage, iteration and cost as csv."""
     buffer = StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(names := ("stage", "iteration", "cost"))
-    writer.writerows([row[name] for name in names] for row in history)
+    writer = csv.DictWriter(buffer, ["stage", "iteration", "cost"], extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(history)
     return buffer.getvalue().encode()
 
 
@@ -253,11 +258,8 @@ def _json(path: Path, content: bytes) -> dict[str, Any]:
     return values
 
 
-REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"
-
-
 class Reading(TypedDict, total=False):
-    """Options of `herglotz.data.load` by their names, then what `herglotz fit` makes of the recording."""
+    """Options of reading a recording: those of `herglotz.data.load`, then those of `herglotz fit`."""
 
     time: str
     group: str
@@ -275,9 +277,9 @@ class Reading(TypedDict, total=False):
 
 
 def reading_in(settings: dict[str, Any], where: str) -> dict[str, Any]:
-    """Take what config.json says of reading the data out of its settings; {} where the user said nothing.
+    """Remove the options of reading from the settings in config.json and return them; {} if there are none.
 
-    Raise InputError if an entry is not known, or of another type than the flag of its name.
+    Raise InputError if an entry is unknown or has a wrong type.
     """
     reading = settings.pop("reading", {})
     check_entries(Reading, reading, f"{where}: reading", REMEDY)
@@ -287,9 +289,9 @@ def reading_in(settings: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def reading_told(options: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """The options of `as_trajectories` that a file could be read with: names and numbers, no arrays of times.
+    """The options of `as_trajectories` that apply to a file: names and numbers, no arrays of times.
 
-    `names` are the coordinates that were read: those that `angles=True` means.
+    `names` are the coordinates of the data, to which `angles=True` refers.
     """
     plain = {name: list(x) if np.ndim(x) == 1 else x for name, x in options.items()}
     if isinstance(angles := plain.get("angles"), bool):

@@ -1,4 +1,4 @@
-"""`select`: fit the ladder, compare held-out errors, keep the level of fewest parameters that is not beaten."""
+"""`select`: fit the levels, compare their held-out errors, keep the one with fewest parameters that is not beaten."""
 
 from __future__ import annotations
 
@@ -30,19 +30,26 @@ from herglotz.training.structure import structure_is_free, terms_are_free
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
-LADDER = (*LEVELS, "auto")  # "auto", which `fit` takes without a level, is the richest and comes last
-BLOCKS = 5  # least number of blocks that the held-out time of all trajectories is divided into
-TIMED_STEPS = 20  # of a rollout whose time is measured, over which the cost of the call itself is spread
+# "auto", the default of `fit`, is the richest and comes last.
+LADDER = (*LEVELS, "auto")
+# Least number of blocks of held-out time over all trajectories.
+BLOCKS = 5
+# Steps of a timed rollout: enough to make the cost of the call small.
+TIMED_STEPS = 20
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One level of the ladder, fitted from several seeds."""
+    """One level, fitted from several seeds.
+
+    `errors` are held-out RMS errors of free runs, in units of q, inf for a failed run; `step_us` is the processor time
+    of one step of one trajectory, in µs.
+    """
 
     level: str
     runs: tuple[Run, ...]
-    errors: Tensor  # (seeds, blocks) held-out RMS of the free run, in units of q; inf where it failed
-    step_us: float  # processor time of one step of one trajectory, µs
+    errors: Tensor  # (seeds, blocks)
+    step_us: float
 
     @property
     def error(self) -> float:
@@ -56,12 +63,12 @@ class Candidate:
 
     @property
     def median_seed(self) -> int:
-        """The seed of the median held-out RMS (the lower one of two)."""
+        """The place of the run with the median held-out RMS (the lower of two)."""
         return int(self.of_seeds.argsort()[(len(self.runs) - 1) // 2])
 
     @property
     def best(self) -> Run:
-        """Return the run of the median seed, which is representative."""
+        """The run of the median seed, which represents the level."""
         return self.runs[self.median_seed]
 
     @property
@@ -89,9 +96,9 @@ class Selection:
     Parameters
     ----------
     candidates
-        One a level: its runs, and their errors over the held-out blocks, in units of q.
+        One per level: its runs, and their errors over the held-out blocks, in units of q.
     chosen
-        That of them which is kept; `run` is its representative fit.
+        The chosen candidate; `run` is its representative fit.
     """
 
     candidates: tuple[Candidate, ...]
@@ -99,11 +106,11 @@ class Selection:
 
     @property
     def run(self) -> Run:
-        """The chosen level's representative run."""
+        """The representative run of the chosen level."""
         return self.chosen.best
 
     def table(self) -> str:
-        """Level × held-out error × spread × parameters × cost, for people, in 80 columns; → marks the chosen level."""
+        """Level × held-out error × spread × parameters × cost as text, in 80 columns; → marks the chosen level."""
         unit = common_unit(self.run.data.units)
         lines = [f"Free runs over the held-out time{unit and f', in {unit}'}; the arrow marks the chosen level:"]
         lines += [f"  {'level':<13}{'held-out RMS':>12}{'min … max':>20}{'parameters':>12}{'µs/step':>9}{'fit, s':>8}"]
@@ -136,39 +143,37 @@ def select(
 ) -> Selection:
     """Fit every level from every seed on the first part of each trajectory; score free runs over the rest.
 
-    The held-out time is cut into blocks (at least five in all); the score of a fit is the RMS over its blocks. Of the
-    levels that the best one does not beat, that of the fewest trained parameters is chosen, and of equals the first of
-    the ladder. To beat is to win by the rule of the prior's strengths (`cross_validation.beaten`) between the median
-    seeds, and beyond the best level's own range over seeds.
+    The held-out time is divided into blocks (at least five in all); the score of a fit is the RMS over its blocks. The
+    level with the fewest trained parameters is chosen among those that the best level does not beat; of equals, the
+    first. The best level beats another by the rule of the prior's strengths (`cross_validation.beaten`) between the
+    median seeds, and if the other's error is outside the best level's own range over seeds.
 
     Parameters
     ----------
     data
         Trajectories of positions, or anything else that `fit` takes.
     levels
-        Which levels, of `herglotz.models.LEVELS` and "auto", which is `fit` left to itself; tried in this order.
-        None: those of `levels_for`.
+        Levels of `herglotz.models.LEVELS`, and "auto", the default of `fit`. None: those of `levels_for`.
     seeds
-        Fits a level, with seeds config.seed, config.seed + 1, …; one where neither a network nor a
-        batch is drawn.
+        Fits per level, with seeds config.seed, config.seed + 1, …; one if nothing is random (no network, no batch).
     config
-        Everything else about the fits; `train_fraction` must be below 1.
+        All other settings of the fits; `train_fraction` must be below 1.
     out
-        Folder for one checkpoint a fit, so that `resume` goes on after an interruption.
+        Folder for one checkpoint per fit, from which `resume` continues after an interruption.
     progress, resume
         As for `fit`.
     **reading
-        How other data than trajectories are to be read (`herglotz.data.as_trajectories`).
+        Options of reading data other than trajectories (`herglotz.data.as_trajectories`).
 
     Returns
     -------
     Selection
-        Every fit with its errors; `run` is the one to keep, and `table()` tells why.
+        Every fit with its errors; `run` is the chosen one, and `table()` shows why.
 
     Raises
     ------
     InputError
-        If a level is unknown or nothing is held out, or no level has a finite held-out error.
+        If a level is unknown, nothing is held out, or no level has a finite held-out error.
     """
     config = config or FitConfig()
     check_levels(levels)
@@ -194,7 +199,6 @@ def select(
 
     for level in ladder:
         runs = [one(level, config.seed)]
-        # Without a network or batches nothing is drawn: fits from all seeds are one fit.
         drawn = runs[0].model.config.networks or config.batch
         runs += [one(level, config.seed + k) if drawn else runs[0] for k in range(1, seeds)]
         errors = torch.stack([block_errors(run) for run in runs])
@@ -203,7 +207,7 @@ def select(
 
 
 def _tell(run: Run, done: int, total: int, took: float) -> None:
-    """One line on stderr after a fit, with the time that the fits to come will take at the pace so far."""
+    """Print one line on stderr after a fit, with the expected time of the remaining fits."""
     rms, left = run.metrics.get("extrapolation_rms"), took / done * (total - done)
     error = "fails" if rms is None else f"{rms:.3g}"
     text = f"fit {done} of {total}: {run.decided.level}, seed {run.config.seed}: held-out RMS {error}"
@@ -211,7 +215,7 @@ def _tell(run: Run, done: int, total: int, took: float) -> None:
 
 
 def check_levels(levels: Sequence[str] | None) -> None:
-    """Raise unless all levels are known and one is named; None stands for those that fit the data."""
+    """Raise unless every level is known and there is at least one; None stands for `levels_for`."""
     unknown = [level for level in levels or () if level not in LADDER]
     names, near = ", ".join(LADDER), did_you_mean("".join(unknown[:1]), LADDER)
     refuse({
@@ -221,11 +225,11 @@ def check_levels(levels: Sequence[str] | None) -> None:
 
 
 def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
-    """The levels that are compared where none is named.
+    """The default levels of `select`.
 
-    All but the full one; the forced one alone where forces are told; where inputs are recorded and used, the forced one
-    and "auto", which adds dry friction to it; and "auto" where `fit` looks for terms or for a structure that no level
-    has (`herglotz.training.structure`).
+    All but "full". If the settings name forces, only "forced"; if inputs are recorded and used, "forced" and "auto",
+    which adds dry friction. "auto" as well if `fit` searches for terms or for a structure that no level has
+    (`herglotz.training.structure`).
     """
     if data.u is not None and config.use_inputs and not config.coulomb:
         return ("forced", "auto")
@@ -237,9 +241,9 @@ def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
 
 def block_errors(run: Run) -> Tensor:
     """RMS of the run's free prediction over each block of held-out time, (blocks,), in units of q; inf if it failed."""
-    held = unseen_errors(run)
-    pieces = -(-BLOCKS // len(held))
-    blocks = [part for x in held for part in x.tensor_split(min(pieces, len(x))) if len(part)]
+    errors = unseen_errors(run)
+    pieces = -(-BLOCKS // len(errors))
+    blocks = [part for x in errors for part in x.tensor_split(min(pieces, len(x))) if len(part)]
     if not blocks:
         raise InputError("the data leave no sample to hold out; record longer, or lower the train fraction")
     rms = torch.stack([x.square().mean().sqrt() for x in blocks])
@@ -255,11 +259,11 @@ def _simplest(candidates: list[Candidate]) -> Candidate:
         within = c is best or c.error <= float(best.of_seeds.max())
         return within or not beaten(c.errors[c.median_seed], best.errors[best.median_seed])
 
-    return min(filter(as_good, candidates), key=lambda c: c.parameters)  # the first of equals
+    return min(filter(as_good, candidates), key=lambda c: c.parameters)
 
 
 def step_cost(run: Run) -> float:
-    """Microseconds of processor time that a step of the eager stepper takes, one trajectory, the best of three."""
+    """Processor time of a step of the eager stepper for one trajectory, in µs, the best of three measurements."""
     q, p, s = (x[:1] for x in run.states)
     costs = []
     with torch.no_grad():

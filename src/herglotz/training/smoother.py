@@ -22,28 +22,31 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
+# Process noise per radian of motion over the measurement noise (`smooth`): small, so that states follow the model.
+PROCESS_NOISE = 0.1
+
 
 @dataclass(frozen=True)
 class Smoothed:
-    """States at every sample and their standard errors, given the model."""
+    """States at every sample and their standard errors for a fixed model; s has 0 if the motion has no s."""
 
     states: State  # (N, n), (N, n), (N,)
-    std: State  # the same shapes; s has 0 where the motion does not depend on it
+    std: State  # (N, n), (N, n), (N,)
 
 
 def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
-    """Return the smoothed states of each trajectory for a fixed model.
+    """The smoothed states of each trajectory for a fixed model.
 
     Parameters
     ----------
     model
-        The dynamics; its parameters are held.
+        The dynamics; its parameters stay fixed.
     data
-        Positions, and inputs where the model takes them; steps may differ, samples may be missing.
+        Positions, and inputs if the model takes inputs. Steps may differ, samples may be missing.
     sigma
         Standard deviation of the noise of q, in its units.
     process
-        Of `SmoothingProblem`. Small: the model is believed; large: the data are.
+        Process noise (`SmoothingProblem`). Small: the states follow the model; large: they follow the data.
 
     Raises
     ------
@@ -59,7 +62,9 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     solved = smoothed_states(problem)
     if solved is None:
         where = data.source or "data"
-        raise InputError(f"{where}: the model has no step near these data, so nothing can be smoothed; fit it again")
+        raise InputError(
+            f"{where}: a step of the model near these data fails, so nothing can be smoothed; fit it again"
+        )
     x, _ = solved
     found = problem.states(x)
     std = torch.zeros_like(found)
@@ -68,8 +73,14 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     return Smoothed(*(state_of(y) for y in (found, std)))
 
 
+def process_noise(model: ContactLagrangian, h: float) -> float:
+    """`process` of `SmoothingProblem` for steps h; it grows as √h, since the variance of a random force adds up."""
+    angle = h * max(v / x for v, x in zip(model.config.speed, model.config.scale, strict=True))
+    return PROCESS_NOISE * min(1.0, angle) ** 0.5
+
+
 def smoothed_states(problem: SmoothingProblem) -> tuple[Tensor, float] | None:
-    """All unknowns with the states smoothed, the model held, and ½|r|²; None where it has no step near the data."""
+    """All unknowns with smoothed states and a fixed model, and ½|r|²; None if a step near the data fails."""
     x = smoothing_start(problem)
     states = StatesOnly(problem, x[: problem.P])
     result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
@@ -77,10 +88,10 @@ def smoothed_states(problem: SmoothingProblem) -> tuple[Tensor, float] | None:
 
 
 def smoothing_start(problem: SmoothingProblem) -> Tensor:
-    """Unknowns that smoothing starts from: straight lines between samples, or the model's own motion near them.
+    """The start of smoothing: straight lines between samples, or with dry friction a motion of the model near the data.
 
-    A joint that set-valued friction holds stands still whatever its momentum is, so that a search which starts with
-    defects cannot mend them there; the motion from a start state has none.
+    A sticking joint stands still whatever its momentum: there the positions of a start with defects have no slope by
+    the momenta, and the defects stay. A motion of the model has no defects.
     """
     x, data, model = problem.start(), problem.data, problem.parameters.model
     if model.friction is None or not model.friction.dry:

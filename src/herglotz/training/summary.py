@@ -1,4 +1,4 @@
-"""What a run reached, in words: for the screen, a notebook and a file."""
+"""The result of a run in words: for the screen, a notebook and a file."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from herglotz.training.equation import Equation
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.recorded_range import range_in_words
 
-MOST_FEATURES, COLUMNS = 5, 80
-MOST_NAMED = 4  # coordinates; of a chain of masses the order says which is which
+MAX_FEATURES, COLUMNS = 5, 80
+# More coordinates are not explained: they form a chain, and their order is enough.
+MAX_NAMES = 4
 
 
 def rows(run: FittedRun) -> list[tuple[str, str]]:
-    """Names and values of what was reached, those that the run has."""
+    """Names and values of the results that the run has."""
     m, data = run.metrics, run.data
-    unit, degrees = common_unit(data.units), bool(data.degrees)  # as the file had them
+    unit, degrees = common_unit(data.units), bool(data.degrees)
     level = f"own L_d {m['own']}" if "own" in m else f"{run.decided.level} level"
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
@@ -35,7 +36,7 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
 
 
 def summary(run: FittedRun) -> str:
-    """A few lines for people, the verdict last."""
+    """A few lines of text, the verdict last."""
     table = rows(run)
     width = max(len(name) for name, _ in table)
     lines = [fill(value, COLUMNS, initial_indent=f"  {name:<{width}}  ", subsequent_indent=" " * (width + 4))
@@ -65,16 +66,16 @@ def as_html(run: FittedRun) -> str:
 
 
 def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
-    """The named terms, and which coordinate q1 is where it has a name of its own."""
-    told = [f"q{i} is {name}" for i, name in enumerate(names, 1) if name != f"q{i}" and len(names) <= MOST_NAMED]
-    rest = len(features) - MOST_FEATURES
-    named = sorted(features, key=lambda text: text.startswith(("sin", "cos")))  # waves of functions are many
-    shown = ", ".join(named[:MOST_FEATURES]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
-    return shown + (f"  ({', '.join(told)})" if told else "")
+    """The named terms with the waves of functions last, and the names of the coordinates q1, q2, …."""
+    symbols = [f"q{i} is {name}" for i, name in enumerate(names, 1) if name != f"q{i}" and len(names) <= MAX_NAMES]
+    rest = len(features) - MAX_FEATURES
+    named = sorted(features, key=lambda text: text.startswith(("sin", "cos")))
+    shown = ", ".join(named[:MAX_FEATURES]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
+    return shown + (f"  ({', '.join(symbols)})" if symbols else "")
 
 
 def model_card(run: FittedRun, h_range: tuple[float, float]) -> str:
-    """What a reader of an exported file should know: summary, verdict, and the range that the model was fitted to."""
+    """The comment of an exported file: summary, verdict, and the range of the training data."""
     steps, positions = span(h_range, run.data.time_unit), range_in_words(run.box, run.data)
     return "\n".join([
         f"Model of {run.data.source or 'a recording'} (sha256 {run.data.digest()[:16]})", summary(run),
@@ -84,5 +85,5 @@ def model_card(run: FittedRun, h_range: tuple[float, float]) -> str:
 
 
 def _told(value: float | None, unit: str, degrees: bool = False, after: str = "") -> str:
-    """Three digits and a unit; "" where there is no value."""
+    """Three digits and a unit; "" for None."""
     return "" if value is None else size(value, unit, degrees) + after

@@ -1,4 +1,4 @@
-"""What the rows of J and the residuals of multiple shooting add up to, segment by segment."""
+"""Sums over the rows of J and the residuals of multiple shooting, segment by segment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from herglotz.training.problems.grid import SegmentGrid
 
 
 class Sums(NamedTuple):
-    """What the rows of J and the residuals r of the data add up to, and the derivatives of the ends of segments."""
+    """JᵀJ and Jᵀr of the data in blocks, and the derivatives `slopes` of the ends of segments."""
 
     corner: Tensor  # (P, P)
     border: Tensor  # (S, d, P)
@@ -31,7 +31,7 @@ class Sums(NamedTuple):
     def add_samples(self, grid: SegmentGrid, Z: Tensor, by: Tensor, r: Tensor) -> None:
         """Add the rows by · ∂q of the samples, with residuals r (N, n), from derivatives Z (S, K+1, d, P + d) at nodes.
 
-        The derivatives of the ends of segments are noted too.
+        This sets `slopes` too.
         """
         P, n = len(self.corner), r.shape[1]
         rows, segment = Z.flatten(0, 1)[grid.node][:, :n] * by[..., None], grid.node // (grid.h.shape[1] + 1)
@@ -48,8 +48,8 @@ class Sums(NamedTuple):
     def add_joints(self, to: Tensor, by: Tensor, r: Tensor, own: Tensor | None = None) -> Tensor:
         """Add the rows by · ∂(end of the segment before − start) of the segments `to`, with residuals r, (J, d) each.
 
-        `own` (J, n, P) is by how much residuals of momenta shrink as the masses that they are over grow.
-        Return what couples the start of each segment with the next, (S, d, d).
+        Residuals of momenta are over the masses; `own` (J, n, P) is minus their derivative through the masses.
+        Return the coupling of the start of each segment with the next, (S, d, d).
         """
         upper = torch.zeros_like(self.blocks)
         if not len(to):
@@ -64,7 +64,7 @@ class Sums(NamedTuple):
         self.blocks[to - 1] += before.mT @ before
         self.border[to - 1] += before.mT @ by_theta
         self.by_state[to - 1] += (before.mT @ r[..., None])[..., 0]
-        # The row by the start itself is −by.
+        # The derivative by the start of the segment itself is −by.
         self.blocks[to] += torch.diag_embed(by.square())
         self.border[to] -= by[..., None] * by_theta
         self.by_state[to] -= by * r

@@ -1,4 +1,4 @@
-"""The data, settings and record that every stage of a fit shares, and the model that it starts from."""
+"""`Task`: the data, settings and record that every stage of a fit shares, and the model that a fit starts from."""
 
 from __future__ import annotations
 
@@ -12,25 +12,32 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.stages import Stages
 
-WIDER = 3  # a single layer has this multiple of units: it reaches a tenth of the error of two layers in the same time
-NOISY = 3e-4  # a one-step error above this share of the motion's size is noise: 40 iterations reach it on exact data
-LEAST_GRIP = 0.01  # of set-valued friction at the start of a fit, over the typical speed: small beside what is found
-EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the motion's size; smaller errors are rounding
+# Factor on the units of a single layer, which then has a tenth of the error of two layers in the same time.
+WIDER = 3
+# Share of the motion's size. A larger one-step error is noise: 40 iterations reach this share on exact data.
+NOISY = 3e-4
+# Least set-valued friction at the start of a fit, over the typical speed: small beside the friction of real joints.
+LEAST_GRIP = 0.01
+# σ of exact data over the motion's size: smaller errors are rounding.
+EXACT = {"float64": 1e-8, "float32": 1e-5}
 
-# Settings of a fit that its model has under the same name.
+# Settings of a fit that its `ModelConfig` has under the same name.
 AS_SET = ("level", "seed", "activation", "mass_width", "action_width", "dissipation", "coulomb", "input_map", "known",
           "alike", "diagonal", "coupled", "drag", "order", "terms", "translations", "absent")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Task:
-    """The data of a fit, the first look at them, its settings, and the record of its stages."""
+    """The data of a fit (the training part without spikes), their baseline, the settings, and the record of stages.
 
-    data: Trajectories  # what is fitted: the training part without spikes
+    A `hurried` fit only compares models, and ends when an iteration gains less than 1 %.
+    """
+
+    data: Trajectories
     base: Baseline
     config: FitConfig
     stages: Stages
-    hurried: bool = False  # a fit that only decides among models: iterations that gain less than 1 % end it
+    hurried: bool = False
 
     @property
     def size(self) -> float:
@@ -48,17 +55,17 @@ class Task:
 
 
 def drag_starts_the_fit(config: FitConfig) -> bool:
-    """Whether drag and a constant potential start the fit: where s d·q̇ is in L and the user does not say what else."""
+    """True if drag and a constant potential start the fit: s d·q̇ is in L, and the settings name no other terms."""
     other = config.known or config.terms or config.alike or config.objective == "raw" or config.supervision != "q"
     settings = config.features or other
     return config.level == "affine" and not settings
 
 
 def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian:
-    """A model with the network that the objective needs: the correction, the potential's, or a plain one alone.
+    """A model with the network that the objective needs.
 
-    Where the baseline's motions have "covered" the whole range, the correction is one layer of `WIDER` times as many
-    units. "none": named terms alone.
+    "correction" of the step; "covered": a correction of one layer with `WIDER` times as many units, if the motions of
+    the baseline cover the whole range; "potential"; "plain": a network as the whole model; "none": only named terms.
     """
     alone, wide, forced = network == "plain", network == "covered", config.level == "forced"
     features = ("1", *config.features) if drag_starts_the_fit(config) else () if alone else config.features
@@ -90,15 +97,16 @@ def _start(model: ContactLagrangian, base: Baseline, config: FitConfig) -> None:
         start = torch.tensor(base.input_map, dtype=torch.float64)
         model.friction.input_map.data.copy_(start.reshape(len(base.angles), -1))
     for name, values in base.start.items():
+        # At order 4 the features of the baseline come first, and keep their values.
         numbers = model.get_parameter(name).data.view(-1)
-        numbers[len(numbers) - len(values) :] = numbers.new_tensor(values)  # order 4 has the baseline's features first
+        numbers[len(numbers) - len(values) :] = numbers.new_tensor(values)
 
 
 def with_sticking(model: ContactLagrangian, *, excess: bool = True) -> ContactLagrangian:
-    """The model with set-valued dry friction in place of smooth friction, which a fit starts from.
+    """The model with set-valued dry friction in place of smooth friction, as the start of a fit.
 
-    Friction at 0 has no slope there; its forces start at `LEAST_GRIP` of the typical speed (mass 1) at least. Without
-    `excess` the one of breakaway stays as it is: at 0 or below it is none, and no fit moves it.
+    The derivative of the motion by a set-valued friction force of 0 is 0, and a fit cannot change the force. Forces
+    start at no less than `LEAST_GRIP` of the typical speed (mass 1). Without `excess` that of breakaway stays as it is.
     """
     other = ContactLagrangian(replace(model.config, sticking=True))
     known, least = dict(model.named_parameters()), LEAST_GRIP * max(model.config.speed)

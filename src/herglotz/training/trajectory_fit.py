@@ -1,4 +1,4 @@
-"""Fitting noisy trajectories: growing segments, then the strength of the prior by held-out blocks of time."""
+"""Fit noisy trajectories by multiple shooting: segments grow, then held-out errors choose the strength of the prior."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, spread
-from herglotz.errors import InputError
+from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
 from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
 from herglotz.training.first_states import first_states, states_of_pairs
@@ -23,22 +23,32 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import Task
 
-MOST = 300_000  # numbers in q: states, derivatives and held-out residuals take 15 kB of memory each (measured)
-LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
-FOLLOWED = 0.05  # of the spread of q: segments that miss less follow the motion, and grow on to simulation error
-FLOOR = 1e-6  # of the largest |q|: errors below it are no reason to stop growing segments
-WIDER = (30.0, 900.0)  # times weaker priors: the next ranges start where the default one ends, the last at 5 baselines
-HALVED = 2.0  # factor by which a weaker prior has to lower the error of the shortest segments
-SMALL = 1e-2  # of the largest |q|: shortest segments that miss less lack no force as large as the baseline's
-NOT_THE_NOISE = 1.5  # times the data's precision; as in the verdict
-FAR_OFF, NEAR = 1e-3, 1e-8  # damping of the first iteration: steps are Newton's near the minimum
-STAGE = 40  # iterations of a stage at most: a start near the optimum needs fewer, and a poor one is left by the next
-MANY = 4  # coordinates: of more, an iteration takes up to 0.2 s, and gains of 1e-4 would be waited for minutes
+# Numbers in q. Each takes 15 kB of memory for states, derivatives and held-out residuals (measured): 5 GB in all.
+MAX_POSITIONS = 300_000
+# Segments stop growing if their error exceeds this multiple of the error of shorter segments.
+LOST = 2.0
+# Segments of a sticking model grow further as long as their error is below this share of the spread of q: without a
+# restoring force errors grow with the length, and the simulation error is the objective.
+FOLLOWED = 0.05
+# Shares of the largest |q|. An error below FLOOR does not stop the growth of segments. If the shortest segments miss
+# less than SMALL, no force as large as the baseline's is missing.
+FLOOR, SMALL = 1e-6, 1e-2
+# Factors on the prior strengths: the first range starts where the default one ends, the second at 5 baseline forces.
+# A weaker prior has to halve the error of the shortest segments.
+WEAKER, HALVED = (30.0, 900.0), 2.0
+# Multiple of the data's precision, as in the verdict.
+NOT_THE_NOISE = 1.5
+# Damping λ of the first iteration: near the minimum, steps are Newton's.
+FAR_OFF, NEAR = 1e-3, 1e-8
+# Most iterations of a stage. A start near the optimum needs fewer; a poor optimum is improved by the next stage.
+STAGE = 40
+# With more coordinates an iteration takes up to 0.2 s, and gains of 1e-4 would take minutes.
+MANY_COORDINATES = 4
 
 
 @dataclass(frozen=True)
 class TrajectoryFit:
-    """A fit of parameters and segment states at one length of the segments and one strength of the prior."""
+    """Fitted parameters and segment states, for one length of the segments and one strength of the prior."""
 
     theta: Tensor  # (P,)
     problem: ShootingProblem
@@ -47,20 +57,21 @@ class TrajectoryFit:
 
     @property
     def misfit(self) -> Tensor:
-        """Residuals of the complete samples that are used, (N', n), in units of q."""
+        """Residuals of the complete samples in use, (N', n), in units of q."""
         return self.problem.misfit(self.path)[self.problem.used & self.problem.data.complete]
 
     @property
     def noise(self) -> float:
-        """Scale of the residuals, in units of q: their RMS, that of their bulk where the loss is robust."""
+        """Scale of the residuals, in units of q: RMS, or with a robust loss the median absolute deviation."""
         return scale_of(self.misfit) if self.problem.freedom else float(self.misfit.square().mean().sqrt())
 
-    def follows(self, sigma: float) -> bool:
-        """Whether it misses the data by no more than twice σ."""
-        return self.noise <= LOST * sigma
+    @property
+    def used(self) -> Tensor | None:
+        """Samples in use, (N,) bool; None for all."""
+        return None if bool(self.problem.used.all()) else self.problem.used
 
     def loses(self, plain: TrajectoryFit) -> bool:
-        """Whether it has lost data that least squares follow: what lies far from both alone is an outlier."""
+        """True if this robust fit gives up samples that `plain`, by least squares, follows: these are no outliers."""
         own, its = (float(fit.misfit.square().mean().sqrt()) for fit in (self, plain))
         return own > NOT_THE_NOISE * its
 
@@ -69,32 +80,27 @@ class TrajectoryFit:
         return self.problem.grid.at_samples(self.path.x)
 
     def held_out_errors(self) -> Tensor:
-        """Of every fold, in units of q; see `cross_validation`."""
+        """RMS error of every held-out block, in units of q (`cross_validation.held_out_errors`)."""
         problem = self.problem
         _, A, _ = problem.normal_equations(self.result.x)
         return held_out_errors(problem, self.path, self.theta, A)
 
 
-def check_size(data: Trajectories, most: int = MOST) -> None:
-    """That there are no more than `most` numbers in q, which memory is for.
-
-    InputError names how many samples there are, how many can be, and which thinning leaves as many.
-    """
+def check_size(data: Trajectories, most: int = MAX_POSITIONS) -> None:
+    """Raise InputError if q has more than `most` numbers, which memory limits; the message says how to thin them."""
     allowed = most // data.dof
-    if data.samples <= allowed:
-        return
     every = math.ceil(data.samples / allowed)
-    raise InputError(
+    refuse({
         f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinates, for 5 GB of memory; "
-        f"thin them (--every {every}, Trajectories.thinned) or take fewer"
-    )
+        f"thin them (--every {every}, Trajectories.thinned) or take fewer": data.samples > allowed,
+    })  # fmt: skip
 
 
 class SegmentStages:
-    """Fits of one model at growing segment lengths, from its current parameters; `frozen` fits the states alone.
+    """Fits of one model at growing segment lengths, from its current parameters; `frozen` fits only the states.
 
-    `s` (N,) is s at every sample in the model's unit, where it is known; `label` sets the names of these stages apart
-    from those of others in the same fit.
+    `s` (N,) is s at every sample in the model's unit, if known; `label` ends the names of these stages, which have to
+    be unique in a fit.
     """
 
     def __init__(
@@ -102,9 +108,12 @@ class SegmentStages:
     ):
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
-        self.patient, self.many = True, task.data.dof > MANY  # patient: where no path is known, it is stepped through
-        self.hurried = task.hurried or self.many  # stages before the last, and of states, end where they gain < 1 %
-        self.compared = self.many and model.potential.network is not None  # fits with other priors are last
+        # If no path is known, a patient fit steps through the trajectory for every trial.
+        self.patient, self.many = True, task.data.dof > MANY_COORDINATES
+        # A hurried stage that is not the last, or that fits only states, ends when an iteration gains less than 1 %.
+        self.hurried = task.hurried or self.many
+        # If priors are compared later, no stage here is the last.
+        self.compared = self.many and model.potential.network is not None
 
     def fit(
         self,
@@ -117,9 +126,9 @@ class SegmentStages:
         *,
         near: bool = False,
     ) -> TrajectoryFit | None:
-        """Segments of one length, from the states of the stage before or read off `begin`; None where no path is found.
+        """Segments of one length, from the states of the fit `before`, or read off `begin`; None if no path is found.
 
-        `begin` is the data or, less noisy, the same smoothed; `near`: see `optimise`.
+        `begin` holds the samples, raw (None) or smoothed; `near`: see `optimise`.
         """
         task = self.task
         grid = segment_grid(task.data, length, task.base.model_step)
@@ -134,7 +143,8 @@ class SegmentStages:
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
             problem.guess_from(before.problem, before.path)
-        if self.patient and self.hurried:  # the start alone is stepped through: trials without a path may be left
+        # A hurried fit steps only through the start; trials without a path are rejected.
+        if self.patient and self.hurried:
             problem.solve(problem.pack(start, states))
         problem.patient = self.patient and not self.hurried
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
@@ -143,7 +153,7 @@ class SegmentStages:
     def optimise(
         self, problem: ShootingProblem, theta: Tensor, states: Tensor, name: str, *, near: bool = False
     ) -> TrajectoryFit | None:
-        """Minimise from these parameters and segment states, `near` the minimum or not; None where no path is found."""
+        """Minimise from these parameters and segment states, `near` the minimum or not; None if no path is found."""
         target = StatesOnly(problem, theta) if self.frozen else problem
         x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
         total, whole = min(self.task.config.iterations, STAGE), problem.grid.segments == len(self.task.data)
@@ -163,16 +173,16 @@ class SegmentStages:
         return None if path is None or not math.isfinite(result.cost) else TrajectoryFit(theta, problem, path, result)
 
     def shortest(self, sigma: float) -> TrajectoryFit | None:
-        """The shortest segments, from the samples."""
+        """The shortest segments, from states read off the samples."""
         return self.fit(self.lengths[0], sigma, FREEDOM if self.task.config.robust == "on" else None, None)
 
     def robust_or_not(self, first: TrajectoryFit, *, known: bool = False) -> TrajectoryFit:
-        """The shortest segments, with Student's t or without the outliers where the data have any.
+        """The shortest segments: `first`, or if the data have outliers, a fit without the outliers or by Student's t.
 
-        With `robust` "auto" they are fitted with Student's t as well. Where that shows outliers, and they are few, they
-        are left out and least squares go on with the rest; where the rest has outliers still, or they are many,
-        Student's t is the loss of all further stages (`problems.robust`). Where the model is `known` already, outliers
-        cannot hide in a poor fit: they show in its residuals.
+        With `robust` "auto" the segments are fitted by Student's t as well. A few outliers in its residuals are left
+        out, and least squares continue with the rest. If the outliers are many, or the rest still has outliers,
+        Student's t is the loss of all further stages (`problems.robust`). A `known` model fits well: outliers then show
+        in the residuals of `first`, and no second fit looks for them.
         """
         plain = first.noise < FLOOR * self.task.size or not heavy_tailed(first.misfit)
         if self.task.config.robust != "auto" or (known and plain):
@@ -185,8 +195,8 @@ class SegmentStages:
     def _without_outliers(self, trial: TrajectoryFit) -> TrajectoryFit | None:
         """The same segments by least squares without the samples far from the robust fit; None if outliers remain.
 
-        A heavy-tailed loss finds outliers, but fits what is left less well than least squares do (reweighted least
-        squares, Rousseeuw & Leroy 1987). A push breaks a joint, and no sample that is left out can mend it.
+        A heavy-tailed loss finds outliers, but least squares fit the rest better (reweighted least squares, Rousseeuw &
+        Leroy 1987). A push of the system leaves a large residual at a joint of segments, whatever sample is left out.
         """
         out = torch.zeros_like(trial.problem.used)
         out[trial.problem.data.complete] = far_out(trial.misfit)
@@ -200,46 +210,43 @@ class SegmentStages:
     def at_once(
         self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
     ) -> TrajectoryFit | None:
-        """Whole trajectories from parameters that are known; None where no path is found.
+        """Whole trajectories from known parameters; None if no path is found.
 
-        The states alone are fitted first: together with them, parameters would make up for poor starts.
+        The states are fitted first, with the parameters fixed: else the parameters would compensate poor start states.
         """
         states = SegmentStages(self.task, self.model, frozen=True, label=f", states{self.label}")
         states.patient, states.hurried, self.patient = False, True, False
         before = states.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
-        near = not self.model.capabilities.sticking  # its kinks leave Newton's steps no descent
+        # With the kinks of set-valued friction an undamped Newton step may not descend.
+        near = not self.model.capabilities.sticking
         found = None if before is None else self.fit(self.lengths[-1], sigma, freedom, before, near=near)
         self.patient = True
         return found
 
     def whole(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit | None:
-        """Whole trajectories at once, from parameters that are known well; None where that misses far more than σ."""
-        used = None if bool(first.problem.used.all()) else first.problem.used
-        found = self.fit(self.lengths[-1], first.noise, first.problem.freedom, first, used)
+        """Whole trajectories at once, from the fit `first`; None if the error exceeds twice that of `first` and σ."""
+        found = self.fit(self.lengths[-1], first.noise, first.problem.freedom, first, first.used)
         most = LOST * max(first.noise, sigma, FLOOR * self.task.size)
         return None if found is None or found.noise > most else found
 
     def grow(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit:
-        """From the shortest segments to whole trajectories, or as long as the model follows the data."""
-        last, best = first, first.noise
-        freedom = first.problem.freedom
-        used = None if bool(first.problem.used.all()) else first.problem.used
-        followed = 0.0
-        if self.model.capabilities.sticking:  # no restoring force: errors grow with the length, and are the objective
-            followed = FOLLOWED * spread(self.task.data)
+        """From the shortest segments to whole trajectories, or to the longest that the model follows."""
+        last, best, freedom = first, first.noise, first.problem.freedom
+        followed = FOLLOWED * spread(self.task.data) if self.model.capabilities.sticking else 0.0
         for length in self.lengths[1:]:
             if not self.frozen:
                 sigma = last.noise if freedom else max(sigma, last.noise)
-            longer = self.fit(length, sigma, freedom, last, used)
+            longer = self.fit(length, sigma, freedom, last, first.used)
             most = max(LOST * max(best, FLOOR * self.task.size), followed)
+            # Beyond this length no parameters follow the data: chaos, or forces that the model lacks.
             if longer is None or (not self.frozen and longer.noise > most):
-                break  # no parameters follow the data for so long: chaos, or forces that the model does not know
+                break
             last, best = longer, min(best, longer.noise)
         return last
 
 
 def fit_states(task: Task, model: ContactLagrangian, sigma: float, s: Tensor | None = None) -> TrajectoryFit | None:
-    """The states of the data with the parameters held; None if the model follows not even the shortest segments."""
+    """States of the data with fixed parameters; None if the model does not follow even the shortest segments."""
     stages = SegmentStages(task, model, frozen=True, s=s)
     first = stages.fit(stages.lengths[0], sigma, None, None)
     return None if first is None else stages.grow(first, sigma)
@@ -250,25 +257,25 @@ def fit_trajectories(
 ) -> Chosen[TrajectoryFit] | None:
     """Fit parameters and states to positions.
 
-    Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
-    the states of the one before. Then every prior strength is fitted in turn, the weakest first: its residuals give the
-    noise that all strengths are fitted with. The strongest prior whose held-out error is not beaten beyond its spread
-    wins. Of many coordinates the strongest is first, and the only one where blocks that are held out are missed by more
-    than the motion's spread: too few samples for so many parameters. A model that is `known` from an earlier fit needs
-    no growing: whole trajectories follow the shortest segments.
-    The result is from the longest segments that could be fitted; None if the model cannot follow even the shortest.
+    Segments grow from 20 steps to whole trajectories, or to the longest that the model follows (None: it does not
+    follow even the shortest); each stage starts from the states of the stage before. Then every prior strength is
+    fitted in turn, first the weakest, whose residuals give the noise level for all. The strongest prior wins whose
+    held-out error is not beaten beyond its spread. With many coordinates the strongest is fitted first, and is the only
+    one if its held-out error exceeds the spread of the motion: too few samples for the parameters. A model that is
+    `known` from an earlier fit skips the growth: whole trajectories follow the shortest segments.
     """
-    if model.potential.network is None:  # there is no strength of a prior to choose
-        departure = task.config.departures[0]
-        task = replace(task, config=replace(task.config, departures=(departure,)))
-        _, last = _longest(task, model, sigma, known=known)
-        return None if last is None else Chosen(last, departure, {departure: last.held_out_errors()})
+    # Without a network there is no strength of a prior to choose.
+    if model.potential.network is None:
+        task = replace(task, config=replace(task.config, departures=task.config.departures[:1]))
     stages, last = _longest(task, model, sigma, known=known)
     if last is None:
         return None
     departures = stages.task.config.departures
+    if model.potential.network is None:
+        return Chosen(last, departures[0], {departures[0]: last.held_out_errors()})
     previous, noise = last, last.noise
-    stages.hurried = task.hurried and not stages.many  # strengths are compared by fits that have ended
+    # Only converged fits are compared.
+    stages.hurried = task.hurried and not stages.many
 
     def fit(name: str, departure: float) -> TrajectoryFit | None:
         nonlocal previous
@@ -277,19 +284,20 @@ def fit_trajectories(
             model, task.data, old.grid, sigma=noise, prior=prior_of(model, task.base, departure), freedom=old.freedom,
             used=old.used,
         )  # fmt: skip
-        problem.path = previous.path  # the same segments
+        problem.path = previous.path
         states = problem.states_at(previous.path, old.grid.start_sample)
         found = stages.optimise(problem, previous.theta, states, name)
         previous = found or previous
         return found
 
-    if stages.many:  # fits of strengths that held-out blocks cannot tell apart would be waited for in vain
+    # With many coordinates each strength takes minutes: the others are skipped if held-out blocks cannot compare them.
+    if stages.many:
         least = min(departures)
         strongest = fit("strongest prior", least)
         held_out = {} if strongest is None else {least: strongest.held_out_errors()}
         if strongest is not None and float(held_out[least].square().mean().sqrt()) > spread(task.data):
             return Chosen(strongest, least, held_out)
-    # The weakest prior twice: the first round finds the noise, which then stays the same for all.
+    # The weakest prior is fitted twice: the first fit measures the noise, which then is the same for all strengths.
     noise = (fit("noise", max(departures)) or last).noise
     found = strongest_not_beaten(departures, lambda departure: fit(f"prior {departure:g}", departure))
     return found or Chosen(last, departures[0], {})
@@ -298,39 +306,38 @@ def fit_trajectories(
 def _longest(
     task: Task, model: ContactLagrangian, sigma: float, *, known: bool
 ) -> tuple[SegmentStages, TrajectoryFit | None]:
-    """The fit to segments that are as long as the model follows, by the loss that the data call for, with its stages.
+    """The fit to the longest segments that the model follows, with its stages; its loss is robust if need be.
 
-    Of a model that is known whole trajectories by least squares are first. A heavy-tailed loss replaces them where it
-    lets no data go that they follow: the tails may be those of what the model misses.
+    A known model is first fitted to whole trajectories by least squares. A heavy-tailed loss replaces this fit unless
+    it gives up samples that least squares follow: the tails are then errors of the model, no outliers.
     """
     plain, known_stages = None, SegmentStages(task, model)
     if known and task.config.robust != "on":
         known_to = max(sigma, FLOOR * task.size)
         plain = known_stages.at_once(known_to)
         tails = plain is not None and task.config.robust != "off" and heavy_tailed(plain.misfit)
-        if plain is not None and plain.follows(known_to) and not tails:
+        if plain is not None and plain.noise <= LOST * known_to and not tails:
             return known_stages, plain
     stages, first = _wide_enough(task, model, sigma)
     if first is None:
         return known_stages, plain
     first = stages.robust_or_not(first, known=known)
-    at_once = known or model.potential.network is None
-    last = stages.whole(first, sigma if known else 0.0) if at_once else None
-    last = last or stages.grow(first, sigma)
+    skips_growth = known or model.potential.network is None
+    last = (stages.whole(first, sigma if known else 0.0) if skips_growth else None) or stages.grow(first, sigma)
     return (stages, last) if plain is None or not last.loses(plain) else (known_stages, plain)
 
 
 def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:
-    """The stages whose range of priors lets the shortest segments follow the data, and the fit of these segments.
+    """Stages with a prior weak enough for the shortest segments to follow the data, and the fit of these segments.
 
-    The range of the settings, if these segments are at the data's precision or miss less than 1 % of the motion. If
-    not, ranges weaker by 30 and 900 are tried, and taken where they halve the error: the baseline then lacks a force as
-    large as its own. Errors are those of the bulk, for outliers are no reason for another prior.
+    The strengths of the settings suffice if the error is near the data's precision or below 1 % of the motion. If not,
+    priors weaker by 30 and 900 are tried, and taken if they halve the error: the baseline then lacks a force as large
+    as its own. Errors are median absolute deviations, because outliers are no reason for another prior.
     """
     stages = SegmentStages(task, model)
     first = stages.shortest(sigma)
     enough = max(NOT_THE_NOISE * precision(task.data), SMALL * task.size)
-    for by in WIDER if len(task.config.departures) > 1 else ():
+    for by in WEAKER if len(task.config.departures) > 1 else ():
         if first is not None and scale_of(first.misfit) <= enough:
             break
         weaker = tuple(departure * by for departure in task.config.departures)

@@ -1,9 +1,9 @@
-"""How far to trust a fit: the Gauss–Newton (Laplace) posterior, and bands on its predictions.
+"""The Gauss–Newton (Laplace) posterior of a fit, and the bands of its predictions.
 
 Around the fit, −log posterior ≈ ½ (x − x̂)ᵀ A (x − x̂) with A = JᵀJ of the trajectory problem, prior included, so the
-unknowns x (parameters and start states) have covariance A⁻¹. What a deterministic model misses is not white, and A⁻¹
-takes it for white: it is multiplied by (held-out RMS / σ)², the factor by which held-out blocks of time are worse than
-residuals. It is that of the median block: one that alone tells some number is lost without it, which A⁻¹ knows.
+unknowns x (parameters and start states) have covariance A⁻¹. A⁻¹ assumes white residuals, but the error of a
+deterministic model is not white: the covariance is multiplied by (held-out RMS / σ)². The RMS is that of the median
+block of held-out time, because a block that alone determines some number has a large error, which A⁻¹ accounts for.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class Bands:
     Parameters
     ----------
     q
-        (N, n) free run, in the units of the data, as both that follow.
+        (N, n) free run, in the units of the data.
     std
         (N, n) standard deviation of the model's position, in the units of q.
     sigma
-        (n,) standard deviation of the noise of a measurement, in the units of q.
+        (n,) standard deviation of the measurement noise, in the units of q.
     """
 
     q: Tensor
@@ -55,7 +55,7 @@ class Bands:
     sigma: Tensor
 
     def interval(self, level: float = 0.9, *, measured: bool = True) -> tuple[Tensor, Tensor]:
-        """Lower and upper end of the central interval, (N, n) each; of a measured value, or of the true position."""
+        """Lower and upper end of the central interval of a measured value, or of the true position, (N, n) each."""
         if not 0 < level < 1:
             raise InputError(f"level must be between 0 and 1, got {level:g}; 0.9 is usual")
         width = NormalDist().inv_cdf(0.5 + level / 2)
@@ -69,7 +69,7 @@ class Bands:
 
 
 class Laplace:
-    """Posterior of a run's parameters and start states, as `laplace` gives it."""
+    """Posterior of a run's parameters and start states; made by `laplace`."""
 
     def __init__(self, run: Run):
         self.run = run
@@ -96,7 +96,7 @@ class Laplace:
         A = dense(self.problem.normal_equations(x)[1])
         errors = held_out_errors(self.problem, self.path, self.theta, A)
         self.inflation = inflation_of(errors, self.sigma)
-        self.information = A.double()  # prior included
+        self.information = A.double()
         self.covariance = inverse_of(self.information) * self.inflation**2
 
     @one_thread()
@@ -110,14 +110,14 @@ class Laplace:
         return self._bands(data, self.path.x[:, 0], [self.covariance[i[:, None], i[None, :]] for i in own])
 
     def predict(self, data: Trajectories, seen: int) -> Bands:
-        """Bands on trajectories that the fit has not seen: their first `seen` samples give the start, the rest follows.
+        """Bands of new trajectories: their first `seen` samples give the start states, a free run the rest.
 
-        The start x of each is fitted to those samples with θ held. With JᵀJ of that fit in blocks, and C the covariance
+        The start x of each is fitted to those samples, θ being fixed. With JᵀJ of that fit in blocks, C the covariance
         of θ, x has the derivative G = −A_xx⁻¹ A_xθ by θ, and (θ, x) the covariance [[C, C Gᵀ], [G C, G C Gᵀ + A_xx⁻¹]].
 
-        The data are of the same system (coordinates, units, inputs), each trajectory of more than `seen` samples, 3 or
-        more; bands on those are the bands of a fit. Raise InputError if a trajectory is shorter, or the model cannot
-        follow its beginning.
+        The data have the coordinates, units and inputs of the run, and more than `seen` ≥ 3 samples per trajectory; in
+        the first `seen` samples the bands are those of a fit. Raise InputError if a trajectory is shorter, or the model
+        does not follow its beginning.
         """
         data, where = data.unwrapped(), data.source or "data"
         if data.angles != self.run.data.angles:
@@ -146,18 +146,18 @@ class Laplace:
         """Runs from `start`, (B, 2n+1), with a covariance of (θ, start) for each, (P + d, P + d)."""
         whole, path = self._solved(data, start)
         with torch.no_grad():
-            Z = whole.slopes_at_samples(self.theta, path).double().split(data.lengths)  # each (N_b, n, P + d)
+            Z = whole.slopes_at_samples(self.theta, path).double().split(data.lengths)  # (N_b, n, P + d) each
             variance = torch.cat([((z @ C) * z).sum(-1) for z, C in zip(Z, joint, strict=True)])
         q, std = whole.grid.at_samples(path.x[..., : whole.n]), variance.clamp_min(0).sqrt().to(data.q)
         return Bands(q, std, self.problem.deviations)
 
     def standard_deviations(self) -> dict[str, Tensor]:
-        """Of every parameter, by name, in its own units."""
+        """Standard deviation of every parameter, by name, in its own units."""
         P = len(self.theta)
         return self.problem.parameters.unflatten(self.covariance.diagonal()[:P].clamp_min(0).sqrt())
 
     def effective_parameters(self) -> float:
-        """How many of the parameters the data determine: P − tr(C A_prior) (MacKay 1992)."""
+        """The effective number of parameters, P − tr(C A_prior), which the data determine (MacKay 1992)."""
         P = len(self.theta)
         _, prior, _ = self.prior.normal_equations(self.theta)
         return P - float((self.covariance[:P, :P] / self.inflation**2 * prior.double()).sum())
@@ -180,7 +180,7 @@ class Laplace:
 
 
 def inflation_of(errors: Tensor, sigma: float) -> float:
-    """The factor of deviations: the median of RMS `errors` over held-out blocks over σ, 1 at least."""
+    """The factor f of deviations, at least 1: median of the RMS `errors` of held-out blocks, over σ."""
     return float("inf") if int(errors.isinf().sum()) > 1 else max(1.0, float(errors.median()) / sigma)
 
 
@@ -214,9 +214,9 @@ def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: 
     """The mean prediction of fits from several seeds to the same data, with their spread.
 
     By the law of total variance the variance of the position is the mean of the fits' Laplace variances plus the
-    variance of their predictions: what one posterior sees around its own minimum, and how far apart the minima are.
-    With `data`, bands on other trajectories, each started from its first `seen` samples (`Laplace.predict`). Raise
-    InputError if there are fewer than two runs, or they were fitted to different data.
+    variance of their predictions: the uncertainty around each minimum, and the distance of the minima.
+    With `data`: bands of other trajectories, each started from its first `seen` samples (`Laplace.predict`). Raise
+    InputError if there are fewer than two runs, or the runs were fitted to different data.
     """
     if len(runs) < 2:
         raise InputError(f"an ensemble needs two runs or more, got {len(runs)}; fit other seeds")
@@ -229,6 +229,7 @@ def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: 
 
 
 def determined(effective: float, every: int) -> str:
-    """How many parameters the data determine, in words."""
-    free = "" if effective > every - 0.05 else "; the others stay where the prior holds them"  # as one digit shows it
+    """The number of parameters that the data determine, in words."""
+    # Closer than 0.05 both numbers print alike.
+    free = "" if effective > every - 0.05 else "; the others stay where the prior holds them"
     return f"{effective:.1f} of {every}{free}"

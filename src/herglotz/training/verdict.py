@@ -1,17 +1,17 @@
-"""`verdict`: whether a run is as good as its data allow, in one sentence, with a remedy where it is not.
+"""`verdict`: one sentence that says how well a run fits its data, with a remedy if the model does not fit.
 
 Three errors are compared with the precision of the data, which is estimated from the data alone:
 
 * free runs over windows of 20 recorded steps of the training part, from the fitted states;
-* the same over the unseen part, from states that are fitted there with the parameters held, or from those of the
-  free run, whichever are nearer to the data;
-* the one free run over the whole unseen part, `extrapolation_rms`.
+* the same windows over the unseen part, from states fitted there with fixed parameters, or from the states of the free
+  run, whichever are nearer to the data;
+* one free run over the whole unseen part, `extrapolation_rms`.
 
-A free run that is lost rejects a model, unless what the data leave open of its start explains that: chaotic motion
-leaves every model in the long run. One that breaks off, or leaves the world, rejects it always. What the data leave
-open of the model itself (`foresight`) rejects it too: a recording that is too short fits many models. Errors of several
-coordinates are over the spread of each. Where recordings are too short to show their noise, what the model misses of
-the training data stands for it.
+A model is rejected if a free run loses the motion, unless the uncertainty of the start state explains the loss: chaotic
+motion leaves every model in the long run. A free run that fails or diverges always rejects the model. So does a large
+uncertainty of the model itself (`foresight`): many models fit a recording that is too short. Errors of several
+coordinates are divided by the spread of each. If a recording is too short to show its noise, the misfit of the training
+data replaces the noise.
 """
 
 from __future__ import annotations
@@ -41,20 +41,27 @@ from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
 FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does not fit"
-EXACT_ENOUGH = 1e-4  # of the spread: exact data have no noise to be compared with
-# Share of the spread, and multiple of the noise: an error above both of a pair is lost. Windows of 20 steps that miss a
-# tenth are what `herglotz verify` refuses, and a model with nothing in it misses all; noise that buries the motion is
-# missed by a model that follows it, too. Of precise data less is a misfit that their noise has no part in: of six laws
-# that were missed by 10 to 19 times the noise in their own recording, five were missed by more than 20 times from other
-# starts, the worst by 125 times (`benchmarks/judge.py --only "open 5417" "law 3"`).
+# Share of the spread. Smaller errors count as none, since exact data have no noise to compare with.
+EXACT_ENOUGH = 1e-4
+# Pairs (share of the spread, multiple of the noise). An error above both numbers of a pair loses the motion. A tenth of
+# the spread in windows of 20 steps is the limit of `herglotz verify`; noise larger than the motion is missed by a good
+# model as well. For precise data a smaller share is no effect of noise: of six laws with 10 to 19 times the noise in
+# their own recording, five had more than 20 times the noise from other starts, the worst 125 times
+# (`benchmarks/judge.py --only "open 5417" "law 3"`).
 LOST = ((0.1, 3.0), (0.05, 10.0))
-APART = 20.0  # times another error in the same sentence: a word has to say why
-CHANCE = 3.0  # standard deviations of a free run, by what the data leave open of its start
-HALF = 0.5  # of the spread: windows of noise alone, whose starts are fitted, leave 0.9 to 0.95 of it
-CLEARLY = 2.0  # standard errors by which a free run is better than the mean of the data
-MORE = 30.0  # times what may be left open: 900 times as much of the same is not recorded
+# Two errors in one sentence that differ by this ratio need an explanation.
+APART = 20.0
+# Standard deviations of a free run, by the uncertainty of its start, within which a loss of the motion is no error.
+CHANCE = 3.0
+# Share of the spread. Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
+HALF = 0.5
+# Standard errors by which a free run has to be better than the mean of the data.
+CLEARLY = 2.0
+# Most recordings of the same kind, as the root of their number: nobody records 900 times as much.
+MAX_ROOT_OF_RECORDINGS = 30.0
 EACH = "all over the spread of each coordinate"
-STATE_ITERATIONS = 10  # of fitting the states of unseen windows: 2n numbers a window from 20 samples need fewer
+# Iterations for the states of unseen windows: 2n unknowns from 20 samples need fewer.
+STATE_ITERATIONS = 10
 
 
 def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories) -> Tensor:
@@ -69,7 +76,7 @@ def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories
 
 
 def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tensor:
-    """Such errors where the fit has not been, from states that are fitted there; inf where a step fails."""
+    """Errors of windows of unseen data, (N', n), from states fitted there; inf if a step fails."""
     found = _with_own_starts(task, fitted, data, FREEDOM if task.config.robust != "off" else None)
     if found is None:
         return data.q.new_full((1, data.dof), torch.inf)
@@ -78,16 +85,16 @@ def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tens
 
 
 def _with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: float | None) -> TrajectoryFit | None:
-    """The fit of such windows' states alone; None where a step fails."""
+    """The fit of the states of windows, with fixed parameters; None if a step fails."""
     config = replace(task.config, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(task, data=data, config=config, stages=Stages()), fitted.model, frozen=True)
     return stages.fit(stages.lengths[0], fitted.sigma, freedom, None)
 
 
 def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
-    """What the residual of the training part shows of the reason of a misfit; "" where it shows none.
+    """The reason of a misfit in words, from the residuals of the training part; "" if they show none.
 
-    In steps so short that noise hides its curvature every second, fourth … sample is asked.
+    If steps are so short that noise hides the curvature, every second, fourth, … sample is tried.
     """
     reason, steps = reason_of_data(train.liveliest(MOST)) or None, 1
     while reason is None:
@@ -104,41 +111,47 @@ def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
 
 
 def _gross(windows: Tensor, data: Trajectories) -> Tensor:
-    """Samples that a heavy-tailed loss outweighed, (N,) bool; none where they are too many to be gross errors."""
+    """Samples with gross errors, (N,) bool; none if the outliers are too many. Windows start at first samples."""
     out = far_out(windows / windows.abs().median(0).values.clamp_min(1e-300))
-    out[list(data.offsets)] = False  # trajectories start there
+    out[list(data.offsets)] = False
     return out if float(out.double().mean()) <= FEW else torch.zeros_like(out)
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What a verdict rests on: RMS errors and sizes, all in one unit, or over the spread of each coordinate."""
+    """The RMS errors and sizes behind a verdict, in one unit, or divided by the spread of each coordinate.
+
+    `windows`, `unseen` and `free` are the three errors in the head of this module, None if nothing was held out; `free`
+    is inf if the free run fails or diverges. `noise` is the precision of the data, inf if unknown. With `unit` None
+    all numbers are over the spread; with `degrees` numbers in rad are printed in deg. `out` training samples with gross
+    errors are left out of the errors.
+    """
 
     windows: float
-    unseen: float | None  # None: nothing was held out
-    free: float | None  # inf: it breaks off, or leaves the world
-    noise: float  # precision of the data; inf: not known
+    unseen: float | None
+    free: float | None
+    noise: float
     spread: float
-    unit: str | None = ""  # None: all are over the spread of each coordinate, which is 1
-    degrees: bool = False  # told in deg, as they were recorded; the unit is rad
-    out: int = 0  # samples of the training part that are gross errors, and have no say
+    unit: str | None = ""
+    degrees: bool = False
+    out: int = 0
 
     @property
     def limit(self) -> float:
-        """What can be asked of a fit."""
+        """The smallest error that the data can show."""
         noise = self.noise if math.isfinite(self.noise) else min(self.windows, self.lost)
         return max(noise, EXACT_ENOUGH * self.spread)
 
     @property
     def lost(self) -> float:
-        """Where an error is no longer one of a model that follows the motion."""
-        if not math.isfinite(self.noise):  # no multiple of it is known
+        """The error above which a model does not follow the motion; without known noise a share of the spread."""
+        if not math.isfinite(self.noise):
             return LOST[0][0] * self.spread
         return min(max(share * self.spread, times * self.limit) for share, times in LOST)
 
     @property
     def worst(self) -> float:
-        """The largest of them."""
+        """The largest error."""
         return max(self.windows, self.unseen or 0.0, self.free or 0.0)
 
     def __str__(self) -> str:
@@ -154,7 +167,7 @@ class Errors:
         elif self.free is not None:
             told.append("and one run over all unseen time breaks off or leaves the world")
         spread = f"their spread is {self._size(self.spread)}" if self.unit is not None else EACH
-        spread += f"; {self.out} training samples are far from the model, and have no say" if self.out else ""
+        spread += f"; {self.out} training samples are far from the model, and are left out" if self.out else ""
         return f"{', '.join(told)}; {self._precision()}, {spread}"
 
     def _missed(self, error: float, what: str, missed: bool = False) -> str:
@@ -163,7 +176,7 @@ class Errors:
         return f"{what} by {self._size(error)}" if missed else f"miss {what} by {self._size(error)}"
 
     def _why(self, error: float, other: float, why: str) -> str:
-        """Why an error is far from the one that was told before it; nothing where it is not."""
+        """The reason why an error is far from the `other` in the sentence; "" if the two are close."""
         if not (math.isfinite(error) and 0 < other < math.inf) or 1 / APART < error / other < APART:
             return ""
         return (
@@ -175,8 +188,7 @@ class Errors:
     def _precision(self) -> str:
         if not math.isfinite(self.noise):
             return f"the data's precision is unknown, for no training part has {SAMPLES} samples"
-        exact = self.limit > self.noise
-        least = f" (errors below {self._size(self.limit)} count as none)" if exact else ""
+        least = f" (errors below {self._size(self.limit)} count as none)" if self.limit > self.noise else ""
         return f"the data's precision is {self._size(self.noise)}{least}"
 
     def _size(self, x: float) -> str:
@@ -188,11 +200,15 @@ def judged(
     task: Task,
     seen: Look,
     fitted: Fitted,
-    everywhere: Tensor,  # (N, 2n+1) states at all samples
-    free: Tensor | None,  # (M, n) errors of the free run over the unseen part; None: nothing was held out
-    metrics: dict[str, Any],  # what is known of the fit already
+    everywhere: Tensor,  # (N, 2n+1)
+    free: Tensor | None,  # (M, n)
+    metrics: dict[str, Any],
 ) -> dict[str, Any]:
-    """The verdict, and the errors it rests on; samples that the fit takes for gross errors have no say."""
+    """The verdict and its errors, without the samples that the fit rejects as gross errors.
+
+    `everywhere` holds the states at all samples, `free` the errors of the free run over the unseen part (None: nothing
+    was held out), and `metrics` the numbers of the fit so far.
+    """
     used = torch.ones_like(task.data.t, dtype=torch.bool) if fitted.used is None else fitted.used
     kept, states = task.data.keep(used), fitted.states[~seen.spikes]
     windows = window_errors(task, fitted, states[used], kept)
@@ -204,7 +220,7 @@ def judged(
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)
     scaled = replace(kept, q=kept.q / unit)
     if unseen is not None and free is not None and _rms(unseen / unit) > _rms(free / unit):
-        unseen = free  # the free run's states are better than those that were found for the windows
+        unseen = free
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
     spread = _rms(scaled.q - scaled.q.mean(0))
     named, in_degrees = (common_unit(kept.units), bool(kept.degrees)) if kept.dof == 1 else (None, False)
@@ -218,9 +234,9 @@ def judged(
 
 
 def bound(data: Trajectories) -> str:
-    """Which two positions stay on a circle as well as they are known, with what to try; "" where none do.
+    """Two positions that stay on a circle within their precision, in words with a remedy; "" if there are none.
 
-    Their motion has one freedom. What pulls them back to the circle is not recorded, and a free run leaves it.
+    They have one degree of freedom. The constraint force is not recorded, and a free run leaves the circle.
     """
     noise, size = precisions(data).to(data.q) * data.balance, data.q.std(0, correction=0)
     for one in circles(replace(data, notes=())):
@@ -238,10 +254,10 @@ def in_words(
     shown: Callable[[], str] = lambda: "",
     bound: str = "",
 ) -> str:
-    """One of the three verdicts, with numbers and, where the model does not fit, what to try.
+    """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
 
-    `shown` gives what the residual shows of the reason, with what to try (`herglotz.training.missed`); `bound` says
-    which positions have one freedom.
+    `shown` gives the reason that the residuals show, with a remedy (`herglotz.training.missed`); `bound` names two
+    positions with one degree of freedom.
     """
     free, missed = errors.free or 0.0, not errors.windows <= AT_THE_NOISE * errors.limit
     if bound:
@@ -262,13 +278,13 @@ def in_words(
 
 
 def _worse(errors: Errors) -> str:
-    """By how much a model that fits misses more than the noise, or what stands for it."""
+    """The verdict of a model that fits with an error above the noise, or above the misfit that replaces the noise."""
     known = "" if math.isfinite(errors.noise) else ", for which its misfit of the training data stands,"
     return f"{WORSE}{known} by a factor of {errors.worst / errors.limit:.2g}: {errors}"
 
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[[], str]) -> str:
-    """What the data do not determine, and what to record; a longer recording only where that would tell."""
+    """The verdict on a model that the data do not determine, with the recording that would help."""
     over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.windows > AT_THE_NOISE * errors.limit
     if not ahead.reached:
         return f"the model's own motion breaks off {over}; {errors}. {_remedy(metrics, missed, shown)}"
@@ -278,15 +294,16 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown:
     changes = f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread"
     if missed:
         return f"a force is missing, and others are left open; {errors}. {changes}. {_remedy(metrics, True, shown)}"
-    times = (ahead.open / UNCERTAIN) ** 2  # what is left open falls with the root of the number of samples
-    if times > MORE**2:
+    # The uncertainty falls with the root of the number of samples.
+    times = (ahead.open / UNCERTAIN) ** 2
+    if times > MAX_ROOT_OF_RECORDINGS**2:
         return f"such motions do not tell, however many; {errors}. {changes}. Try other motions: starts, inputs, speeds"
     longer = f"a recording {max(2, math.ceil(times))} times as long, or several from other starts"
     return f"too little was recorded to tell; {errors}. {changes}. Try {longer}"
 
 
 def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[[], str]) -> str:
-    """What to try, behind the reason where the residual shows one; `missed`: the training data, by more than noise."""
+    """The remedy, after the reason if the residuals show one; `missed`: the training error exceeds the noise."""
     if not missed:
         return "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
     if reason := shown():

@@ -28,7 +28,7 @@ from herglotz.training.distributed import is_first, process_group
 from herglotz.training.solvers.matrix_free import MatrixFree
 from herglotz.training.problems.prior import prior_of
 
-distributed.LEAST = 8  # there are few rows, and each process shall have some
+distributed.MIN_ROWS = 8  # there are few rows, and each process shall have some
 found = {}
 with process_group():
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
@@ -67,7 +67,7 @@ if any("gloo" in name for name in threads):
 
 def result_here(tmp_path, monkeypatch):
     """Parameters and costs of the fits in this process."""
-    monkeypatch.setattr(distributed, "LEAST", distributed.LEAST)  # `WORK` sets it
+    monkeypatch.setattr(distributed, "MIN_ROWS", distributed.MIN_ROWS)  # `WORK` sets it
     monkeypatch.setattr(sys, "argv", ["work.py", str(tmp_path / "1.pt")])
     exec(WORK, {"__name__": "work"})
     return torch.load(tmp_path / "1.pt", weights_only=True)

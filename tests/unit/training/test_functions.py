@@ -147,7 +147,7 @@ def test_a_prior_deviation_that_is_none_is_refused(spread):
     # fails if a plan of a file divides by it
     data = recorded(lambda q, v: -q - 0.1 * v, STARTS[:1], angle=False)
     base = replace(estimate_baseline(data), spreads={"q1^2": spread})
-    with pytest.raises(InputError, match=r"'q1\^2' is .*, and has to be a number above 0"):
+    with pytest.raises(InputError, match=r"'q1\^2' is .*, but must be a number > 0"):
         prior_of(build_model(base, FitConfig(level="linear").resolved(data), "none"), base, None)
 
 

@@ -112,28 +112,7 @@ def test_dry_friction_is_found():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_full_level_finds_damping_that_depends_on_s(seed):
-    # fails if D13, D23 or ∂s/∂θ is missing from the fit, or the units cannot leave the identity. The latents start at
-    # the true s0: from s0 = 0 the same fit stops, depending on the seed, in minima up to 60 times worse.
-
-    def field(q, p, s):  # many short motions: the same (q, v) at different s, so damping by (q, v) cannot stand in
-        damping = (0.4 + 0.3 * torch.tanh(s))[..., None]
-        R = -0.4 * s - 0.3 * torch.log(torch.cosh(s))
-        return p, -torch.sin(q) - damping * p, (p * p / 2 + torch.cos(q) - 1)[..., 0] + R
-
-    q, p, s = starts(24, 1)
-    data = recorded(field, q, p, 3 * s, 0.1, 14)
-    errors = {}
-    for level in ("linear", "affine", "full"):
-        _, error = one_step_fit(data, level=level, s0=3 * s, potential_width=0, action_width=2, seed=seed)
-        errors[level] = rms(error)
-    assert errors["full"] < 0.3 * min(errors["linear"], errors["affine"]), errors
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_damping_that_affine_networks_learned_is_the_true_one(seed):
+def test_damping_that_affine_networks_learned_is_the_true_one():
     # fails if ∂g/∂q is missing from the fit, or g stands in for V: of a rate between 0.4 and 0.5 over the data 5e-4 is
     # missed at most. V is not compared: s + b(q) in the place of s has the same motion and c, and another V.
 
@@ -146,7 +125,7 @@ def test_damping_that_affine_networks_learned_is_the_true_one(seed):
     q, p, s = starts(12, 1)
     data = recorded(field, q, p, 2 * s, 0.1, 20)
     widths = {"potential_width": 6, "correction_width": 4, "damping_width": 6}
-    model, _ = one_step_fit(data, iterations=60, level="affine", s0=2 * s, seed=seed, **widths)
+    model, _ = one_step_fit(data, iterations=60, level="affine", s0=2 * s, **widths)
     low, high = (float(data.q.quantile(x)) for x in (0.02, 0.98))
     x, h = torch.linspace(low, high, 41).double()[:, None], torch.full((41,), 1e-3).double()
     with torch.no_grad():

@@ -29,7 +29,7 @@ def test_stages_of_many_coordinates_end_early(monkeypatch, n, grown, compared):
     config = FitConfig(level="linear", robust="off", departures=(6e-3, 2e-3))
     task = Task(data, estimate_baseline(data), config, Stages(False, None, "", resume=False))
     assert trajectory_fit.fit_trajectories(task, task.build("potential"), 1.0) is not None
-    last = 3 + (n > trajectory_fit.MANY)  # the strongest of many, the noise, and two strengths
+    last = 3 + (n > trajectory_fit.MANY_COORDINATES)  # the strongest of many, the noise, and two strengths
     assert ends == [grown] * (len(ends) - last) + [compared] * last
     assert len(ends) > last + 1
 
@@ -48,7 +48,7 @@ def test_strengths_that_held_out_blocks_cannot_tell_apart_are_not_fitted(n, samp
     assert found is not None
     assert set(found.held_out) == ({2e-3, 6e-3} if told_apart else {2e-3})
     assert [name for name in task.stages.done if not name.startswith("segments")] == [
-        *["strongest prior"] * (n > trajectory_fit.MANY),
+        *["strongest prior"] * (n > trajectory_fit.MANY_COORDINATES),
         *["noise", "prior 0.006", "prior 0.002"] * told_apart,
     ]
 

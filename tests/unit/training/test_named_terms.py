@@ -22,6 +22,11 @@ from herglotz.training.named_terms import candidates
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
 
+def printed(model, data):
+    """The equation of a model of these data as text."""
+    return str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
+
+
 @pytest.fixture(scope="module")
 def duffing():
     data = simulate(scene("duffing"), trajectories=1, steps=200, h=0.1, noise=0.003, seed=0)
@@ -75,7 +80,7 @@ def test_the_equation_has_the_names_of_the_file():
     model = ContactLagrangian(config)
     with torch.no_grad():
         model.get_parameter("friction.input_map").fill_(2.0)
-    text = str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
+    text = printed(model, data)
     assert " + 2 F " in text
     assert "theta in rad, F in N, theta recorded in deg" in " ".join(text.split())
     model = ContactLagrangian(replace(config, input_zero=True))
@@ -84,7 +89,7 @@ def test_the_equation_has_the_names_of_the_file():
         with torch.no_grad():
             model.get_parameter("friction.input_map").fill_(2.0)
             model.get_parameter("friction.input_zero").fill_(zero)
-        assert shown in str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
+        assert shown in printed(model, data)
 
 
 @pytest.mark.parametrize("names", [("q0", "q1"), ("q2", "q1"), ("v1", "x")])
@@ -100,7 +105,7 @@ def test_names_that_look_like_the_grammar_stay_apart(names):
     with torch.no_grad():
         model.get_parameter("kinetic.sum.coefficient").fill_(0.7)
     a, b = names
-    assert f"({a} {b}′ − {b} {a}′)" in " ".join(str(equation_of(SimpleNamespace(model=model, data=data))).split())  # pyright: ignore
+    assert f"({a} {b}′ − {b} {a}′)" in " ".join(printed(model, data).split())
 
 
 def test_signs_of_an_equation():  # fails if the first minus inside a line loses its blank
@@ -115,7 +120,7 @@ def test_a_lagrangian_has_its_kinetic_energy():
     model = ContactLagrangian(ModelConfig((False, False), "linear", two, two, (0.0, 0.0), (0.0, 0.0)))
     t = torch.arange(5, dtype=torch.float64)
     data = Trajectories.of(t, torch.stack([t, t], 1), names=("a", "b"))
-    assert str(equation_of(SimpleNamespace(model=model, data=data))).startswith("L = 0.5 a′² + 0.5 b′²")  # pyright: ignore
+    assert printed(model, data).startswith("L = 0.5 a′² + 0.5 b′²")
     config = ModelConfig(
         (False, False), "linear", two, two, (0.0, 0.0), (0.0, 0.0), potential_width=0, features=("q1 v2 - q2 v1",)
     )
@@ -123,7 +128,7 @@ def test_a_lagrangian_has_its_kinetic_energy():
     with torch.no_grad():
         model.get_parameter("kinetic.sum.coefficient").fill_(0.85)
     # fails if ½ vᵀ M v is lost beside a product of speeds, or the second of its products without the coefficient
-    text = str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
+    text = printed(model, data)
     assert text.startswith("L = 0.5 a′² + 0.5 b′² + 0.85 (a b′ − b a′) − 0.1 s")
     # fails if the law of motion is not told, without which nobody can integrate L, or a force of 0 has a line
     assert "motion: d/dt ∂L/∂a′ = ∂L/∂a + (∂L/∂s) ∂L/∂a′, so for every coordinate; s′ = L" in " ".join(text.split())
@@ -138,17 +143,17 @@ def test_the_contact_form_damps_every_coordinate():
     alone = ContactLagrangian(ModelConfig(**settings, diagonal=True))
     with torch.no_grad():
         alone.get_parameter("kinetic.log_diagonal").fill_(0.5 * math.log(2.0))
-    lines = str(equation_of(SimpleNamespace(model=alone, data=data))).splitlines()  # pyright: ignore
+    lines = printed(alone, data).splitlines()
     # fails if a line that shares nothing with others keeps a mass that no motion tells: 0.48417(±32) y″ = …
     assert lines[:2] == ["a″ = −0.3 a′ − 4 a", "b″ = −0.3 b′ − 2 b"]
     shared = ContactLagrangian(ModelConfig(**settings, diagonal=True, features=("(q1 - q2)^2",)))
     with torch.no_grad():
         shared.get_parameter("kinetic.log_diagonal").fill_(0.5 * math.log(2.0))
         shared.get_parameter("potential.features.sum.coefficient").fill_(0.5)
-    lines = str(equation_of(SimpleNamespace(model=shared, data=data))).splitlines()  # pyright: ignore
+    lines = printed(shared, data).splitlines()
     assert lines[:2] == ["a″ = −0.3 a′ − 4 a − 1 (a − b)", "2 b″ = −0.6 b′ − 4 b + 1 (a − b)"]
     both = ContactLagrangian(ModelConfig(**settings))
-    assert "− 0.3 s" in str(equation_of(SimpleNamespace(model=both, data=data)))  # pyright: ignore
+    assert "− 0.3 s" in printed(both, data)
 
 
 def test_no_number_is_left_out_of_an_equation():

@@ -132,7 +132,7 @@ def test_a_wrong_plan_is_refused_in_words():
     with pytest.raises(InputError, match="plan must be a Plan, or a run that followed one, got dict"):
         fit(pendulum(), QUICK, plan=plan)  # pyright: ignore[reportArgumentType]
     two = {**plan, "start": {**plan["start"], "stiffness": [1.0, 1.0]}}
-    with pytest.raises(InputError, match="the plan is of 2 coordinates, the data have 1"):
+    with pytest.raises(InputError, match="the plan has 2 coordinates, the data have 1"):
         fit(pendulum(), QUICK, plan=Plan.from_dict(two))
 
 

@@ -16,6 +16,7 @@ from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
 from herglotz.training.predict import predict
 from herglotz.training.recorded_range import MARGIN
+from herglotz.training.smoother import process_noise
 
 predict_module = sys.modules[predict.__module__]  # the package has the function's name
 
@@ -161,7 +162,7 @@ def test_windows_cover_the_recording():
 def test_a_step_that_fails_is_counted_and_ends_the_motion(monkeypatch):
     # fails if NaN enters the RMS, or what was not reached is passed over in silence
     model = model_of("linear")
-    own = Stepper.rollout
+    run, data, own = run_of(model), recording(model), Stepper.rollout
 
     def breaks(self, *state, **settings):
         out = own(self, *state, **settings)
@@ -171,24 +172,12 @@ def test_a_step_that_fails_is_counted_and_ends_the_motion(monkeypatch):
 
     monkeypatch.setattr(Stepper, "rollout", breaks)
     monkeypatch.setattr("herglotz.training.free_run.near_data", lambda *_: None)
-    found = predict(run_of_quietly(model, own), recorded_quietly(model, own))
+    found = predict(run, data)
     assert found.failed_steps == pytest.approx(51 / 122)
     assert found.rms < 1e-9  # type: ignore[operator]
     motion = found.motion()
     assert motion is not None
     assert motion.lengths == (30, 81)
-
-
-def run_of_quietly(model, own):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Stepper, "rollout", own)
-        return run_of(model)
-
-
-def recorded_quietly(model, own):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Stepper, "rollout", own)
-        return recording(model)
 
 
 def test_a_warm_up_that_is_lost_counts_as_the_worst_of_the_others(monkeypatch):
@@ -225,6 +214,7 @@ def test_mistakes_say_what_to_do():
         ({"data": replace(data, units=("m",), angles=(False,))}, "q is in m, the run was fitted in rad; convert"),
         ({"data": two}, "other.csv: the coordinates are a, b; the run was fitted to q: rename"),
         ({"warmup": 80}, "other.csv: trajectory 0 has 81 samples; a warm-up of 80 needs at least 82: use --warmup 40"),
+        ({"data": data.rows(torch.arange(85), (81, 4))}, "at least 22: leave it out, as no warm-up is short enough"),
         ({"warmup": 2}, "warmup must be a whole number >= 3"),
         ({"windows": 3}, "windows and horizon go together"),
         ({"windows": 3, "horizon": 99.0}, "other.csv: no trajectory holds 20 samples and a time of 99 after them"),
@@ -267,14 +257,6 @@ def test_predicted_velocities_are_those_of_the_motion():
     torch.testing.assert_close(motion.v, found.v, rtol=0, atol=0)
 
 
-def test_no_warm_up_is_named_where_none_works():
-    # fails if a trajectory of four samples, which no warm-up of three leaves two of, is told --warmup 3
-    model = model_of("linear")
-    data = recording(model)
-    with pytest.raises(InputError, match="needs at least 22: leave it out, for none is short enough"):
-        predict(run_of(model), data.rows(torch.arange(85), (81, 4)))
-
-
 def test_coordinates_are_found_by_name():
     # fails if columns are taken by their place: the second column of the file is the first coordinate of the run
     model = model_of("linear")
@@ -314,17 +296,7 @@ def test_a_free_run_beyond_the_recorded_range_is_noted():
     assert "leaves the range" in repr(motion)
 
 
-def test_a_warm_up_is_believed_alike_at_every_step(monkeypatch):
-    # fails if noise of each step adds up: over 145 samples a period free runs began 1.6 times the noise off
+def test_process_noise_does_not_depend_on_the_step():
+    # fails if the noise of every step adds up: over 145 samples a period free runs began 1.6 times the noise off
     model = ContactLagrangian(ModelConfig(level="linear", rate=0.1, scale=(1.0,), speed=(1.0,), potential_width=0))
-    t, found = 0.1 * torch.arange(9, dtype=torch.float64), []
-    make = predict_module.SmoothingProblem
-
-    def noted(*arguments, process, **settings):
-        found.append(process)
-        return make(*arguments, process=process, **settings)
-
-    monkeypatch.setattr(predict_module, "SmoothingProblem", noted)
-    for step in (0.1, 0.025):
-        predict_module._smoothed(model, Trajectories.of(t, t.sin()[:, None], (9,)), 0.01, step, None)
-    assert found[0] == pytest.approx(2 * found[1])
+    assert process_noise(model, 0.1) == pytest.approx(2 * process_noise(model, 0.025))

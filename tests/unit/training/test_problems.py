@@ -16,7 +16,6 @@ from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt
 from herglotz.training.arrowhead import dense
-from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import data_rows, held_out_errors, left_out_errors, simplest_not_beaten
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
@@ -88,7 +87,7 @@ def test_held_parameters_leave_the_equations_of_the_states(level):
 
 
 @pytest.mark.parametrize("make", [residual_problem, shooting_problem, whole_problem])
-@pytest.mark.parametrize(("level", "n"), [("linear", 1), ("affine", 1), ("linear", 2)])
+@pytest.mark.parametrize(("level", "n"), [("linear", 1), ("affine", 1), ("full", 1), ("linear", 2)])
 def test_gradients_match_finite_differences(make, level, n):
     # fails if a term of the implicit-function theorem, of the recurrence for s, or of the prior is missing
     problem, x = make(level, n)
@@ -454,16 +453,6 @@ def test_simplest_not_beaten():
     assert simplest_not_beaten({0.1: same * 1.1, 1.0: same}) == 1.0
 
 
-def test_baseline_finds_stiffness_tilt_and_rate():
-    # fails if a column of the regression has the wrong sign
-    data = simulate(scene("damped_pendulum", gamma=0.3), trajectories=4, steps=200, h=0.02, seed=0)
-    shifted = Trajectories.of(data.t, data.q + 0.3, data.lengths, angles=(True,))
-    base = estimate_baseline(shifted)
-    assert base.stiffness[0] == pytest.approx(math.cos(0.3), abs=1e-3)
-    assert base.tilt[0] == pytest.approx(-math.sin(0.3), abs=1e-3)
-    assert base.rate == pytest.approx(0.3, abs=1e-3)
-
-
 def test_data_that_never_moves_is_refused():
     # fails if a constant trajectory divides by zero
     still = Trajectories.of(torch.arange(9.0).double(), torch.ones(9, 1).double())
@@ -510,14 +499,12 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
         ({"dtype": "float16"}, "unknown dtype 'float16'; choose one of float64, float32"),
         ({"train_fraction": 0.0}, r"train fraction must be in \(0, 1\], got 0"),
         ({"optimiser": "adam"}, "adam fits the objectives residual and raw, not 'auto'"),
-        ({"optimiser": "adamw"}, "adamw fits the objectives residual and raw, not 'auto'"),
-        ({"substeps": 2}, "substeps are of trajectory fitting, not of the objective 'auto'"),
+        ({"substeps": 2}, "substeps need trajectory fitting, not the objective 'auto'"),
         ({"substeps": 0}, "substeps must be >= 1, got 0"),
-        ({"batch": 8}, "batch is of adam and adamw"),
+        ({"batch": 8}, "batch applies only to adam and adamw"),
         ({"batch": 0, "optimiser": "adam", "objective": "residual"}, "batch must be >= 1, got 0"),
         ({"batch": 8, "optimiser": "adam", "objective": "residual", "level": "full"}, "carries s along whole"),
         ({"device": "abacus"}, "unknown device 'abacus'; use cpu or cuda"),
-        ({"iterations": 0}, "iterations must be >= 1, got 0"),
         ({"departures": ()}, "departures must be one or more positive numbers"),
     ],
 )

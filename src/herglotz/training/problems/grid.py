@@ -1,4 +1,4 @@
-"""Recorded samples laid on a grid of model steps, cut into segments: the bookkeeping of trajectory fitting."""
+"""The grid of model steps of a recording, divided into segments: the bookkeeping of trajectory fitting."""
 
 from __future__ import annotations
 
@@ -12,25 +12,29 @@ from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 
-FIRST_SEGMENT = 20  # recorded steps; later stages double it
+# Recorded steps of the shortest segments; every later stage doubles the length.
+FIRST_SEGMENT = 20
 
 
 @dataclass(frozen=True)
 class SegmentGrid:
-    """S segments of at most K model steps each; shorter ones are padded at the end and the padding is never read.
+    """S segments of at most K model steps; shorter segments have padding at the end, which is never read.
 
-    A recorded step longer than `max_step` is crossed in several equal model steps (nodes without an observation), so
-    that a gap does not cost accuracy.
+    A recorded step longer than `max_step` becomes several equal model steps (nodes without a sample), so that a gap
+    costs no accuracy. `node` is the flat index s·(K+1) + k of the node of each sample; `start_sample` the row of the
+    data at the start of each segment, and `end` its last node; `joined` is True if a segment starts at the end of the
+    one before, False at the start of a trajectory. Model step k is part of the recorded step that starts at `row`, with
+    its middle at the share `part` of that step. `length` is the requested number of recorded steps of a segment.
     """
 
-    h: Tensor  # (S, K) model steps
-    node: Tensor  # (N,) flat index s·(K+1) + k of the node that each sample observes
-    start_sample: Tensor  # (S,) row of the data at the start of each segment
-    joined: Tensor  # (S,) bool, whether it starts where the segment before ends; else a trajectory starts there
-    end: Tensor  # (S,) last node of each segment
-    row: Tensor  # (S, K) row of the data at the start of the recorded step that each model step is part of
-    part: Tensor  # (S, K) where in this recorded step the middle of the model step is, from 0 to 1
-    length: int  # recorded steps of a segment that were asked for: the same length gives the same segments
+    h: Tensor  # (S, K)
+    node: Tensor  # (N,)
+    start_sample: Tensor  # (S,)
+    joined: Tensor  # (S,) bool
+    end: Tensor  # (S,)
+    row: Tensor  # (S, K)
+    part: Tensor  # (S, K)
+    length: int
 
     @property
     def segments(self) -> int:
@@ -43,20 +47,20 @@ class SegmentGrid:
         return self.h.shape[1]
 
     def times(self, data: Trajectories) -> Tensor:
-        """Time of every node, (S, K + 1), also of those that pad a segment."""
+        """Time of every node, (S, K + 1), with padding."""
         first = data.t[self.start_sample][:, None]
         return torch.cat([first, first + self.h.cumsum(1)], 1)
 
     def at_samples(self, x: Tensor) -> Tensor:
-        """Values at the samples, (N, …) in their order, from those at every node, (S, K + 1, …)."""
+        """Values at the samples, (N, …), from the values x at every node, (S, K + 1, …)."""
         return x.flatten(0, 1)[self.node]
 
 
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
     """Inputs of the steps that start at each sample, (N, m), or of the model steps of a grid, (S, K, m).
 
-    None for a model that takes none. The last one of a trajectory acts on no step. Raise InputError if the model takes
-    inputs and the data hold none, or another number of them.
+    None for a model without inputs. The last input of a trajectory acts on no step. Raise InputError if the data do not
+    have the inputs of the model.
     """
     if not model.inputs:
         return None
@@ -72,9 +76,9 @@ def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid 
 
 
 def segment_lengths(data: Trajectories) -> list[int]:
-    """Segment lengths of the stages: 20, 40, 80, … recorded steps, and at last each trajectory whole.
+    """Segment lengths of the stages, in recorded steps: 20, 40, 80, …, and last whole trajectories.
 
-    A length of more than two thirds of the longest trajectory cuts none in two.
+    Lengths above two thirds of the longest trajectory are left out, since they divide no trajectory.
     """
     longest = max(data.lengths) - 1
     lengths = []
@@ -86,15 +90,17 @@ def segment_lengths(data: Trajectories) -> list[int]:
 
 
 def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGrid:
-    """Cut each trajectory into segments of about `length` recorded steps.
+    """Divide each trajectory into segments of about `length` recorded steps.
 
-    Segments of one trajectory have equal lengths up to one step, so that none is a stub. The last sample of a segment
-    is the first of the next; it is observed once, by the earlier segment.
+    Segments of one trajectory have equal lengths up to one step. The last sample of a segment is the first of the next;
+    only the earlier segment observes it.
     """
     recorded, device = data.t.double().cpu().diff(), data.t.device
-    counts = (recorded / max_step - 1e-6).ceil().clamp_min(1).long()  # model steps; a hair for rounded time stamps
-    lines: list[tuple[Tensor, Tensor, Tensor]] = []  # of each segment: h, row and part of its model steps
-    seen: list[Tensor] = []  # its observed nodes
+    # Model steps of every recorded step, with a tolerance for rounded time stamps.
+    counts = (recorded / max_step - 1e-6).ceil().clamp_min(1).long()
+    # For every segment (h, row, part) of its model steps, and its observed nodes.
+    lines: list[tuple[Tensor, Tensor, Tensor]] = []
+    seen: list[Tensor] = []
     starts: list[int] = []
     joined: list[bool] = []
     for first, count in zip(data.offsets, data.lengths, strict=True):
@@ -110,7 +116,8 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
             seen.append(node[i > 0 :])
     end = torch.tensor([len(row) for _, row, _ in lines])
     K = int(end.max())
-    padding = torch.arange(K).minimum(end[:, None] - 1)  # the last model step again
+    # The last model step of a segment is its padding.
+    padding = torch.arange(K).minimum(end[:, None] - 1)
     h, row, part = (
         torch.stack([x[at] for x, at in zip(each, padding, strict=True)]) for each in zip(*lines, strict=True)
     )

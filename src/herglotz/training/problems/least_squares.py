@@ -1,4 +1,4 @@
-"""What every objective of a fit shares: its data, the robust loss, and the prior on the parameters."""
+"""Base classes of the objectives of a fit: data, robust loss, and the prior of the parameters."""
 
 from __future__ import annotations
 
@@ -17,28 +17,32 @@ from herglotz.training.problems.grid import SegmentGrid, step_inputs
 from herglotz.training.problems.prior import Prior
 from herglotz.training.problems.robust import loss, root_weights
 
-SOME = 64  # steps of the data that say how large the masses are
+# Steps of the data for the size of the masses.
+MASS_STEPS = 64
 
 
 class LeastSquares:
     """Σ ρ(r) + prior(θ), with r the residuals over their standard deviations and ρ(r) = ½r² or Student's t.
 
     An objective derives `cost` and `normal_equations` (`solvers.levenberg_marquardt.SumOfSquares`) from these parts.
+    The parameters of `model` are the start; the model is not changed. `sigma` is the standard deviation of the noise of
+    q over its `balance`, `freedom` the ν of Student's t (`robust`; None: least squares).
     """
 
     def __init__(
         self,
-        model: ContactLagrangian,  # its current parameters are the start; the model is not changed
-        data: Trajectories,  # of positions, and of inputs where the model takes them
+        model: ContactLagrangian,
+        data: Trajectories,
         *,
-        sigma: float,  # standard deviation of the noise of q over its `balance`
-        prior: Prior | None = None,  # penalty on the parameters
-        freedom: float | None = None,  # degrees of freedom ν of Student's t (`robust`); None: least squares
+        sigma: float,
+        prior: Prior | None = None,
+        freedom: float | None = None,
     ):
         self.parameters, self.data, self.n = ParameterVector(model), data, data.dof
         self.P = len(self.parameters.get())
         self.sigma, self.prior, self.freedom = sigma, prior, freedom
-        self.deviations = sigma * data.balance  # (n,) of each coordinate, in its unit
+        # Standard deviation of each coordinate, in its unit.
+        self.deviations = sigma * data.balance  # (n,)
         self.u = step_inputs(model, data)  # (N, m)
 
     def loss(self, *residuals: Tensor) -> Tensor:
@@ -46,7 +50,7 @@ class LeastSquares:
         return torch.stack([loss(r, self.freedom) for r in residuals]).sum()
 
     def root_weights(self, r: Tensor) -> Tensor:
-        """√w(r): what multiplies rows of J and r in the robust normal equations; 1 for least squares."""
+        """√w(r), which multiplies rows of J and r in the robust normal equations; 1 for least squares."""
         return root_weights(r, self.freedom)
 
     def prior_cost(self, theta: Tensor) -> Tensor:
@@ -61,9 +65,10 @@ class LeastSquares:
 
 
 class StatesProblem(LeastSquares, ABC):
-    """An objective over the parameters and states (q, p[, s]) on a grid of model steps, the parameters first.
+    """An objective over the parameters, then states (q, p[, s]) on a grid of model steps.
 
-    s is an unknown only where the positions depend on it: d = 2n + 1 numbers a state there, else 2n.
+    s is an unknown only if positions depend on s: a state has d = 2n + 1 numbers then, else 2n. `scale` and `speed` are
+    the sizes of q and q̇, `action` that of s, `mass` the ratio of p to q̇.
     """
 
     def __init__(self, model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, **settings: Any):
@@ -71,14 +76,15 @@ class StatesProblem(LeastSquares, ABC):
         self.grid = grid
         self.d = states_of(model)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
-        self.action = float((self.speed * self.scale).sum())  # natural size of s
-        self.mass = self._masses(model)  # (n,) in the units of p over those of v; it reads the inputs at the samples
-        self.u = step_inputs(model, data, grid)  # (S, K, m), no longer (N, m)
+        self.action = float((self.speed * self.scale).sum())
+        # The masses need the inputs at the samples, (N, m); after that u is per model step.
+        self.mass = self._masses(model)  # (n,)
+        self.u = step_inputs(model, data, grid)  # (S, K, m)
 
     def _masses(self, model: ContactLagrangian) -> Tensor:
-        """Median of h times the diagonal of the mixed Hessian over steps of the data, (n,); 1 where it is no size."""
+        """Median of h · diag(mixed Hessian) over steps of the data, (n,); 1 if that is 0 or infinite."""
         steps, u = self.data.steps(), self.u
-        some = torch.linspace(0, len(steps.h) - 1, min(SOME, len(steps.h)), device=steps.h.device).round().long()
+        some = torch.linspace(0, len(steps.h) - 1, min(MASS_STEPS, len(steps.h)), device=steps.h.device).round().long()
         i, h = steps.index[some], steps.h[some]
         with torch.no_grad():
             P = partials(model if u is None else model.at(u[i]), self.data.q[i], self.data.q[i + 1], 0 * h, h, 2)
@@ -86,20 +92,20 @@ class StatesProblem(LeastSquares, ABC):
         return torch.where(mass.isfinite() & (mass > 0), mass, 1.0)
 
     def with_s(self, states: Tensor) -> Tensor:
-        """States (..., 2n+1) from the unknowns (..., d), with s = 0 where s is none of them."""
+        """States (..., 2n+1) from the unknowns (..., d), with s = 0 if s is no unknown."""
         return torch.cat([states, states.new_zeros(*states.shape[:-1], 2 * self.n + 1 - self.d)], -1)
 
     @abstractmethod
     def cost(self, x: Tensor) -> Tensor:
-        """½|r|², a scalar; infinite where a step has no solution."""
+        """½|r|², a scalar; infinite if a step has no solution."""
 
     @abstractmethod
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Any, Tensor]:
-        """(½|r|², JᵀJ, Jᵀr); `held`: of the states alone, the parameters as they are."""
+        """(½|r|², JᵀJ, Jᵀr); `held`: for the states alone, with fixed parameters."""
 
 
 class StatesOnly:
-    """A problem over parameters and states with the parameters held: only the states are fitted."""
+    """A problem over parameters and states with fixed parameters: only the states are fitted."""
 
     def __init__(self, problem: StatesProblem, theta: Tensor):
         self.problem, self.theta = problem, theta
@@ -109,9 +115,9 @@ class StatesOnly:
         return torch.cat([self.theta, states])
 
     def cost(self, x: Tensor) -> Tensor:
-        """Of all unknowns; only the states differ from call to call."""
+        """The cost of the problem with these states."""
         return self.problem.cost(self.full(x))
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Any, Tensor]:
-        """Those of the states alone."""
+        """The normal equations of the states alone."""
         return self.problem.normal_equations(self.full(x), held=True)

@@ -1,8 +1,8 @@
-"""Objectives of one step: how far each recorded q_{k+1} is from the position that the model predicts.
+"""One-step objectives: the distance of each recorded q_{k+1} from the position that the model predicts.
 
 r_k = J⁻¹R_k with R_k the discrete Herglotz residual and J = ∂R_k/∂q_{k+1}, which is M where R = 0. To first order r_k
-is the error of the predicted position, it does not change under a gauge transformation, and it cannot be made small
-by shrinking M. The raw residual R_k can, and does: it is offered only so that this can be seen (docs/verification.md).
+is the error of the predicted position. It is invariant under gauge transformations, and a smaller M does not make it
+smaller. A smaller M does shrink the raw residual R_k, which is an objective only to show this (docs/verification.md).
 """
 
 from __future__ import annotations
@@ -24,15 +24,17 @@ from herglotz.training.distributed import LaneSums, add_over_processes, own_part
 from herglotz.training.problems.least_squares import LeastSquares
 from herglotz.training.problems.recorded_action import action, action_derivative
 
-MANY = 6  # coordinates from which on second derivatives of L_d by θ would cost more than all the rest
-CHUNK = 4096  # triples whose Jacobian is held in memory at once: 4096 · 2 · 300 parameters are 20 MB
+# From this number of coordinates on, second derivatives of L_d by θ would cost more than all the rest.
+MANY = 6
+# Triples whose Jacobian is in memory at once: 4096 · 2 coordinates · 300 parameters are 20 MB.
+CHUNK = 4096
 
 
 class OneStep(LeastSquares, ABC):
     """Σ ρ(r/σ) + prior over the parameters and a few further unknowns, with r a function of three samples.
 
-    A subclass supplies `start`, `_rows` (what `_local` takes of some triples) and `_local` (the residuals of one triple
-    or of a batch of them).
+    A subclass defines `start`, `_rows` (the arguments of `_local` for some triples) and `_local` (the residuals of one
+    triple or of a batch). `chunk` triples have their Jacobian in memory at once; `settings` go to `LeastSquares`.
     """
 
     def __init__(
@@ -42,12 +44,13 @@ class OneStep(LeastSquares, ABC):
         triples: Triples,
         *,
         sigma: float = 1.0,
-        chunk: int = CHUNK,  # triples whose Jacobian is held in memory at once
-        **settings: Any,  # of `LeastSquares`
+        chunk: int = CHUNK,
+        **settings: Any,
     ):
         super().__init__(model, data, sigma=sigma, **settings)
         self.triples, self.chunk = triples, chunk
-        self.deviation = triples.h0.new_full((len(triples), 1), sigma)  # the standard deviation of every r
+        # Standard deviation of every r.
+        self.deviation = triples.h0.new_full((len(triples), 1), sigma)  # (T, 1)
 
     @abstractmethod
     def start(self) -> Tensor:
@@ -60,7 +63,7 @@ class OneStep(LeastSquares, ABC):
     def _local(self, x: Tensor, *rows: Any) -> Tensor: ...
 
     def _carried(self, x: Tensor, *, derivative: bool) -> Any:  # noqa: ARG002
-        """What is computed along whole trajectories before the triples: nothing."""
+        """Values along whole trajectories that the triples need: none."""
         return None
 
     def _linearised(self, x: Tensor, part: Tensor, carried: Any) -> tuple[Tensor, Tensor]:
@@ -76,12 +79,12 @@ class OneStep(LeastSquares, ABC):
         return len(self.triples)
 
     def all_residuals(self, x: Tensor) -> Tensor:
-        """R of every triple, (T, k), in units of q."""
+        """The residual r of every triple, (T, k), in units of q."""
         with torch.no_grad():
             return self._local(x, *self._rows(slice(None), self._carried(x, derivative=False)))
 
     def residuals(self, x: Tensor) -> Tensor:
-        """The errors of the recorded positions, (T, n), over the balance of the coordinates (of p: the raw metric)."""
+        """Errors of the recorded positions, (T, n), over the balance of the coordinates (raw metric: units of p)."""
         return self.all_residuals(x)[:, : self.n]
 
     def cost(self, x: Tensor) -> Tensor:
@@ -89,7 +92,7 @@ class OneStep(LeastSquares, ABC):
         return self.loss(self.all_residuals(x) / self.deviation) + self.prior_cost(x[: self.P])
 
     def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """(cost, ∂cost/∂x) without a Jacobian, for Adam; `rows`: of some triples, made to stand for all."""
+        """(cost, ∂cost/∂x) without a Jacobian, for Adam; with `rows` scaled from these triples to all."""
         rank, processes = world()
         own = (torch.arange(self.rows) if rows is None else rows)[rank::processes].to(x.device)
         x = x.detach().requires_grad_()
@@ -123,10 +126,7 @@ class OneStep(LeastSquares, ABC):
         return cost + of_prior[0], A, b
 
     def pieces(self) -> Iterator[tuple[Tensor, Callable[[Tensor], Tensor]]]:
-        """The triples of each of this process's chunks, and their r/σ as a function of the parameters.
-
-        For models whose motion has no s.
-        """
+        """The chunks of triples of this process, each with r/σ as a function of θ; only if the motion has no s."""
         for _, part in own_parts(self.rows, self.chunk, self.triples.h0.device):
             rows = self._rows(part, None)
             yield part, lambda theta, rows=rows, by=self.deviation[part]: (self._local(theta, *rows) / by).reshape(-1)
@@ -137,9 +137,12 @@ class OneStep(LeastSquares, ABC):
 
 
 class ResidualProblem(OneStep):
-    """½ Σ |r_k|² / σ² + prior over parameters and, where s enters the motion, one latent s per trajectory.
+    """½ Σ |r_k|² / σ² + prior over parameters and, if s enters the motion, one latent s per trajectory.
 
-    s is integrated along each trajectory from its latent start. `residuals` leaves expected triples out.
+    s is integrated along each trajectory from its latent start. `metric` is "position" for J⁻¹R or "raw" for R. Triples
+    with a step longer than `max_step` (gaps) are left out. `expected` adds triples that were not recorded, with their
+    standard deviation (`baseline_motion`); `residuals` leaves them out. If s does not enter the motion, `most` limits
+    the recorded triples, evenly spread. `settings` are those of `OneStep`.
     """
 
     def __init__(
@@ -147,43 +150,45 @@ class ResidualProblem(OneStep):
         model: ContactLagrangian,
         data: Trajectories,
         *,
-        metric: str = "position",  # for J⁻¹R; "raw" for R
-        max_step: float | None = None,  # triples that span a longer step (gaps) are left out
-        # Triples that were not recorded, and their standard deviation (`baseline_motion`).
+        metric: str = "position",
+        max_step: float | None = None,
         expected: tuple[Triples, float] | None = None,
-        most: int | None = None,  # recorded triples, evenly spread; None: all, and so where s enters the motion
-        **settings: Any,  # of `OneStep`
+        most: int | None = None,
+        **settings: Any,
     ):
         self.metric, self.carries_s, triples = metric, model.s_enters_motion, data.triples(max_step)
         if most is not None and not self.carries_s:
             triples = triples.spread_out(most)
         super().__init__(model, data, triples if expected is None else join(triples, expected[0]), **settings)
-        self.recorded = len(triples)  # those that are only expected follow them
+        # The expected triples follow the recorded ones.
+        self.recorded = len(triples)
         if expected is not None:
             self.deviation[self.recorded :] = expected[1]
         self.latents = len(data) if self.carries_s else 0
-        costly = data.dof >= MANY or isinstance(model, OwnLagrangian)  # whose second derivatives are autograd's
+        # An `OwnLagrangian` has its second derivatives from autograd.
+        costly = data.dof >= MANY or isinstance(model, OwnLagrangian)
         self.many = costly and not self.carries_s and metric == "position"
 
     def start(self) -> Tensor:
-        """Parameters, then the latents (zero)."""
+        """The parameters, then 0 for every latent s."""
         theta = self.parameters.get()
         return torch.cat([theta, theta.new_zeros(self.latents)])
 
     def residuals(self, x: Tensor) -> Tensor:
-        """Those of the recorded triples, (T, n); see `OneStep`."""
+        """Residuals of the recorded triples, (T, n); see `OneStep`."""
         return self.all_residuals(x)[: self.recorded]
 
     def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """See `OneStep`; where s enters the motion by the normal equations, which hold the recurrence's derivative."""
+        """See `OneStep`; if s enters the motion, by the normal equations, which include the recurrence of s."""
         if not self.carries_s:
             return super().cost_and_gradient(x, rows)
-        assert rows is None  # FitConfig checked
+        # `FitConfig` refuses batches here.
+        assert rows is None
         cost, _, gradient = self.normal_equations(x)
         return cost, gradient
 
     def _carried(self, x: Tensor, *, derivative: bool) -> tuple[Tensor, Tensor | None] | None:
-        """S at every sample, (N,), and ds/dx, (N, unknowns)."""
+        """The action s at every sample, (N,), and ds/dx, (N, unknowns)."""
         if not self.carries_s:
             return None
         theta, latent = x[: self.P], x[self.P :]
@@ -210,7 +215,7 @@ class ResidualProblem(OneStep):
         return r, J + r_s[..., None] * carried[1][self.triples.index[part]][:, None, :]
 
     def _local(self, x: Tensor, *rows: Any) -> Tensor:
-        """J⁻¹R over the balance of the coordinates (or R) of one triple or of a batch of them."""
+        """J⁻¹R over the balance of the coordinates (or R) of one triple or of a batch."""
         q0, q1, q2, s0, h0, h1, u0, u1 = rows
         theta = x[: self.P] if self.carries_s else x
         before = self.parameters.partials(theta, q0, q1, s0, h0, 1, u0)
@@ -222,7 +227,7 @@ class ResidualProblem(OneStep):
         return solve(momentum_jacobian(after, p), R) / self.data.balance
 
     def _linearised_many(self, theta: Tensor, *rows: Any) -> tuple[Tensor, Tensor]:
-        """J⁻¹R and J⁻¹ ∂R/∂θ, (T, n, P): the derivative of J⁻¹R without that of J, which is of the size of R."""
+        """J⁻¹R, (T, n), and its derivative without that of J, J⁻¹ ∂R/∂θ, (T, n, P); the omitted part is of order R."""
         q0, q1, q2, s0, h0, h1, u0, u1 = rows
 
         def residual(theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor, *u: Tensor) -> Tensor:

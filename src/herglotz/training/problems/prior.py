@@ -1,4 +1,4 @@
-"""What a model is expected to be before it sees data: near its baseline."""
+"""The prior of a model: Gaussian, around the baseline."""
 
 from __future__ import annotations
 
@@ -18,20 +18,25 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.dictionary import keys_of
 from herglotz.training.parameter_vector import ParameterVector
 
-# Parameters of order one, by the beginning of their names.
+# Parameters of networks, of order one, by the start of their names.
 NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.network", "action.log_slope",
             "action.weight", "action.bias")  # fmt: skip
-WIDTH = 0.5  # of the logarithms of dry friction's widths: below what a step resolves, they only make it stiff
-SPLIT = 1e-3  # of a rate: friction of one coordinate is its rate, and a rate that friction cancels hides long steps
-EACH, MOST = 64, 256  # points of the grid, a coordinate and at most: more do not change an RMS, and each has n rows
-BREAKAWAY = 0.01  # of Stribeck's excess force, in forces of the baseline: a broad one would replace viscous friction
+# Deviation of the logarithms of dry friction's widths. Widths below the resolution of a step only make it stiff.
+WIDTH = 0.5
+# Deviation of viscous friction of a single coordinate, over that of the rate. Both act alike, and a large rate that a
+# negative friction cancels would forbid long steps.
+SPLIT = 1e-3
+# Points of the grid, per coordinate and in all. More do not change an RMS, and each has n rows.
+EACH, MAX_POINTS = 64, 256
+# Deviation of Stribeck's excess force, over the baseline's force. A broad excess would replace viscous friction.
+BREAKAWAY = 0.01
 
 
 class Gaussian:
-    """The prior of some numbers, each by itself: N(start, spread²)."""
+    """The prior of independent numbers: N(start, spread²), with weight = 1 / spread², 0 without a prior."""
 
     def __init__(self, start: Tensor, weight: Tensor):
-        self.start, self.weight = start, weight  # (P,) each; weight is 1 / spread², 0 where nothing is known
+        self.start, self.weight = start, weight  # (P,), (P,)
 
     def cost(self, theta: Tensor) -> Tensor:
         """½ Σ ((θ − start) / spread)²."""
@@ -43,24 +48,24 @@ class Gaussian:
 
 
 class Prior:
-    """Gaussian prior, as residuals that join a least-squares problem.
+    """Gaussian prior, as residuals of a least-squares problem. `low` and `high` are the range of q in the data.
 
     * The force of the potential's network, −∂V_net/∂q, has over the range of the data an RMS of N(0, (τ F)²), with F
-      the RMS force of the baseline: `departure` = τ. (Many grid points share that one residual's weight.)
+      the RMS force of the baseline: `departure` = τ. (The grid points share the weight of one residual.)
     * The damping's network G(q̄, v) (affine level) has there an RMS of N(0, (τ r)²), r the typical rate of the motion.
-    * Every network weight is N(its start, `weight`²): weak, it only keeps unseen directions from drifting. (Centred
-      at 0 it would switch the network off: behind a zero-initialised last layer nothing else holds the first one.)
+    * Every network weight is N(its start, `weight`²), a weak prior against drift of undetermined weights. (Centred at 0
+      it would switch the network off: with a last layer that starts at 0, only the prior acts on the first layer.)
     * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
       friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²),
       its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their start, 0.5²).
-    * Terms by name (`herglotz.models.Term`) state their own spread, and those of functions have `spreads`, around 0.
+    * A `herglotz.models.Term` has its own spread, and the waves of functions have `spreads`, around 0.
     """
 
     def __init__(
         self,
         model: ContactLagrangian,
-        low: Tensor,  # (n,) lowest position in the data
-        high: Tensor,  # (n,) highest
+        low: Tensor,  # (n,)
+        high: Tensor,  # (n,)
         *,
         departure: float | None,
         weight: float = 10.0,
@@ -71,13 +76,13 @@ class Prior:
         self.start, self.departure = self.parameters.get(), departure
         keys, spreads = keys_of(self.parameters.numbers, model.config), spreads or {}
         refuse({
-            f"the prior deviation of '{key}' is {spread:g}, and has to be a number above 0": not 0 < spread < math.inf
+            f"the prior deviation of '{key}' is {spread:g}, but must be a number > 0": not 0 < spread < math.inf
             for key, spread in spreads.items()
         })  # fmt: skip
         self.waves = {i: spreads[key] for i, key in enumerate(keys) if key in spreads}
         self.start[list(self.waves)] = 0.0
         points = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True)
-        unit = points.draw(min(EACH * len(low), MOST)).to(low)
+        unit = points.draw(min(EACH * len(low), MAX_POINTS)).to(low)
         speed = low.new_tensor(model.config.speed)
         self.grid = unit[:, : len(low)] * (high - low) + low
         self.velocity = (2 * unit[:, len(low) :] - 1) * speed
@@ -85,7 +90,7 @@ class Prior:
         force = float(self._baseline_force().square().mean().sqrt())
         self.force = force if force > 0 else 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
-        self.networks = self._index(*NETWORKS).to(self.start.device)  # what departures depend on
+        self.networks = self._index(*NETWORKS).to(self.start.device)
         with torch.no_grad():
             self.departs = departure is not None and bool(self._departures(self.start, self.grid, self.velocity))
 
@@ -104,7 +109,7 @@ class Prior:
         cost, b = own.square().sum() / 2, torch.zeros_like(theta).index_add(0, self.index, own / self.spread)
         A = torch.zeros_like(theta).index_add(0, self.index, self.spread**-2).diag()
         if self.departs:
-            # Point by point: the derivative of all outputs at all points at once took 44 GB for twenty coordinates.
+            # The derivative is taken point by point: that of all points at once took 44 GB for twenty coordinates.
             def departed(x: Tensor, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
                 r = self._departed(theta.index_copy(0, self.networks, x), q, v)
                 return r, r
@@ -116,7 +121,7 @@ class Prior:
         return cost, A, b
 
     def _own(self, model: ContactLagrangian, weight: float, rate_spread: float) -> tuple[Tensor, Tensor]:
-        """Which parameters are N(their start, spread²) by themselves, and their spreads, (m,) each."""
+        """Places and spreads of the parameters with an own prior N(start, spread²), (m,) each."""
         spreads = [
             (self._index(*NETWORKS), weight),
             (self._index("damping.rate", "damping.drag", "action.rate"), rate_spread),
@@ -143,7 +148,7 @@ class Prior:
             own = potential.baseline(self.grid, 1).gradient
             if potential.features is None or bool(own.any()):
                 return own
-            return potential.features(self.grid, 1).gradient  # the potential is made of features alone
+            return potential.features(self.grid, 1).gradient
 
     def _departed(self, theta: Tensor, q: Tensor, v: Tensor) -> Tensor:
         """The residuals of the networks' outputs at points of the grid, (k, ...)."""
@@ -159,9 +164,9 @@ class Prior:
 
 
 def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Any:
-    """The `Prior` of every objective, sized by the data: rates are known to 0.3 of the slowest coordinate's own rate.
+    """The `Prior` of every objective; the deviation of rates is 0.3 of the rate |q̇|/|q| of the slowest coordinate.
 
-    A `Prior`, or None of an L_d of one's own, whose parameters mean nothing that is known.
+    None for the user's own L_d, whose parameters have no known meaning.
     """
     if not isinstance(model, ContactLagrangian):
         return None

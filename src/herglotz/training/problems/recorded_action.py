@@ -16,9 +16,12 @@ def action(
     parameters: ParameterVector,
     theta: Tensor,  # (P,)
     data: Trajectories,
-    latent: Tensor,  # (B,) s at the start of every trajectory
+    latent: Tensor,  # (B,)
 ) -> Tensor:
-    """S at every sample, (N,); of L_d that is affine in s, L_d = L_d(s = 0) + (c − 1) s, from one evaluation of all."""
+    """The action s at every sample, (N,), from its start values `latent` of every trajectory.
+
+    For L_d affine in s, L_d = L_d(s = 0) + (c − 1) s, all steps need only one evaluation.
+    """
     s, h = torch.zeros_like(data.t), data.t.diff()
     affine = not parameters.model.capabilities.action_flow
     P = parameters.partials(theta, data.q[:-1], data.q[1:], s[:-1], h, 1) if affine else None
@@ -37,9 +40,9 @@ def action_derivative(
     parameters: ParameterVector,
     theta: Tensor,  # (P,)
     data: Trajectories,
-    s: Tensor,  # (N,) of `action`
+    s: Tensor,  # (N,)
 ) -> Tensor:
-    """ds/d(θ, latent) at every sample, (N, P + B), by the recurrence ds_{k+1} = c_k ds_k + ∂L_d/∂θ."""
+    """Derivative ds/d(θ, latent) of `action` at every sample, (N, P + B), by ds_{k+1} = c_k ds_k + ∂L_d/∂θ."""
     q, h = data.q, data.t.diff()
 
     def increment(theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,7 +61,7 @@ def action_derivative(
 
 
 def _samples(data: Trajectories) -> Iterator[tuple[Tensor, Tensor]]:
-    """For k = 0, 1, …: rows of the k-th samples, and which trajectories are that long."""
+    """For k = 0, 1, …: rows of the k-th samples, and indices of the trajectories with more than k samples."""
     lengths = torch.tensor(data.lengths, device=data.t.device)
     offsets = lengths.cumsum(0) - lengths
     for k in range(int(lengths.max())):

@@ -1,10 +1,9 @@
 """JᵀJ of parameters and the states of whole trajectories: a border of parameters around block tridiagonal states.
 
     ⎡ C  Bᵀ ⎤     C (P, P): parameters
-    ⎣ B  T  ⎦     T: every state and the next, B (…, P): how each depends on the parameters
+    ⎣ B  T  ⎦     T: states, block tridiagonal; B (…, P): states by parameters
 
-is solved by eliminating the states, (C − Bᵀ T⁻¹ B) δθ = b_θ − Bᵀ T⁻¹ b_x, at a cost that grows with the number of
-samples.
+is solved by eliminating the states, (C − Bᵀ T⁻¹ B) δθ = b_θ − Bᵀ T⁻¹ b_x, at a cost linear in the number of samples.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ class Bordered:
 
     corner: Tensor  # (P, P)
     border: Tensor  # (S, M, d, P)
-    blocks: Blocks  # of T, (S, M, d, d) each
+    blocks: Blocks  # (S, M, d, d) each
 
     def __matmul__(self, v: Tensor) -> Tensor:
         """The matrix times v, (P + S·M·d,)."""
@@ -38,13 +37,13 @@ class Bordered:
         return torch.cat([self.corner.diagonal(), self.blocks[0].diagonal(dim1=-2, dim2=-1).flatten()])
 
     def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(matrix + diag(damping))⁻¹ b, or None where there is no finite one."""
+        """(matrix + diag(damping))⁻¹ b, or None if there is no finite solution."""
         y = self.solve_many(b[:, None], damping)
         finite = y is not None and bool(torch.isfinite(y).all())
         return of_first(y[:, 0])[0] if everywhere(finite) and y is not None else None
 
     def solve_many(self, b: Tensor, damping: Tensor | None = None) -> Tensor | None:
-        """The same for columns b (P + S·M·d, R); None where the parameters' part is not positive definite."""
+        """`solve` for columns b (P + S·M·d, R); None if the reduced matrix is not positive definite."""
         P, shape = len(self.corner), self.border.shape
         corner, (diagonal, *beside) = self.corner.double(), (x.double() for x in self.blocks)
         if damping is not None:

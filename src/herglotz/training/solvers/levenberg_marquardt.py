@@ -13,12 +13,14 @@ from torch import Tensor
 from herglotz.progress import beat
 from herglotz.training.distributed import everywhere, of_first
 
-ROUNDING = 1e-11  # a change of the cost below this, relative, is the rounding of a long sum
-FREE, LEFT = 1e-6, 0.01  # damping of steps that are Newton's, and the share of a quiet step that is not worth one
+# A smaller relative change of the cost is the rounding of a long sum.
+ROUNDING = 1e-11
+# Below this damping λ a step is a Newton step. The search ends if it predicts less than this share of the tolerance.
+NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
 
 
 class ByProducts(Protocol):
-    """A matrix JᵀJ that is known by its products (`matrix_free`)."""
+    """A matrix JᵀJ given by products with vectors (`matrix_free`)."""
 
     def __matmul__(self, v: Tensor, /) -> Tensor:
         """JᵀJ v."""
@@ -29,15 +31,15 @@ class ByProducts(Protocol):
         ...
 
     def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(JᵀJ + diag(damping))⁻¹ b, or None where there is no finite one."""
+        """(JᵀJ + diag(damping))⁻¹ b, or None if there is no finite solution."""
         ...
 
 
 class SumOfSquares(Protocol):
-    """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, so that they may work in chunks."""
+    """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, possibly in chunks."""
 
     def cost(self, x: Tensor) -> Tensor:
-        """½|r|², a scalar; may be inf or nan where x is not admissible."""
+        """½|r|², a scalar; inf or NaN if x is not admissible."""
         ...
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, ByProducts, Tensor]:
@@ -46,17 +48,17 @@ class SumOfSquares(Protocol):
 
 
 class Progress(Protocol):
-    """What an optimiser reports to, and goes on from."""
+    """Receives the state of an optimiser; `resumed` is that state from an interrupted run (None: start from x)."""
 
-    resumed: dict[str, Any] | None  # what `search` gave in the interrupted run; None: start from x
+    resumed: dict[str, Any] | None
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]], /) -> None:
-        """Called after each iteration; `search()` is all that decides how the search goes on, as plain values."""
+        """Called after each iteration; `search()` gives the state of the search as plain values."""
         ...
 
 
 def memory_of(problem: Any) -> dict[str, Any]:
-    """What a problem, or the one inside it, remembers of its last evaluation and later ones start from; {} of most."""
+    """The start values that a problem, or the problem inside it, keeps for its next evaluation; {} for most."""
     inner = getattr(problem, "problem", problem)
     return inner.memory() if hasattr(inner, "memory") else {}
 
@@ -69,19 +71,22 @@ def remind(problem: Any, memory: dict[str, Any]) -> None:
 
 @dataclass
 class OptimiserResult:
-    """The best point found and how the search went."""
+    """The best point, the accepted costs, and why the search ended.
+
+    `reason` is "converged", "max_iterations", "no_descent" or "not_finite"; `memory` is that of the problem at the end.
+    """
 
     x: Tensor
     cost: float
-    reason: str  # "converged", "max_iterations", "no_descent" or "not_finite"
+    reason: str
     iterations: int
-    history: list[float] = field(default_factory=list)  # accepted costs
-    memory: dict[str, Any] = field(default_factory=dict)  # of the problem, at the end
+    history: list[float] = field(default_factory=list)
+    memory: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
 class _Search:
-    """All that decides how the search goes on, beside the equations at x."""
+    """The state of a search, without the normal equations at x."""
 
     x: Tensor
     best: float
@@ -97,8 +102,8 @@ class _Search:
         return "converged" if self.quiet >= patience else "no_descent" if self.damping > 1e12 else None
 
     def ends(self, predicted: float, enough: float) -> bool:
-        """Whether an all but undamped step is to lower the cost by next to nothing beside what is `enough`."""
-        return self.damping <= FREE and 0 <= predicted < LEFT * enough
+        """True if a Newton step predicts a decrease far below the tolerance `enough`."""
+        return self.damping <= NEWTON_DAMPING and 0 <= predicted < NEGLIGIBLE * enough
 
     @classmethod
     def gone_on(cls, x: Tensor, cost: float, scale: Tensor, damping: float, resumed: Any) -> _Search:
@@ -110,25 +115,25 @@ class _Search:
 
 def levenberg_marquardt(
     problem: SumOfSquares,
-    x: Tensor,  # (P,) start
+    x: Tensor,  # (P,)
     *,
-    max_iterations: int = 150,  # accepted and rejected steps together
+    max_iterations: int = 150,
     rtol: float = 1e-6,
     atol: float = 0.0,
     patience: int = 5,
-    damping: float = 1e-3,  # λ of the first step; far smaller where few combinations of the unknowns are free
-    callback: Progress | None = None,  # called after each iteration; a search goes on from what it holds, bit for bit
+    damping: float = 1e-3,
+    callback: Progress | None = None,
 ) -> OptimiserResult:
-    """Minimise ½|r(x)|².
+    """Minimise ½|r(x)|² from the start x, in at most `max_iterations` accepted and rejected steps.
 
     Each iteration solves (JᵀJ + λ D) δ = −Jᵀr with D the running maximum of diag JᵀJ (Marquardt's scaling, Moré's
-    monotone version) by Cholesky, or by conjugate gradients where JᵀJ is known by its products; λ follows the ratio of
-    actual to predicted decrease (Nielsen's rule).
+    monotone version) by Cholesky, or by conjugate gradients if JᵀJ is given by products; λ starts at `damping` and
+    follows the ratio of actual to predicted decrease (Nielsen's rule).
 
     The search ends after `patience` accepted steps in a row that each lower the cost by less than `atol`, or `rtol`
-    relative. A step that changes it by rounding only is not taken and counts as one of them. It ends at once where an
-    all but undamped step is to lower the cost by less than a hundredth of that. The result is always the best finite
-    point.
+    relative. A step that changes the cost only by rounding is not taken, but counts as such a step. The search ends at
+    once if a Newton step predicts less than a hundredth of the tolerance. The result is the best finite point. A search
+    resumed by the `callback` is bit-equal to an uninterrupted one.
     """
     resumed = None if callback is None else callback.resumed
     if resumed is not None:
@@ -150,7 +155,7 @@ def levenberg_marquardt(
                 at.quiet = patience
                 break
             new = float(of_first(problem.cost(at.x + step))[0])
-        # Whether rounding lets the cost fall differs from machine to machine; the search must not depend on it.
+        # Rounding errors differ between machines; the search must not depend on their sign.
         settled = abs(at.best - new) <= rounding * at.best
         if step is not None and not settled and new < at.best and predicted > 0:
             gain = (at.best - new) / predicted
@@ -172,9 +177,9 @@ def levenberg_marquardt(
 
 
 def _floored(scale: Tensor) -> Tensor:
-    """Keep the scaling positive where a parameter has had no influence yet (behind a zero-initialised layer).
+    """A positive scaling for parameters without influence yet (behind a layer that starts at 0).
 
-    Those that have some keep their own, however small: it is a power of the unit of length.
+    All others keep their scaling, however small, because it has a unit.
     """
     largest = float(scale.max())
     return torch.where(scale > 0, scale, largest if largest > 0 else 1.0)
@@ -184,7 +189,7 @@ Equations = tuple[Tensor, "Tensor | ByProducts", Tensor]
 
 
 def _of_first(equations: Equations) -> Equations:
-    """The first process's; products are the same everywhere already."""
+    """The equations of the first process; a matrix given by products is the same in every process."""
     cost, A, b = equations
     if isinstance(A, Tensor):
         return cast(Equations, of_first(cost, A, b))
@@ -196,10 +201,10 @@ def _damped_step(A: Tensor | ByProducts, b: Tensor, diagonal: Tensor) -> Tensor 
     if not isinstance(A, Tensor):
         step = A.solve(-b, diagonal)
         return step if everywhere(step is not None) else None
-    matrix = (A + torch.diag(diagonal)).double()  # squared condition numbers need float64
+    # JᵀJ has the squared condition number of J, which needs float64.
+    matrix = (A + torch.diag(diagonal)).double()
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not everywhere(int(info) == 0):
         return None
-    step = -torch.cholesky_solve(b.double()[:, None], factor)[:, 0].to(b.dtype)
-    (step,) = of_first(step)
+    (step,) = of_first(-torch.cholesky_solve(b.double()[:, None], factor)[:, 0].to(b.dtype))
     return step if bool(torch.isfinite(step).all()) else None
