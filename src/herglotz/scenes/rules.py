@@ -14,8 +14,8 @@ from torch import Tensor
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.newton import find_root, solve
+from herglotz.mechanics.scalar_fields import Lagrangian
 from herglotz.scenes.special import as_step
-from herglotz.theory.continuous import Lagrangian
 
 MAX_NEWTON = 30  # ends a scalar equation without a solution
 # With the Jacobian held fixed each Newton step inside the graph makes derivatives exact one order further.

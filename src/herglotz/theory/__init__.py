@@ -1,19 +1,19 @@
 """The paper's objects, a file a subject. Learning and stepping a model need none of them."""
 
+from herglotz.mechanics.scalar_fields import derivatives as derivatives
+from herglotz.stepping.continuous_equation import (
+    ContinuousEquation as ContinuousEquation,
+    FractionalStepper as FractionalStepper,
+    inverse_step as inverse_step,
+)
 from herglotz.theory.action import Action as Action, curve_action as curve_action, herglotz_action as herglotz_action
 from herglotz.theory.boundary import Curve as Curve, boundary_value as boundary_value, initial_value as initial_value
 from herglotz.theory.check import TheoremCheck as TheoremCheck, check as check
 from herglotz.theory.constrained import ConstrainedStepper as ConstrainedStepper
 from herglotz.theory.continuous import (
     contact_vector_field as contact_vector_field,
-    derivatives as derivatives,
     evolution_vector_field as evolution_vector_field,
     herglotz_acceleration as herglotz_acceleration,
-)
-from herglotz.theory.continuous_equation import (
-    ContinuousEquation as ContinuousEquation,
-    FractionalStepper as FractionalStepper,
-    inverse_step as inverse_step,
 )
 from herglotz.theory.degenerate import (
     LegendrianStepper as LegendrianStepper,

@@ -28,9 +28,9 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.partials import partials
+from herglotz.mechanics.scalar_fields import gradient
 from herglotz.stepping import Rollout, State, Stepper
 from herglotz.stepping.state import Step
-from herglotz.theory.continuous import gradient
 
 TimeLagrangian = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
 

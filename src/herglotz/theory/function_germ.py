@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from herglotz.theory.continuous import gradient
+from herglotz.mechanics.scalar_fields import gradient
 
 Function = Callable[[Tensor], Tensor]  # F(q), (..., n) → (...)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from herglotz.mechanics.contact import join
-from herglotz.theory.continuous import Hamiltonian, gradient
+from herglotz.mechanics.scalar_fields import Hamiltonian, gradient
 from herglotz.theory.function_germ import Function, prolongation
 from herglotz.theory.jacobi import Field
 

@@ -18,7 +18,8 @@ from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus, momentum_residual
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, partials
-from herglotz.theory.continuous import Hamiltonian, contact_vector_field, derivatives
+from herglotz.mechanics.scalar_fields import Hamiltonian, derivatives
+from herglotz.theory.continuous import contact_vector_field
 
 Section = Callable[[Tensor, Tensor], Tensor]  # p = γ(q, s), (..., n) and (...) → (..., n)
 

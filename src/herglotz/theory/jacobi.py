@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.contact import Triple, contact_form, jacobian, join, split
-from herglotz.theory.continuous import ScalarField, derivatives
+from herglotz.mechanics.scalar_fields import ScalarField, derivatives
 
 Field = Callable[[Tensor, Tensor, Tensor], Triple]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.newton import find_root
-from herglotz.theory.continuous import ScalarField, derivatives
+from herglotz.mechanics.scalar_fields import ScalarField, derivatives
 
 
 def fiber_derivative(

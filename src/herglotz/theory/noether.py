@@ -18,7 +18,7 @@ from torch import Tensor
 
 from herglotz.mechanics.contact import Triple, jacobian
 from herglotz.mechanics.partials import DiscreteLagrangian, value
-from herglotz.theory.continuous import Hamiltonian, ScalarField, gradient
+from herglotz.mechanics.scalar_fields import Hamiltonian, ScalarField, gradient
 from herglotz.theory.jacobi import jacobi_bracket
 
 Action = Callable[[Tensor, Tensor], Tensor]  # g(ε, q): (...) and (..., n) → (..., n), g(0, q) = q

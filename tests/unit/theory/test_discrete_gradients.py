@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from herglotz.mechanics.scalar_fields import gradient
 from herglotz.theory import midpoint_gradient
-from herglotz.theory.continuous import gradient
 
 
 def f(x):

@@ -28,10 +28,10 @@ from herglotz.mechanics import momentum_minus, momentum_plus, partials
 from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials
+from herglotz.mechanics.scalar_fields import gradient
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.stepping.stepper import Stepper
-from herglotz.theory.continuous import gradient
 
 MOST = 18  # largest m: at 31 samples a period of Hénon–Heiles 9 leave dH̃/dt + RH̃ = 4e-9 and 18 leave 1e-11
 AGREED = 1e-13  # of the move to the next iterate: two orders that differ by less differ by rounding
