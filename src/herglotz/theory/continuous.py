@@ -19,7 +19,10 @@ def contact_vector_field(
     p: Tensor,  # (..., n)
     s: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H. Source: contact Hamilton equations of the paper."""
+    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H.
+
+    Source: contact Hamilton equations of the paper.
+    """
     q_dot, p_dot, heat, H_value = _evolution(H, q, p, s)
     return q_dot, p_dot, heat - H_value
 
@@ -30,9 +33,9 @@ def evolution_vector_field(
     p: Tensor,  # (..., n)
     s: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """E_H = X_H + H ∂_s: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p. H is constant along it and η(E_H) = 0.
+    """E_H = X_H + H ∂_s: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p. H is constant along E_H, and η(E_H) = 0.
 
-    Source: erratum E2; it is the field for which Theorem 1 of the paper holds as printed.
+    Source: erratum E2; Theorem 1 of the paper holds as printed for E_H.
     """
     return _evolution(H, q, p, s)[:3]
 
