@@ -199,15 +199,6 @@ def test_the_golden_section_is_discrete_too(n):
     assert worst(plus) > 1e-3
 
 
-def test_transport_keeps_the_golden_section():
-    # fails if the preimage is not solved for in s as well
-    oscillator, (q, s) = scene("damped_oscillator"), away_from_zero(1)
-    carried = transport_section(oscillator.L_d, radial(), 0.1)
-    torch.testing.assert_close(carried(q, s), radial()(q, s), rtol=1e-12, atol=1e-12)
-    twice = transport_section(oscillator.L_d, carried, 0.1)
-    torch.testing.assert_close(twice(q, s), radial()(q, s), rtol=1e-11, atol=1e-11)
-
-
 def pendula(q0, q1, s0, h):
     """Two coupled pendula with damping that depends on s and on the motion: nothing is quadratic."""
     v, q = (q1 - q0) / h, (q0 + q1) / 2

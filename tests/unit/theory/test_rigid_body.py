@@ -55,12 +55,6 @@ def test_cayley_turns_by_twice_the_arctangent():
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand_as(R), rtol=0, atol=2e-15)
 
 
-def test_derivatives_are_right_at_the_identity():
-    # fails if a branch that is not taken sends NaN into the gradient
-    for size in (0.0, 1e-9, 1.0, 2.0):
-        assert torch.autograd.gradcheck(cayley, ((axes(2) * size).requires_grad_(),))
-
-
 def test_the_step_solves_the_discrete_equation():
     # fails if F J_d − J_d Fᵀ has another factor, J_d is J, or c enters twice
     x, h = start(), 0.2
@@ -111,15 +105,6 @@ def test_spatial_momentum_scales_with_sigma_and_attitudes_stay_rotations():
     torch.testing.assert_close(out.sigma, torch.exp(-0.02 * t).expand(2, -1), rtol=1e-12, atol=0)
     kinetic = 0.5 * (start().M ** 2 / J).sum(-1)
     torch.testing.assert_close(stepper.energy(start().M), kinetic)
-
-
-@pytest.mark.slow
-def test_ten_thousand_steps():
-    # fails if R drifts off SO(3): without the correction RᵀR − I grows like the number of steps
-    stepper = RigidBodyStepper(J, 0.002)
-    orthogonal, momentum, _ = conserved(stepper.rollout(*start(), h=0.05, steps=10_000), stepper)
-    assert orthogonal < 1e-13
-    assert momentum < 1e-12
 
 
 def test_float32_and_matrix_inertia():
