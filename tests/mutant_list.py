@@ -105,7 +105,7 @@ MUTANTS = [
     ("theory/degenerate.py", "chain = self.ahead + 1", "chain = self.ahead + 2"),
     ("theory/degenerate.py", "q0 if guess is None else guess.detach()", "q0"),
     ("theory/degenerate.py", "q1 = x[..., : q0.shape[-1]]", "q1 = x[..., -q0.shape[-1] :]"),
-    ("theory/degenerate.py", " | (P.c == 0)", ""),
+    ("theory/degenerate.py", "forgets = (P.c == 0)", "forgets = (P.c != P.c)"),
     ("theory/degenerate.py", "small = sizes <= ", "small = sizes > "),
     ("theory/degenerate.py", "kernel = V.mT * small", "kernel = V * small"),
     ("theory/degenerate.py", "State(moved(y).q + nan[..., None], p0, s0)", "State(moved(y).q, p0, s0)"),

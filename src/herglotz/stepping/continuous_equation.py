@@ -174,17 +174,13 @@ class _Iterates:
         state, log_c = State(*split(x[..., :-1])), x[..., -1]
         n = state.q.shape[-1]
         other = self.nodes.get(last - sign)
-        # Uniform motion is the guess.
-        guess = None if other is None else (2 * x - other[0]).detach()
-        if sign > 0:
-            start = None if guess is None else torch.where(guess.isfinite(), guess, x)[..., :n]
-            step = self.stepper.step(state, self.h, start)
-        else:
-            start = None
-            if guess is not None:
-                guess = torch.where(guess.isfinite(), guess, x)
-                start = torch.cat([guess[..., :n], guess[..., 2 * n : 2 * n + 1]], -1)
-            step = inverse_step(self.L_d, state, self.h, start)
+        guess, forward = None, sign > 0
+        if other is not None:
+            uniform = (2 * x - other[0]).detach()
+            uniform = torch.where(uniform.isfinite(), uniform, x)
+            q, s = uniform[..., :n], uniform[..., 2 * n : 2 * n + 1]
+            guess = q if forward else torch.cat([q, s], -1)
+        step = self.stepper.step(state, self.h, guess) if forward else inverse_step(self.L_d, state, self.h, guess)
         row = torch.cat([join(*step.state), (log_c + sign * step.c.log())[..., None]], -1)
         self.nodes[last + sign] = (row, torch.where(status == Status.CONVERGED, step.status, status))
 

@@ -143,8 +143,8 @@ def _check_open(q: Tensor) -> None:
 
 
 def _size(*terms: Tensor) -> float:
-    largest = max((float(x[x.isfinite()].abs().max()) for x in terms if x.isfinite().any()), default=0.0)
-    return largest or 1.0
+    largest = _worst(torch.cat([x.abs().flatten() for x in terms]))
+    return largest if largest > 0 else 1.0
 
 
 def _worst(values: Tensor) -> float:

@@ -90,8 +90,8 @@ class LegendrianStepper(OneStepMethod):
         x, status, residual, iterations = self._least_squares(lambda x: self._chain(state, h, x), start)
         q1 = x[..., : q0.shape[-1]]
         P = partials(self.L_d, q0, q1, s0, h)
-        failed = (status != Status.CONVERGED) | (P.c == 0)
-        status = torch.where(failed & (status == Status.CONVERGED), Status.SINGULAR, status).to(torch.uint8)
+        forgets = (P.c == 0) & (status == Status.CONVERGED)
+        status = torch.where(forgets, Status.SINGULAR, status).to(torch.uint8)
         new = State(*(x.detach() for x in (q1, momentum_plus(P), s0 + P.L)))
         return Step.of(new, P.c.detach(), status, residual, iterations)
 

@@ -107,7 +107,7 @@ class RigidBodyStepper:
         f, status, residual, iterations = self._solve(g)
         F = cayley(f)
         # tr((I − F) J_d) = 2 f·Jf/(1 + |f|²); the right-hand side has no cancellation.
-        action = 2.0 * (f * self._times(f)).sum(-1) / (1.0 + (f * f).sum(-1))
+        action = 2.0 * (f * (f @ self.inertia.to(f))).sum(-1) / (1.0 + (f * f).sum(-1))
         c = (root**2).expand_as(s)
         new = BodyState(
             _orthogonal(R @ F),
@@ -133,9 +133,6 @@ class RigidBodyStepper:
         track = roll_out(state, Drive(lambda: single, h_all, Plan(h_all.shape[-1], every), extrapolate=False))
         R, M, s = track.states
         return BodyRollout(R, M, s, track.sigma, track.status, track.residual)
-
-    def _times(self, f: Tensor) -> Tensor:
-        return f @ self.inertia.to(f)
 
     def _solve(self, g: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
         """The Cayley vector f of F with F J_d − J_d Fᵀ = ĝ, its status, last Newton step, and iterations.

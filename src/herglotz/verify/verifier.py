@@ -121,9 +121,7 @@ def verify(
         missing = ("contact", "momentum", *(("holding",) if known.sticks else ()))
         checks[2] = replace(checks[2], note=f"{checks[2].note}. {NO_CONTACT_MAP}")
     else:
-        fixed = tolerance is not None
-        loose = identity if fixed else rounded(identity, w)
-        checks.append(contact(w, strict if fixed else rounded(strict, w)))
+        loose = (strict, identity) if tolerance is not None else (rounded(strict, w), rounded(identity, w))
         checks += _of_a_contact_map(known, w, identity, loose, fan(known, steps, seed + 1))
     if known.scene is not None and known.scene.exact:
         checks.append(_exact_flow(known, w, identity))
@@ -146,16 +144,22 @@ def _bounds(known: Subject, tolerance: float | None) -> tuple[float, float]:
     return identity if known.L_d is None else CONTACT[dtype], identity
 
 
-def _of_a_contact_map(known: Subject, w: SampledRollout, bound: float, loose: float, f: Fan) -> list[Check]:
-    """The identities of a map without forces; `loose` bounds those into which the rounding of q enters."""
+def _of_a_contact_map(
+    known: Subject, w: SampledRollout, bound: float, loose: tuple[float, float], f: Fan
+) -> list[Check]:
+    """The identities of a map without forces.
+
+    The rounding of q enters the contact property and other identities of p, whose bounds are the two of `loose`.
+    """
     right, left = hamiltonians_exist(known, w)
-    checks = [volume(w, bound), momentum_matching(known, w, bound), *derivatives(f, loose, bound)]
+    checks = [contact(w, loose[0]), volume(w, bound), momentum_matching(known, w, bound)]
+    checks += derivatives(f, loose[1], bound)
     checks.append(hamilton_jacobi(known, f, bound) if right else NO_H_PLUS)
     if known.L_d is None:
         return checks
     if not left:
         return [*checks, *NO_H_MINUS]
-    return [*checks, left_formalism(known, w, loose), left_hamilton_jacobi(known, f, bound)]
+    return [*checks, left_formalism(known, w, loose[1]), left_hamilton_jacobi(known, f, bound)]
 
 
 def _details(known: Subject, steps: int, seed: int) -> dict[str, Any]:
