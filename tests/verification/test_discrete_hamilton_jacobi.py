@@ -177,30 +177,3 @@ def test_off_the_flow_the_residual_is_quadratic_in_the_distance():
         slopes = (values[:-1] / values[1:]).log2()
         assert float((slopes - 2).abs().max()) < 0.05, slopes
         assert float(values[0]) > 1e-6
-
-
-def test_a_single_trajectory_determines_nothing():
-    # fails if solving the equation along one trajectory is taken for a solution (E7): here are two wrong S that do
-    f = Fan("nonlinear")
-    one = slice(0, 1)
-    q0, q1, s0, s1 = f.q0[one], f.q1[one], f.s0[one], f.s1[one]
-
-    def tangent(q, s, p, bend):
-        """S with this value and slope at q and any second derivative."""
-        return lambda x: s[0] + ((x - q[0]) * p[0]).sum(-1) + bend * ((x - q[0]) ** 2).sum(-1)
-
-    class One(Fan):
-        def __init__(self):
-            self.L_d, self.h, self.q0, self.q1 = f.L_d, f.h, q0, q1
-
-    on_one = One()
-    S0, S1 = tangent(q0, s0, f.p0[one], 7.0), tangent(q1, s1, f.p1[one], -3.0)
-    assert largest(on_one.right(S0, S1, q0, q1)) < 1e-13
-    assert largest(on_one.left(S0, S1, q0, q1)) < 1e-13
-    assert largest(f.right(S0, S1, f.q0, f.q1)) > 1e-3  # on the open set it is found out
-
-    wrong = f.p1[one] + 0.4  # not even the momentum is determined by the right equation along one trajectory
-    H = RightHamiltonian(f.L_d, q1)(q0, wrong, s0, f.h)
-    S1 = tangent(q1, s0 + (wrong * q1).sum(-1) - H, wrong, 0.0)
-    assert largest(on_one.right(S0, S1, q0, q1)) < 1e-13
-    assert largest(f.right(S0, S1, f.q0, f.q1)) > 1e-3

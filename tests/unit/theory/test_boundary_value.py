@@ -95,14 +95,6 @@ def test_beyond_a_conjugate_point_the_curve_is_found_and_said_to_have_crossed():
     assert int(curve.opening.crossed) in (9, 10)
 
 
-def test_two_coordinates_that_focus_at_once_have_crossed():
-    # fails if crossing is read off a determinant, whose sign two coordinates change twice
-    q, p = (torch.tensor(x, dtype=torch.float64) for x in ([1.0, -0.3], [0.5, 0.4]))
-    out = Stepper(OSCILLATOR.L_d).rollout(q, p, q[0], h=0.4, steps=10)
-    curve = boundary_value(OSCILLATOR.L_d, q, out.q[-1], q[0], h=0.4, steps=10)
-    assert int(curve.opening.crossed) == 7  # π/ω = 3.16 lies between 7 h and 8 h
-
-
 def test_no_solution_has_a_status():
     # fails if Newton's last iterate is returned where the equation has no root: R_1 = 1 + q_1² here
     def rootless(q0, q1, s0, h):
