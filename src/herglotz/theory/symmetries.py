@@ -161,9 +161,9 @@ def symmetries(
     state = check_batch(states)
     n = state.q.shape[-1]
     names = tuple(coordinates) or tuple(f"q{i + 1}" for i in range(n))
-    for what, given in (("angles", angles), ("coordinates", names)):
+    for setting, given in (("angles", angles), ("coordinates", names)):
         if len(given) not in (0, n):
-            raise InputError(f"{what} needs one entry a coordinate ({n}), got {len(given)}")
+            raise InputError(f"{setting} needs one entry a coordinate ({n}), got {len(given)}")
     straight = [i for i in range(n) if not (angles and angles[i])]
     most = PRECISION.get(state.q.dtype, 1e-4) if precision is None else precision
     return _null_space(_columns(L_d, state, h, steps, straight), most, names)
@@ -241,13 +241,13 @@ def _columns(L_d: DiscreteLagrangian, states: State, h: Tensor | float, steps: i
     # The size leaves out boundary terms, which a gauge adds to p, and the part of s that is due to s_0.
     start = torch.cat([s0[:, :1, None], chi0[:, :1]], -1)
     kept = (P.c.cumprod(-1)[..., None] * start).flatten(0, 1)
-    size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, kept], -1), size[:, -1:])], -1)
+    size = torch.cat([_outside_span(chi, size[:, :-1]), _outside_span(torch.cat([chi, kept], -1), size[:, -1:])], -1)
     if len(size) < 2 * defect.shape[-1]:
         raise InputError(f"{len(size)} steps do not determine {defect.shape[-1]} numbers; give more states or steps")
     return _Columns(defect[:, :m], size, defect[:, m:], _rms(chi), centre, middle, straight)
 
 
-def _beside(known: Tensor, columns: Tensor) -> Tensor:
+def _outside_span(known: Tensor, columns: Tensor) -> Tensor:
     """The part of the columns outside the span of the known columns."""
     U, S, _ = torch.linalg.svd(known / _rms(known).clamp_min(MIN_RELATIVE_DEFECT), full_matrices=False)
     U = U[:, MIN_RELATIVE_DEFECT * S[0] < S]
@@ -257,13 +257,13 @@ def _beside(known: Tensor, columns: Tensor) -> Tensor:
 def _null_space(x: _Columns, precision: float, names: tuple[str, ...]) -> Symmetries:
     """The generators whose drift is at most the precision, in a reduced basis: translations, then the others."""
     n, wide = len(x.centre), len(x.centre) * len(x.straight)
-    basis, drift, unseen = _small(x, list(range(wide + n + 1)), precision)
-    moved, _, _ = _small(x, list(range(wide, wide + n)), precision)
+    basis, drift, unseen = _below_precision(x, list(range(wide + n + 1)), precision)
+    moved, _, _ = _below_precision(x, list(range(wide, wide + n)), precision)
     moved = _reduced(moved, range(wide, wide + n))
     # The other generators: the directions of the basis that are furthest from the translations.
     Q, _ = torch.linalg.qr(x.size @ moved.mT)
-    beside = x.size @ basis.mT
-    _, _, V = torch.linalg.svd(beside - Q @ (Q.mT @ beside), full_matrices=False)
+    others = x.size @ basis.mT
+    _, _, V = torch.linalg.svd(others - Q @ (Q.mT @ others), full_matrices=False)
     # From ξ = A (q − q̄) + b to ξ = A q + b.
     rest = x.about(V[: len(basis) - len(moved)] @ basis, -x.centre)
     rest = _reduced(rest, [wide + n, *range(wide)])
@@ -278,7 +278,7 @@ def _null_space(x: _Columns, precision: float, names: tuple[str, ...]) -> Symmet
     return Symmetries(A, rows[:, wide:-1], rows[:, -1], k, w, B, x.drift(about), drift, precision, unseen, names)
 
 
-def _small(x: _Columns, columns: list[int], precision: float) -> tuple[Tensor, Tensor, int]:
+def _below_precision(x: _Columns, columns: list[int], precision: float) -> tuple[Tensor, Tensor, int]:
     """Generators of some columns with a drift up to the precision, (r, m), all drifts, and the number unseen."""
     size = x.size[:, columns]
     scale = _rms(size)

@@ -71,13 +71,13 @@ def formula(
 def _sum(terms: list[tuple[float, str]], small: float = MIN_RELATIVE_ENTRY) -> str:
     """The text `2 x − y + 3` for [(2, "x"), (−1, "y"), (3, "")]."""
     least = small * max(abs(x) for x, _ in terms)
-    terms = [(x, what) for x, what in terms if abs(x) > least]
+    terms = [(x, symbol) for x, symbol in terms if abs(x) > least]
     first = next((i for i, (x, _) in enumerate(terms) if x > 0), 0)
     text = ""
-    for x, what in [*terms[first : first + 1], *terms[:first], *terms[first + 1 :]]:
-        number = f"{abs(x):.4g}" if abs(abs(x) - 1) > MIN_RELATIVE_ENTRY or not what else ""
+    for x, symbol in [*terms[first : first + 1], *terms[:first], *terms[first + 1 :]]:
+        number = f"{abs(x):.4g}" if abs(abs(x) - 1) > MIN_RELATIVE_ENTRY or not symbol else ""
         sign = " − " if x < 0 else " + "
-        text += (sign if text else sign.strip().replace("+", "")) + " ".join(y for y in (number, what) if y)
+        text += (sign if text else sign.strip().replace("+", "")) + " ".join(y for y in (number, symbol) if y)
     return text or "0"
 
 

@@ -101,9 +101,9 @@ def tulczyjew_triple(
         contact_product_point(*points),
         right,
         left,
-        _less(right, _jet(right[0], H_plus, -s0, -1.0)),
-        _less(left, _jet(left[0], H_minus, end[2], 1.0)),
-        _less(right, _jet(right[0], family, torch.zeros_like(s0), 0.0)),
+        _difference(right, _jet(right[0], H_plus, -s0, -1.0)),
+        _difference(left, _jet(left[0], H_minus, end[2], 1.0)),
+        _difference(right, _jet(right[0], family, torch.zeros_like(s0), 0.0)),
     )
 
 
@@ -112,5 +112,5 @@ def _jet(base: Tensor, P: Partials, s: Tensor, slope: float) -> Triple:
     return base, torch.cat([P.D1, P.D2, P.D3[..., None] + slope], -1), P.L + s
 
 
-def _less(a: Triple, b: Triple) -> Tensor:
+def _difference(a: Triple, b: Triple) -> Tensor:
     return torch.cat([a[0] - b[0], a[1] - b[1], (a[2] - b[2])[..., None]], -1)
