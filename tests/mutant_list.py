@@ -98,7 +98,7 @@ MUTANTS = [
     ("theory/rigid_body.py", "c[..., None] * (F.mT @ M", "(F.mT @ M"),
     ("theory/rigid_body.py", "g = (h * root)[..., None] * M", "g = h[..., None] * M"),
     ("theory/constrained.py", "(Dg0.mT @ x[..., n:, None])", "(Dg1.mT @ x[..., n:, None])"),
-    ("theory/constrained.py", "p1 = self._projected(q1, momentum_plus(P), s1, self._rows(q1)[1])", "p1 = momentum_plus(P)"),
+    ("theory/constrained.py", "p1 = self._projected(q1, momentum_plus(P), s1)", "p1 = momentum_plus(P)"),
     ("theory/degenerate.py", "q, p, s = q1, momentum_plus(P), s + P.L", "q, p, s = q1, momentum_plus(P), s"),
     ("theory/degenerate.py", "q, p, s = q1, momentum_plus(P)", "q, p, s = q1, p"),
     ("theory/degenerate.py", "(q1, momentum_plus(P), s0 + P.L), P.c", "(q1, momentum_plus(P), s0 - P.L), P.c"),

@@ -60,7 +60,7 @@ class ConstrainedStepper(OneStepMethod):
     def project(self, state: State) -> State:
         """Return (q, p + Dgᵀμ, s) with Dg·v = 0: the state with its momentum projected on the tangent space."""
         q, p, s = check_state(state)
-        return State(q, self._projected(q, p, s, self._rows(q)[1]), s)
+        return State(q, self._projected(q, p, s), s)
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
         """One step: solve for (q1, λ) → momentum → projection → action.
@@ -74,7 +74,7 @@ class ConstrainedStepper(OneStepMethod):
         q1, _, root = self._solve(state, h, guess)
         P = partials(self.L_d, state.q, q1, state.s, h)
         s1 = state.s + P.L
-        p1 = self._projected(q1, momentum_plus(P), s1, self._rows(q1)[1])
+        p1 = self._projected(q1, momentum_plus(P), s1)
         # If Dg loses rank, the saddle-point matrix or the matrix of the projection is singular.
         end = torch.isfinite(p1).all(-1) & torch.isfinite(s1)
         singular = (P.c == 0) | (root.converged & ~end)
@@ -131,8 +131,9 @@ class ConstrainedStepper(OneStepMethod):
         x = root.with_slope(lambda x: balance(x, 1)[0])
         return x[..., :n], x[..., n:], root
 
-    def _projected(self, q: Tensor, p: Tensor, s: Tensor, Dg: Tensor) -> Tensor:
+    def _projected(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         """The momentum p + Dgᵀμ with Dg·v = 0. Where v is linear in p, one Newton step finds μ."""
+        Dg = self._rows(q)[1]
 
         def equations(mu: Tensor) -> tuple[Tensor, Tensor]:
             v, v_p = jacobian(lambda p: self.velocity(q, p, s), p + (Dg.mT @ mu[..., None])[..., 0])

@@ -145,7 +145,8 @@ class LegendrianStepper(OneStepMethod):
                 return value
 
             value, J = jacobian(F, x)
-            return Point(value.detach(), self._pseudo_inverse(J.detach()), terms[-1])
+            J = torch.where(torch.isfinite(J).all(-1).all(-1)[..., None, None], J, 0.0).detach()
+            return Point(value.detach(), torch.linalg.pinv(J, rtol=eps**RANK_POWER), terms[-1])
 
         def sizes(x: Tensor, _: Point, left: Tensor) -> tuple[Tensor, Tensor]:
             scale = torch.maximum(largest(x), torch.nan_to_num(left, nan=0.0, posinf=0.0))
@@ -160,8 +161,3 @@ class LegendrianStepper(OneStepMethod):
         status = torch.where(residual <= eps**0.75, int(Status.CONVERGED), int(Status.SINGULAR))
         status = torch.where(torch.isfinite(residual), status, int(Status.DIVERGED))
         return found.x, status, residual, found.iterations
-
-    def _pseudo_inverse(self, J: Tensor) -> Tensor:
-        """The pseudo-inverse J⁺; zeros where J is not finite."""
-        J = torch.where(torch.isfinite(J).all(-1).all(-1)[..., None, None], J, 0.0)
-        return torch.linalg.pinv(J, rtol=torch.finfo(J.dtype).eps ** RANK_POWER)

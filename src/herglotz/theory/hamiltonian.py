@@ -46,7 +46,9 @@ class RightHamiltonian:
             return P.D2 - p1, P.D22
 
         with torch.no_grad():
-            q0, p1, s0 = _broadcast(q0.detach(), p1.detach(), s0.detach(), h)
+            shape = torch.broadcast_shapes(q0.shape[:-1], p1.shape[:-1], s0.shape, torch.as_tensor(h).shape)
+            q0, p1 = (x.detach().broadcast_to(*shape, x.shape[-1]) for x in (q0, p1))
+            s0 = s0.detach().broadcast_to(shape)
             start = q0 if self.near is None else self.near.broadcast_to(q0.shape)
             q1 = find_root(equations, start).solved
             P = unforced(partials(self.L_d, q0, q1, s0, h, order=2))
@@ -134,8 +136,3 @@ class _Exchanged:
 def _exchanged(P: Partials) -> Partials:
     D12 = P.D12 if P.D12 is None else P.D12.mT
     return Partials(P.L, P.D2, P.D1, P.D3, P.D22, D12, P.D11, P.D23, P.D13, P.D33)
-
-
-def _broadcast(q: Tensor, p: Tensor, s: Tensor, h: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
-    shape = torch.broadcast_shapes(q.shape[:-1], p.shape[:-1], s.shape, torch.as_tensor(h).shape)
-    return q.broadcast_to(*shape, q.shape[-1]), p.broadcast_to(*shape, p.shape[-1]), s.broadcast_to(shape)

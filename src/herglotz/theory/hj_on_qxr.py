@@ -108,12 +108,7 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
                 f"sample {sample}; use a smaller h, or points nearer to the image of the section"
             )
 
-        def residual(x: Tensor) -> Tensor:
-            q0, s0 = x[..., :-1], x[..., -1]
-            P = partials(L_d, q0, q1, s0, h)
-            return torch.cat([momentum_residual(P, gamma0(q0, s0)), (s0 + P.L - s1)[..., None]], -1)
-
-        x = root.with_slope(residual)
+        x = root.with_slope(lambda x: equation(x, q1, s1)[0])
         return momentum_plus(partials(L_d, x[..., :-1], q1, x[..., -1], h))
 
     return gamma1
