@@ -208,21 +208,6 @@ def test_transport_commutes_with_the_step():
     torch.testing.assert_close(section_derivatives(carried, q1, s1)[2], slope, rtol=1e-7, atol=1e-8)
 
 
-def test_a_discrete_solution_tends_to_the_continuous_one():
-    # fails if the discrete equation is consistent with another one: (γ1 − γ0)/h → −(∂_qH + …), order 1 in h
-    oscillator, (q, s) = scene("damped_oscillator"), away_from_zero(1)
-
-    def start(q, s):
-        return torch.sin(q) + 0.3 * s[..., None] * q
-
-    defects = []
-    for h in (0.02, 0.01, 0.005):
-        change = (transport_section(oscillator.L_d, start, h)(q, s) - start(q, s)) / h
-        defects.append(worst(change + section_relatedness_defect(oscillator.hamiltonian, start, q, s)))
-    assert defects[0] / defects[1] == pytest.approx(2, rel=0.1)
-    assert defects[1] / defects[2] == pytest.approx(2, rel=0.1)
-
-
 def test_a_point_that_is_not_reached_is_named():
     # fails if a failed solve comes back as a number
     q = torch.tensor([[1.0]], dtype=torch.float64)
