@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics import DiscreteLagrangian, Forces
 from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
 from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
@@ -113,10 +113,8 @@ def verify(
     # A differenced DΦ̃ cannot be compared with differences.
     if not known.differenced:
         checks.append(derivative(known, w))
-    # A forced map has no generating function, and its volume factor is not c^{n+1}.
     if force is not None:
-        checks += [contact(w, strict, force), momentum_matching(behind, w, identity)]
-        checks += [holding(behind, w, identity)] if force.held is not None else []
+        checks += _of_a_forced_map(behind, w, strict, identity, force)
     elif known.forced:
         missing = ("contact", "momentum", *(("holding",) if known.sticks else ()))
         checks[2] = replace(checks[2], note=f"{checks[2].note}. {NO_CONTACT_MAP}")
@@ -142,6 +140,12 @@ def _bounds(known: Subject, tolerance: float | None) -> tuple[float, float]:
         return tolerance, tolerance
     identity = (DIFFERENCED if known.differenced else IDENTITY)[dtype]
     return identity if known.L_d is None else CONTACT[dtype], identity
+
+
+def _of_a_forced_map(known: Subject, w: SampledRollout, strict: float, bound: float, force: Forces) -> list[Check]:
+    """The identities of a map with forces, which has no generating function; its volume factor is not c^{n+1}."""
+    checks = [contact(w, strict, force), momentum_matching(known, w, bound)]
+    return checks if force.held is None else [*checks, holding(known, w, bound)]
 
 
 def _of_a_contact_map(
