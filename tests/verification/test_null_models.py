@@ -159,9 +159,9 @@ def test_the_table_says_what_it_does_not_judge():
 
 
 def test_a_momentum_scaled_wrongly_fails():
-    # fails if the contact defect or the momentum check compares p with itself
+    # fails if the contact defect or the momentum check compares p with itself, or the left rows look at L_d alone
     report = verify((Altered(lambda _, step: with_state(step, p=1.01 * step.state.p)), states()), h=H)
-    assert {"contact", "volume", "momentum", "D2S"} <= failed(report)
+    assert {"contact", "volume", "momentum", "D2S", "left_equations"} <= failed(report)
 
 
 def test_a_momentum_divided_by_c_fails():

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.mechanics import partials
+from herglotz.mechanics.scalar_fields import derivatives
 from herglotz.scenes import scene
 from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State
 from herglotz.theory import contact_vector_field, generating_function, right_equations
-from herglotz.theory.continuous import derivatives
 from paper_errata.erratum import PARACHUTE, Erratum, Row, parachute_start, size, tensor
 
 

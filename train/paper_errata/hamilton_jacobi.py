@@ -7,6 +7,7 @@ from torch import Tensor
 
 from herglotz.mechanics import partials
 from herglotz.mechanics.contact import jacobian
+from herglotz.mechanics.scalar_fields import derivatives
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
@@ -25,7 +26,6 @@ from herglotz.theory import (
     prolongation,
     riccati_step,
 )
-from herglotz.theory.continuous import derivatives
 from paper_errata.erratum import OSCILLATOR, Erratum, Row, oscillator_start, printed_left, size, tensor
 
 

@@ -1,3 +1,3 @@
-"""A report for people: one HTML file without network, and its twin in Markdown."""
+"""The report of a run: one HTML file that needs no network, and the same text in Markdown."""
 
 from herglotz.report.write import write_report as write_report

@@ -1,4 +1,4 @@
-"""A report as one HTML file, which fetches nothing: styles, pictures and script are inside; and as Markdown."""
+"""A document as Markdown, and as one HTML file that contains its styles, pictures and script."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from herglotz.plots.style import image
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
 
 COLOURS = {"fits to the noise": "#1b7f4d", "fits, worse": "#b26a00", "does not fit": "#b3261e"}
-SHORT = 12  # characters of a cell that stays on one line; longer ones break where a phone needs it
+# A table cell with up to this many characters, a number with its sign, stays on one line on a narrow screen.
+MAX_UNBROKEN = 12
 
 
 def as_html(document: Document) -> str:
-    """Return the whole page."""
+    """Return the page as HTML."""
     style = files("herglotz.report").joinpath("report.css").read_text(encoding="utf-8")
     script = files("herglotz.report").joinpath("slider.js").read_text(encoding="utf-8")
     colour = next((c for text, c in COLOURS.items() if document.verdict.startswith(text)), "#444444")
@@ -63,8 +64,8 @@ def _block(block: Block) -> str:
 
 
 def _cell(text: str) -> str:
-    """A cell of a table; a number and its sign stay on one line where the page is narrow."""
-    return f"""<td{' class="short"' if len(text) <= SHORT else ""}>{escape(text)}</td>"""
+    """A table cell; its text stays on one line if it is short."""
+    return f"""<td{' class="short"' if len(text) <= MAX_UNBROKEN else ""}>{escape(text)}</td>"""
 
 
 def _data(picture: Picture) -> str:
@@ -81,7 +82,7 @@ def _slider(slider: Slider) -> str:
 
 
 def as_markdown(document: Document) -> str:
-    """Return the words, tables and code; the pictures are in the HTML file."""
+    """Return text, tables and code as Markdown; the pictures are in the HTML file."""
     parts = [f"# {document.title}", f"**{document.verdict.split(':')[0]}.** {document.meaning}", document.verdict]
     for section in document.sections:
         parts += [f"## {section.title}", *filter(None, map(_text_of, section.blocks))]

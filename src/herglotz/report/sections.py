@@ -1,4 +1,4 @@
-"""The contents of a report: sections of text, tables, code and pictures, before they become HTML or Markdown."""
+"""The contents of a report, independent of HTML and Markdown: sections of text, tables, code and pictures."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Code:
-    """Lines to copy."""
+    """Lines of code for the reader to copy."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure with the sentence that says what it shows."""
+    """A figure with a sentence that explains the figure."""
 
     figure: Figure
     caption: str
@@ -33,7 +33,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Slider:
-    """A motion to walk through: times, data and model of each coordinate, and where training ended."""
+    """An interactive motion: times, data and model of a coordinate, and the last training sample."""
 
     values: dict[str, Any]
     caption: str
@@ -44,7 +44,7 @@ Block = str | Table | Code | Picture | Slider
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what stands under it."""
+    """A heading and its blocks."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -52,9 +52,9 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report; the verdict stands first."""
+    """A whole report, which begins with a sentence of `herglotz.training.verdict` and its meaning for the reader."""
 
     title: str
-    verdict: str  # one of the sentences of `herglotz.training.verdict`
-    meaning: str  # of the verdict for the reader
+    verdict: str
+    meaning: str
     sections: tuple[Section, ...] = field(default_factory=tuple)

@@ -1,4 +1,4 @@
-"""`write_report`: one HTML file that says whether to believe a run and how to use it, and its twin in Markdown."""
+"""`write_report`: whether to trust a run, and how to use the run, as one HTML file and as Markdown."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
 
 MEANING = {
-    "fits to the noise": "Free runs of the model miss the data by no more than their noise, also where it was not "
-    "trained. Within the range of the data you can believe it.",
-    "fits, worse": "The model follows the data, but it misses more than their noise explains: something is not in the "
-    "model. Use it for what this error allows.",
-    "does not fit": "The model does not follow the data. Do not use it; the sentence below says what to try.",
+    "fits to the noise": "The error of free runs of the model is not larger than the noise of the data, in held-out "
+    "time too. Within the range of the data you can trust the model.",
+    "fits, worse": "The model follows the data, but its error is larger than the noise of the data: a term is missing. "
+    "Use the model where this error is acceptable.",
+    "does not fit": "The model does not follow the data. Do not use the model; the sentence below says what to try.",
 }
 USE = """\
 herglotz export {run} --out model.h --format c    # C: one header, <math.h> alone
@@ -66,17 +66,17 @@ def write_report(run: Run, folder: str | Path, against: Trajectories | None = No
     against
         Another recording, on which the model is scored (`Run.predict`).
     name
-        What the commands in the report call the run: its folder.
+        The folder of the run in the commands of the report.
 
     Returns
     -------
     list of Path
-        Both files; the HTML file fetches nothing.
+        Both files; the HTML file loads nothing from a network.
 
     Raises
     ------
     InputError
-        If the folder or a file cannot be written, or `against` has other columns than the run.
+        If the folder or a file cannot be written, or the columns of `against` are not those of the run.
     """
     refuse_own(run.model, "the report", "run.verify(), run.summary() and run.plot() show what was reached")
     document = describe(run, against, name)
@@ -88,7 +88,7 @@ def write_report(run: Run, folder: str | Path, against: Trajectories | None = No
 
 
 def describe(run: Run, against: Trajectories | None, name: str) -> Document:
-    """The report's contents."""
+    """The contents of the report."""
     verdict = str(run.metrics.get("verdict", "not judged"))
     meaning = next((words for start, words in MEANING.items() if verdict.startswith(start)), "The run has no verdict.")
     posterior = cache(lambda: _posterior(run))
@@ -115,7 +115,7 @@ def describe(run: Run, against: Trajectories | None, name: str) -> Document:
 
 
 def _posterior(run: Run) -> Laplace | str:
-    """The posterior, or why there is none."""
+    """The posterior, or the reason why no posterior exists."""
     try:
         return laplace(run)
     except InputError as error:
@@ -184,7 +184,8 @@ def _plan(run: Run) -> tuple[Block, ...]:
 
 def _errors(run: Run) -> tuple[Block, ...]:
     data = run.data
-    errors = [error.square().mean(0).sqrt().tolist() for error in unseen_errors(run)]  # NaN where none are held out
+    # NaN if a trajectory has no held-out samples.
+    errors = [error.square().mean(0).sqrt().tolist() for error in unseen_errors(run)]
     each = [_of_each(run, dict(zip(data.names, row, strict=True))) for row in errors]
     rows = [(f"{b}", *(value for _, value in row)) for b, row in enumerate(each)]
     table = Table(("trajectory", *(f"RMS {name}" for name in data.names)), tuple(rows[:20]))
@@ -196,7 +197,7 @@ def _errors(run: Run) -> tuple[Block, ...]:
 
 
 def _of_each(run: Run, errors: dict[str, float | None]) -> list[tuple[str, str]]:
-    """RMS of each coordinate in words, in its unit and in degrees where the table had degrees."""
+    """The RMS of each coordinate as text, in the unit of the recording."""
     units, degrees = dict(zip(run.data.names, run.data.units, strict=True)), run.data.degrees
     return [
         (f"RMS {name}", "not reached" if error is None else size(error, units[name], name in degrees))

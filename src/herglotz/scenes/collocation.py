@@ -12,8 +12,8 @@ from torch import Tensor
 
 from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.scalar_fields import square_jacobian
 from herglotz.scenes.motion import Motion
-from herglotz.theory.continuous import square_jacobian
 
 Array = np.ndarray
 # Most nodes of a motion; the next finer nodes, 2k − 1, estimate its error.

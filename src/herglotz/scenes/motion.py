@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from herglotz.mechanics.scalar_fields import derivatives
 from herglotz.scenes.scene import State, StateFunction
-from herglotz.theory.continuous import derivatives
 
 Balance = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import join, split
-from herglotz.theory.continuous import Lagrangian
+from herglotz.mechanics.scalar_fields import Lagrangian
 
 VectorField = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 Derivative = Callable[[Tensor], Tensor]

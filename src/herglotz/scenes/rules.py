@@ -15,8 +15,8 @@ from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.linear import solve
 from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.scalar_fields import Lagrangian
 from herglotz.scenes.special import as_step
-from herglotz.theory.continuous import Lagrangian
 
 # Ends the iteration of a scalar equation without a solution.
 MAX_NEWTON = 30

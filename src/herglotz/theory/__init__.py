@@ -1,19 +1,30 @@
-"""The paper's objects, a file a subject. Learning and stepping a model need none of them."""
+"""The paper, one file for each subject of a section. Fitting and stepping need none of these files.
 
+    Contact manifolds                  jacobi, legendrian
+    Continuous dynamics                continuous, legendre_dual, function_germ, hj_on_q
+    Discrete Lagrangian dynamics       action, boundary, caustics
+    Discrete Hamiltonian dynamics      left, hamiltonian, hamilton_equations
+    Discrete Hamilton–Jacobi theory    generating, hamilton_jacobi, hopf_lax, check
+    The conclusions                    evolution, hj_on_qxr, degenerate, tulczyjew, explicit_time
+    Beyond the paper                   noether, symmetries, constrained, rigid_body
+
+`docs/paper.md` lists every equation of the paper with its function and its test.
+"""
+
+from herglotz.mechanics.scalar_fields import derivatives as derivatives
+from herglotz.stepping.continuous_equation import (
+    ContinuousEquation as ContinuousEquation,
+    FractionalStepper as FractionalStepper,
+    inverse_step as inverse_step,
+)
 from herglotz.theory.action import Action as Action, curve_action as curve_action, herglotz_action as herglotz_action
 from herglotz.theory.boundary import Curve as Curve, boundary_value as boundary_value, initial_value as initial_value
 from herglotz.theory.check import TheoremCheck as TheoremCheck, check as check
 from herglotz.theory.constrained import ConstrainedStepper as ConstrainedStepper
 from herglotz.theory.continuous import (
     contact_vector_field as contact_vector_field,
-    derivatives as derivatives,
     evolution_vector_field as evolution_vector_field,
     herglotz_acceleration as herglotz_acceleration,
-)
-from herglotz.theory.continuous_equation import (
-    ContinuousEquation as ContinuousEquation,
-    FractionalStepper as FractionalStepper,
-    inverse_step as inverse_step,
 )
 from herglotz.theory.degenerate import (
     LegendrianStepper as LegendrianStepper,
@@ -108,8 +119,9 @@ from herglotz.theory.rigid_body import (
     BodyRollout as BodyRollout,
     BodyState as BodyState,
     RigidBodyStepper as RigidBodyStepper,
+    cayley as cayley,
+    hat as hat,
 )
-from herglotz.theory.rotations import cayley as cayley, hat as hat
 from herglotz.theory.symmetries import Symmetries as Symmetries, symmetries as symmetries
 from herglotz.theory.tulczyjew import (
     TulczyjewTriple as TulczyjewTriple,

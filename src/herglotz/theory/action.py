@@ -1,4 +1,4 @@
-"""The discrete Herglotz action of a curve q_0 … q_N and its derivative: discrete curves need not be solutions here."""
+"""Discrete Lagrangian dynamics: the Herglotz action of any discrete curve q_0 … q_N and its gradient."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from herglotz.theory.left import unforced
 
 @dataclass(frozen=True)
 class Action:
-    """s_k along a discrete curve, and the first variation of s_N."""
+    """The action variable s_k along a discrete curve, and the first variation of s_N."""
 
     s: Tensor  # (..., N+1) s_0 … s_N
     sigma: Tensor  # (..., N+1) σ_k = ∏_{j<k} c_j; ∂s_N/∂s_0 = σ_N
@@ -44,13 +44,14 @@ def curve_action(
 def herglotz_action(L_d: DiscreteLagrangian, q: Tensor, s0: Tensor, h: Tensor | float) -> Action:
     """The action s_N[q_0 … q_N; s_0] and its gradient in closed form.
 
-    q_k enters s_{k+1} through L_d(q_{k−1}, q_k) and L_d(q_k, q_{k+1}) and everything later through s alone, so
+    q_k enters L_d(q_{k−1}, q_k) and L_d(q_k, q_{k+1}); all later steps depend on q_k through s alone. Hence
 
         ∂s_N/∂q_k = (∏_{j>k} c_j) R_k,    R_k = D1L_d(q_k, q_{k+1}, s_k) + c_k D2L_d(q_{k−1}, q_k, s_{k−1})
 
-    with R_0 = D1L_d and, at the far end, ∂s_N/∂q_N = D2L_d = p_N. Interior gradients vanish exactly on the solutions of
-    the discrete Herglotz equations. Raise InputError if the curve has fewer than two points, h does not fit, or L_d
-    comes with forces.  Source: discrete Herglotz action and equations of the paper, indices by erratum E3.
+    with R_0 = D1L_d and, at the last point, ∂s_N/∂q_N = D2L_d = p_N. The gradients at interior points vanish exactly on
+    the solutions of the discrete Herglotz equations. Raise InputError if the curve has fewer than two points, h does
+    not fit, or L_d comes with forces.  Source: discrete Herglotz action and equations of the paper, indices by erratum
+    E3.
     """
     s = curve_action(L_d, q, s0, h)
     P = curve_partials(L_d, q, s, h)
@@ -58,7 +59,7 @@ def herglotz_action(L_d: DiscreteLagrangian, q: Tensor, s0: Tensor, h: Tensor | 
     residual = momentum_residual(later, P.D2[..., :-1, :])
     one = torch.ones_like(s[..., :1])
     sigma = torch.cat([one, P.c.cumprod(-1)], -1)
-    # the product of the factors after k, without dividing by any: c may be 0
+    # The product of the factors after k is not formed by division, because a factor c may be 0.
     after = torch.cat([P.c[..., 1:].flip(-1).cumprod(-1).flip(-1), one], -1)
     rows = torch.cat([P.D1[..., :1, :], residual], -2) * after[..., None]
     return Action(s, sigma, residual, torch.cat([rows, P.D2[..., -1:, :]], -2))
@@ -70,7 +71,7 @@ def curve_partials(L_d: DiscreteLagrangian, q: Tensor, s: Tensor, h: Tensor | fl
 
 
 def curve_steps(q: Tensor, h: Tensor | float) -> Tensor:
-    """All steps of a curve, (..., N).
+    """The sizes h of all steps of a curve, shape (..., N).
 
     Raise InputError if the curve has fewer than two points or h is not positive or does not fit.
     """

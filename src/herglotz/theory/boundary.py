@@ -1,8 +1,9 @@
-"""Discrete curves as critical points of the Herglotz action: fixed ends, or an initial function S and a fixed end.
+"""Discrete Lagrangian dynamics: curves on which the Herglotz action is stationary, and the discrete Cauchy problem.
 
-Newton's method on all interior points at once. The second variation couples neighbours only, once the change of s is
-kept as an unknown beside that of q: block tridiagonal, blocks of size n + 1. Its elimination is the Riccati recursion
-of the Hamilton–Jacobi equation, and a vanishing pivot is a caustic.
+The ends of a curve are fixed, or its last point and an initial function S are given. Newton's method solves for all
+unknown points together. With δs_k as an unknown beside δq_k, the second variation couples neighbours only: the system
+is block tridiagonal with blocks of size n + 1. Block elimination is the Riccati recursion of the Hamilton–Jacobi
+equation, and a singular pivot is a caustic.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from herglotz.theory.function_germ import Function, FunctionGerm, germ
 
 @dataclass(frozen=True)
 class Curve:
-    """Critical points of the action, one per sample; NaN where the status is not CONVERGED."""
+    """One stationary curve for each sample; NaN where the status is not CONVERGED."""
 
     q: Tensor  # (..., N+1, n)
     p: Tensor  # (..., N+1, n)
@@ -34,16 +35,17 @@ class Curve:
     sigma: Tensor  # (..., N+1)
     status: Tensor  # (...) Status values
     residual: Tensor  # (...) last Newton step over the size of the positions
-    opening: Opening  # how far every sample is from a caustic
+    # The distance of each sample from a caustic.
+    opening: Opening
     iterations: int
 
     @property
     def ok(self) -> Tensor:
-        """(...) whether the sample converged."""
+        """Whether each sample converged, shape (...)."""
         return self.status == Status.CONVERGED
 
     def failures(self) -> list[str]:
-        """One line for every sample that failed: which condition, where."""
+        """Return one line for every sample that failed, with the reason."""
         lines = []
         for index in (~self.ok).nonzero().tolist():
             at = tuple(index)
@@ -79,8 +81,8 @@ def boundary_value(
     Returns
     -------
     Curve
-        Status SINGULAR where the ends are conjugate: infinitely many solutions, or none. A curve may have *crossed* a
-        caustic (`opening.crossed`): then it is stationary, not minimal.
+        Status SINGULAR where the ends are conjugate: there are infinitely many solutions, or none. A curve that has
+        *crossed* a caustic (`opening.crossed`) is stationary and not minimal.
 
     Raises
     ------
@@ -106,7 +108,7 @@ def family_value(
     h: Tensor,  # (N,) or (..., N)
     beyond: bool,
 ) -> Curve:
-    """The curve ending in y on which S(q_0) + Σ L_d is stationary in q_0, too: p_0 = dS(q_0), s_0 = S(q_0).
+    """The curve to y with p_0 = dS(q_0) and s_0 = S(q_0), on which S(q_0) + Σ L_d is stationary in q_0 too.
 
     Newton's iteration starts with all points q_0 … q_{N−1} at y.
     """
@@ -114,7 +116,7 @@ def family_value(
 
 
 def checked(curve: Curve, throw: bool) -> Curve:
-    """The curve; with `throw` a `StepError` that names the samples that failed."""
+    """Return the curve; with `throw`, raise a `StepError` that names the samples that failed."""
     if throw and not bool(curve.ok.all()):
         raise StepError(f"no discrete curve at {'; '.join(curve.failures()[:3])}")
     return curve
@@ -129,7 +131,7 @@ def initial_value(
     h: Tensor | float,
     steps: int | None = None,
 ) -> Rollout:
-    """The discrete Cauchy problem: the solution with given q_0, q_1 and s_0, from FL⁻(q_0, q_1, s_0) on."""
+    """Solve the discrete Cauchy problem: the solution with given q_0, q_1 and s_0 starts at FL⁻(q_0, q_1, s_0)."""
     h_all = step_sizes(torch.as_tensor(h, dtype=q0.dtype, device=q0.device), steps)
     P = partials(L_d, q0, q1, s0, h_all[..., 0])
     start = State(q0.expand(P.D1.shape), momentum_minus(P), s0.expand(P.L.shape))
@@ -143,7 +145,7 @@ def initial_value(
 
 
 def straight_line(q_start: Tensor, q_end: Tensor, h: Tensor) -> Tensor:
-    """Uniform motion between the ends at the times of h, (..., N+1, n)."""
+    """Uniform motion between the ends with the steps h, shape (..., N+1, n)."""
     t = torch.cat([torch.zeros_like(h[..., :1]), h.cumsum(-1)], -1)
     t = (t / t[..., -1:])[..., None]
     return (1 - t) * q_start[..., None, :] + t * q_end[..., None, :]
@@ -151,12 +153,18 @@ def straight_line(q_start: Tensor, q_end: Tensor, h: Tensor) -> Tensor:
 
 def _critical(
     L_d: DiscreteLagrangian,
-    guess: Tensor,  # (..., K, n) the unknown points
-    ends: list[Tensor],  # [q_N], or [q_0, q_N]
-    source: Tensor | Function,  # s_0, or S with s_0 = S(q_0)
+    guess: Tensor,  # (..., K, n)
+    ends: list[Tensor],
+    source: Tensor | Function,
     h: Tensor,
     beyond: bool,
 ) -> Curve:
+    """The stationary curve through K unknown points.
+
+    `ends` is [q_0, q_N] with `source` s_0, or [q_N] with `source` a function S, for which s_0 = S(q_0). Unless
+    `beyond`, a curve that has crossed a caustic is SINGULAR.
+    """
+
     def curve(x: Tensor) -> tuple[Tensor, Tensor, Partials, FunctionGerm | None]:
         interior = x.unflatten(-1, guess.shape[-2:]) if x.shape[-1] else guess
         q = torch.cat([*(e[..., None, :] for e in ends[:-1]), interior, ends[-1][..., None, :]], -2)
@@ -188,7 +196,7 @@ def _critical(
 def _solved(
     curve: Callable[[Tensor], tuple[Tensor, Tensor, Partials, FunctionGerm | None]], guess: Tensor, ends: list[Tensor]
 ) -> Root:
-    """The unknown points side by side."""
+    """Newton's solution for the unknown points, which are one vector (..., K n)."""
     x, n = guess.detach().flatten(-2), guess.shape[-1]
     size = torch.cat([e.abs() for e in ends] + [x.abs()], -1).amax(-1, keepdim=True)
     if not x.shape[-1]:
@@ -208,10 +216,11 @@ def _solved(
 
 
 def _system(P: Partials, S: FunctionGerm | None) -> tuple[Tensor, Blocks]:
-    """The equations R_k = 0 at the unknown points and their blocks for (δq_k, δs_k)."""
+    """The residuals R_k at the unknown points, and the diagonal, upper and lower blocks for (δq_k, δs_k)."""
     batch = (slice(None),) * (P.L.ndim - 1)
     later, earlier = (*batch, slice(1, None)), (*batch, slice(None, -1))
-    p, slope = P.D2, P.D22  # incoming momentum and its derivative by q_k
+    # The momentum that arrives at q_k, and its derivative by q_k.
+    p, slope = P.D2, P.D22
     if S is None:
         here, p, slope = P.map(lambda x: x[later]), p[..., :-1, :], slope[..., :-1, :, :]
         before = P.map(lambda x: x[earlier])
@@ -219,7 +228,8 @@ def _system(P: Partials, S: FunctionGerm | None) -> tuple[Tensor, Blocks]:
         here = P
         p = torch.cat([S.dS[..., None, :], p[..., :-1, :]], -2)
         slope = torch.cat([S.d2S[..., None, :, :], slope[..., :-1, :, :]], -3)
-        before = P.map(lambda x: torch.roll(x, 1, P.L.ndim - 1))  # its first entry, the lower block of row 0, is unused
+        # `solve_blocks` does not read the first entry, the lower block of row 0.
+        before = P.map(lambda x: torch.roll(x, 1, P.L.ndim - 1))
     c = here.c[..., None]
     F = here.D1 + c * p
     diagonal = _block(
@@ -235,13 +245,13 @@ def _system(P: Partials, S: FunctionGerm | None) -> tuple[Tensor, Blocks]:
 
 
 def _block(qq: Tensor, qs: Tensor, sq: Tensor, ss: Tensor) -> Tensor:
-    """[[qq, qs], [sq, ss]], shape (..., n+1, n+1)."""
+    """The block [[qq, qs], [sq, ss]], shape (..., n+1, n+1)."""
     bottom = torch.cat([sq, ss[..., None]], -1)
     return torch.cat([torch.cat([qq, qs[..., None]], -1), bottom[..., None, :]], -2)
 
 
 def _parameters(q0: Tensor, S: FunctionGerm | None) -> Tensor:
-    """Derivative of (q_0, p_0, s_0) by the family's parameter: p_0 at fixed q_0 and s_0, or q_0 along dS."""
+    """The derivative of (q_0, p_0, s_0) by the family's parameter, which is p_0, or q_0 where S is given."""
     eye = torch.eye(q0.shape[-1], dtype=q0.dtype, device=q0.device).expand(*q0.shape, q0.shape[-1])
     if S is None:
         return torch.cat([torch.zeros_like(eye), eye, torch.zeros_like(eye[..., :1, :])], -2)

@@ -1,13 +1,13 @@
-"""Theorem 3 in one call: whether S^{k+1} is the discrete Hamilton–Jacobi successor of S^k on an open set of q_k.
+"""Discrete Hamilton–Jacobi theory: whether S^{k+1} follows S^k on an open set of q_k, by Theorem 3.
 
-Three things are measured at q_{k+1} = Φ̃^γ(q_k), none of them computed from another:
+Three residuals are measured at q_{k+1} = Φ̃^γ(q_k). None is computed from another:
 
     right      S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, S^k(q_k))
     left       S^{k+1}(q_{k+1}) − S^k(q_k) + dS^k·q_k + H⁻(dS^k, q_{k+1}, S^{k+1}(q_{k+1}))
     diagram    Φ̃∘γ^k − γ^{k+1}∘Φ̃^γ
 
 The right equation alone accepts wrong functions: along the flow the residual of S^{k+1} + δ is δ + ½ dδ·(D22 L_d)⁻¹dδ,
-an eikonal equation, which δ = −½ (q − κ)·D22 (q − κ) solves (erratum E10). The left equation rejects those.
+an eikonal equation, which δ = −½ (q − κ)·D22 (q − κ) solves (erratum E10). The left equation rejects such functions.
 """
 
 from __future__ import annotations
@@ -25,19 +25,25 @@ from herglotz.theory.generating import hamilton_jacobi_residual, left_hamilton_j
 from herglotz.theory.hamilton_jacobi import commutation_defect
 from herglotz.theory.hamiltonian import LeftHamiltonian, RightHamiltonian
 
-# Relative to the terms. Sound pairs leave 1e-16 to 1e-12; S^{k+1} off by 1e-6 leaves more than 1e-8
-# (`tests/unit/theory/test_check.py`).
+# Largest residual that passes, relative to the terms of its equation. A pair that solves the equations leaves 1e-16 to
+# 1e-12; S^{k+1} wrong by 1e-6 leaves more than 1e-8 (`tests/unit/theory/test_check.py`).
 BOUND = 1e-10
-OPEN = 1e-6  # of their size, which the points must spread in every direction to stand for an open set
+# Smallest spread of the points q in any direction, relative to the largest |q|. Points of a hyperplane
+# spread across it by rounding alone, and represent no open set.
+MIN_SPREAD = 1e-6
 
 
 @dataclass(frozen=True)
 class TheoremCheck:
-    """The two equations and the diagram at every q_k; NaN where a step fails or H± does not exist there."""
+    """The residuals of the two equations and of the diagram at every q_k.
 
-    right: Tensor  # (B) over its largest term
+    `right` and `left` are relative to the largest term of the equations, `diagram` to the largest p or s. An entry is
+    NaN where a step fails or H± does not exist.
+    """
+
+    right: Tensor  # (B)
     left: Tensor  # (B)
-    diagram: Tensor  # (B) largest component, over the largest p or s
+    diagram: Tensor  # (B)
     q1: Tensor  # (B, n) q_{k+1} = Φ̃^γ(q_k)
     bound: float
 
@@ -49,7 +55,7 @@ class TheoremCheck:
         return all(_worst(x) <= self.bound for x in (self.right, self.left, self.diagram) if x.isfinite().any())
 
     def table(self) -> str:
-        """The three rows, and what they mean together."""
+        """Return the verdict and a row for each of the three residuals."""
         rows = [
             ("right discrete Hamilton–Jacobi equation", self.right),
             ("left discrete Hamilton–Jacobi equation", self.left),
@@ -81,18 +87,16 @@ def check(
     h: Tensor | float,
     bound: float = BOUND,
 ) -> TheoremCheck:
-    """Measure whether S1 = S^{k+1} follows S0 = S^k under L_d, on the open set that the points q stand for.
-
-    L_d is without forces.
+    """Measure whether S1 = S^{k+1} follows S0 = S^k under an L_d without forces.
 
     Parameters
     ----------
     S0, S1
-        Functions on Q, (..., n) → (...): their values are values of s. Derivatives come from autograd, or from a method
-        `germ` (`Quadratic`, `PointSource`, `Propagated`).
+        Functions on Q, (..., n) → (...), whose values are values of s. Their derivatives come from a method `germ`
+        (`Quadratic`, `PointSource`, `Propagated`), or else from autograd.
     q
-        (B, n) positions q_k that spread in all n directions: on a single trajectory the equations determine nothing
-        (erratum E7).
+        (B, n) positions q_k that represent an open set: they spread in all n directions. On a single trajectory the
+        equations determine nothing (erratum E7).
     bound
         Largest residual that passes, relative to the terms of its equation.
 
@@ -108,7 +112,8 @@ def check(
         at0 = germ(S0, q)
         q1, p1, s1 = Stepper(L_d).step(State(q, at0.dS, at0.S), h).state
         found = torch.isfinite(q1).all(-1)
-        q1 = torch.where(found[..., None], q1, q)  # S1 may refuse what is not finite
+        # S1 may refuse positions that are not finite.
+        q1 = torch.where(found[..., None], q1, q)
         at1 = germ(S1, q1)
         H_plus = RightHamiltonian(L_d, q1)(q, at1.dS, at0.S, h)
         H_minus = LeftHamiltonian(L_d, q)(at0.dS, q1, at1.S, h)
@@ -130,13 +135,16 @@ def _check_open(q: Tensor) -> None:
             "give points of an open set, e.g. torch.rand(20, n, dtype=torch.float64)"
         )
     spread = torch.linalg.svdvals(q - q.mean(0))
-    if not float(spread[-1]) > OPEN * float(q.abs().max()):
-        raise InputError("the points q do not spread in every direction; a single trajectory determines nothing (E7)")
+    if not float(spread[-1]) > MIN_SPREAD * float(q.abs().max()):
+        raise InputError(
+            "the points q do not spread in every direction: their smallest singular value is "
+            f"{float(spread[-1]):.2g}; a single trajectory determines nothing (E7), give points of an open set"
+        )
 
 
 def _size(*terms: Tensor) -> float:
-    largest = max((float(x[x.isfinite()].abs().max()) for x in terms if x.isfinite().any()), default=0.0)
-    return largest or 1.0
+    largest = _worst(torch.cat([x.abs().flatten() for x in terms]))
+    return largest if largest > 0 else 1.0
 
 
 def _worst(values: Tensor) -> float:

@@ -1,10 +1,10 @@
-"""Holonomic constraints g(q) = 0 on the steps of any discrete Lagrangian (RATTLE with the conformal factor).
+"""Beyond the paper: holonomic constraints g(q) = 0 on the steps of any L_d (RATTLE with the conformal factor).
 
     c p_k + D1 L_d(q_k, q_{k+1}, s_k) = Dg(q_k)ᵀλ,    g(q_{k+1}) = 0        solved for (q_{k+1}, λ)
     p_{k+1} = D2 L_d + Dg(q_{k+1})ᵀμ,                 Dg · v(q_{k+1}, p_{k+1}, s_{k+1}) = 0
 
-with v = H_p the velocity. The projection by μ changes the next λ and nothing else: the positions do not feel it. Of a
-symmetry of L_d and g the momentum J obeys J_{k+1} = c_k J_k, as without constraints.
+with the velocity v = H_p. The projection by μ changes the next λ and no position. The momentum J of a symmetry of L_d
+and g obeys J_{k+1} = c_k J_k, as without constraints.
 """
 
 from __future__ import annotations
@@ -28,10 +28,13 @@ from herglotz.mechanics.newton import Root, find_root
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 
-Constraint = Callable[[Tensor], Tensor]  # q (..., n) → g (..., m)
-Velocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # (q, p, s) → (..., n)
+# g(q), (..., n) → (..., m).
+Constraint = Callable[[Tensor], Tensor]
+# v(q, p, s), shape (..., n).
+Velocity = Callable[[Tensor, Tensor, Tensor], Tensor]
 
-PROJECTIONS = 20  # Newton steps for μ at most
+# Newton steps for μ. One step is enough for a velocity linear in p; the limit matters for nonlinear velocities alone.
+MAX_PROJECTION_STEPS = 20
 
 
 class ConstrainedStepper(OneStepMethod):
@@ -42,7 +45,7 @@ class ConstrainedStepper(OneStepMethod):
     L_d
         Discrete Lagrangian in the ambient coordinates.
     constraint
-        g(q), (..., n) → (..., m), differentiable by autograd; its rows Dg must be independent where it vanishes.
+        g(q), (..., n) → (..., m), differentiable by autograd. The rows of Dg must be independent where g vanishes.
     velocity
         v = H_p(q, p, s), (..., n), e.g. a scene's; for a constant mass p / m.
 
@@ -55,36 +58,36 @@ class ConstrainedStepper(OneStepMethod):
         self.L_d, self.constraint, self.velocity = L_d, constraint, velocity
 
     def project(self, state: State) -> State:
-        """The same position and action with the momentum nearest in the constraint forces: p + Dgᵀμ, Dg·v = 0."""
+        """Return (q, p + Dgᵀμ, s) with Dg·v = 0: the state with its momentum projected on the tangent space."""
         q, p, s = check_state(state)
-        return State(q, self._projected(q, p, s, self._rows(q)[1]), s)
+        return State(q, self._projected(q, p, s), s)
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
         """One step: solve for (q1, λ) → momentum → projection → action.
 
-        The state has g(q) = 0; a p off the tangent space is as good as its projection. The guess is near q1, by default
-        q + h v. Differentiable with respect to the state, h and the parameters of L_d (once). Raise InputError if
-        shapes or dtypes do not fit or h is not positive.
+        The state has g(q) = 0; a p off the tangent space gives the same step as its projection. `guess` is near q1, by
+        default q + h v. The step is once differentiable with respect to the state, h and the parameters of L_d. Raise
+        InputError if shapes or dtypes do not fit or h is not positive.
         """
         state = check_state(state)
         h = check_h(h, state.q)
         q1, _, root = self._solve(state, h, guess)
         P = partials(self.L_d, state.q, q1, state.s, h)
         s1 = state.s + P.L
-        p1 = self._projected(q1, momentum_plus(P), s1, self._rows(q1)[1])
-        # A rank-deficient Dg leaves the saddle-point matrix, or the projection, without an inverse.
+        p1 = self._projected(q1, momentum_plus(P), s1)
+        # If Dg loses rank, the saddle-point matrix or the matrix of the projection is singular.
         end = torch.isfinite(p1).all(-1) & torch.isfinite(s1)
         singular = (P.c == 0) | (root.converged & ~end)
         status = status_of_root(root, torch.isfinite(root.x).all(-1), singular)
         return Step.of(State(q1, p1, s1), P.c, status, root.error, root.iterations)
 
     def multiplier(self, state: State, h: Tensor | float) -> Tensor:
-        """λ of one step, (..., m); 2λ/h tends to the constraint's force (half of each impulse acts at each end)."""
+        """Return λ of one step, (..., m). 2λ/h tends to the constraint's force: half an impulse acts at each end."""
         state = check_state(state)
         return self._solve(state, check_h(h, state.q), None)[1]
 
     def _rows(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """G(q) and Dg(q), (..., m) and (..., m, n)."""
+        """The constraint g(q) and its derivative Dg(q), shapes (..., m) and (..., m, n)."""
         g, Dg = jacobian(self.constraint, q)
         if g.shape[:-1] != q.shape[:-1] or not 0 < g.shape[-1] < q.shape[-1]:
             raise InputError(
@@ -116,7 +119,8 @@ class ConstrainedStepper(OneStepMethod):
             if guess is None:
                 guess = q0 + h[..., None] * self.velocity(q0, p0, s0)
             start = torch.cat([guess, Dg0.new_zeros(*q0.shape[:-1], m)], -1)
-            # λ is a momentum over a slope of g: its size is that of the terms it balances, gravity's impulse at rest.
+            # λ is a momentum over a slope of g. Its scale is that of the terms that λ balances: at rest, gravity's
+            # impulse.
             size = torch.maximum(q0.abs().amax(-1, keepdim=True), (guess - q0).abs().amax(-1, keepdim=True))
             slope = Dg0.abs().amax((-2, -1))[..., None]
             P = partials(self.L_d, q0, guess, s0, h)
@@ -127,8 +131,9 @@ class ConstrainedStepper(OneStepMethod):
         x = root.with_slope(lambda x: balance(x, 1)[0])
         return x[..., :n], x[..., n:], root
 
-    def _projected(self, q: Tensor, p: Tensor, s: Tensor, Dg: Tensor) -> Tensor:
-        """The momentum p + Dgᵀμ with Dg·v = 0; where v is linear in p one Newton step finds μ."""
+    def _projected(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        """The momentum p + Dgᵀμ with Dg·v = 0. Where v is linear in p, one Newton step finds μ."""
+        Dg = self._rows(q)[1]
 
         def equations(mu: Tensor) -> tuple[Tensor, Tensor]:
             v, v_p = jacobian(lambda p: self.velocity(q, p, s), p + (Dg.mT @ mu[..., None])[..., 0])
@@ -136,6 +141,6 @@ class ConstrainedStepper(OneStepMethod):
 
         start = p.new_zeros(*p.shape[:-1], Dg.shape[-2])
         scale = (p.detach().abs().amax(-1) / Dg.detach().abs().amax((-2, -1)))[..., None].expand(start.shape)
-        root = find_root(equations, start, scale, iterations=PROJECTIONS)
+        root = find_root(equations, start, scale, iterations=MAX_PROJECTION_STEPS)
         mu = root.with_slope(lambda mu: equations(mu)[0])
         return p + (Dg.mT @ mu[..., None])[..., 0]

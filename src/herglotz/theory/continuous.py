@@ -1,53 +1,16 @@
-"""The continuous counterpart: a contact Hamiltonian H(q, p, s) or Lagrangian L(q, v, s) and the motion it gives.
+"""Continuous dynamics of the paper: the fields of a contact Hamiltonian H(q, p, s), Herglotz's equations of L(q, v, s).
 
-Everything here is batched over leading dimensions and differentiable again where an argument wants a gradient.
+All functions are batched over leading dimensions. A result can be differentiated again where an argument wants a
+gradient.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.partials import Partials, autograd_partials
-
-ScalarField = Callable[[Tensor, Tensor, Tensor], Tensor]
-Hamiltonian = ScalarField
-Lagrangian = ScalarField
-
-
-def derivatives(
-    f: ScalarField,
-    q: Tensor,  # (..., n)
-    x: Tensor,  # (..., n) p or v
-    s: Tensor,  # (...)
-    order: int = 1,
-) -> Partials:
-    """f(q, x, s) and its derivatives, through the door: D1 = f_q, D2 = f_x, D3 = f_s, D12 = f_qx and so on."""
-    return autograd_partials(lambda q, x, s, h: f(q, x, s), q, x, s, 0.0, order)  # noqa: ARG005
-
-
-def gradient(
-    F: Callable[[Tensor], Tensor],  # (..., m) → (...)
-    x: Tensor,  # (..., m)
-    order: int = 1,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """F, F_x and (order 2) F_xx with shapes (...), (..., m), (..., m, m)."""
-    P = autograd_partials(lambda x, _, s, h: F(x), x, x, x[..., 0], 0.0, order)  # noqa: ARG005
-    return P.L, P.D1, P.D11
-
-
-def square_jacobian(
-    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart; takes one more leading dimension
-    x: Tensor,  # (..., m)
-    rows: int | None = None,  # k, default m
-) -> tuple[Tensor, Tensor]:
-    """The same as `jacobian` by one backward pass instead of k: on k copies of x, of which copy i gives row i."""
-    copies = x.expand(x.shape[-1] if rows is None else rows, *x.shape)
-    y, J, _ = gradient(lambda x: f(x).diagonal(dim1=0, dim2=-1).movedim(-1, 0), copies)
-    return y.movedim(0, -1), J.movedim(0, -2)
+from herglotz.mechanics.scalar_fields import Hamiltonian, Lagrangian, derivatives
 
 
 def contact_vector_field(
@@ -56,7 +19,10 @@ def contact_vector_field(
     p: Tensor,  # (..., n)
     s: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H. Source: contact Hamilton equations of the paper."""
+    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H.
+
+    Source: contact Hamilton equations of the paper.
+    """
     q_dot, p_dot, heat, H_value = _evolution(H, q, p, s)
     return q_dot, p_dot, heat - H_value
 
@@ -67,9 +33,9 @@ def evolution_vector_field(
     p: Tensor,  # (..., n)
     s: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """E_H = X_H + H ∂_s: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p. H is constant along it and η(E_H) = 0.
+    """E_H = X_H + H ∂_s: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p. H is constant along E_H, and η(E_H) = 0.
 
-    Source: erratum E2; it is the field for which Theorem 1 of the paper holds as printed.
+    Source: erratum E2; Theorem 1 of the paper holds as printed for E_H.
     """
     return _evolution(H, q, p, s)[:3]
 

@@ -1,10 +1,10 @@
-"""Steps that keep the energy: discrete evolution (thermodynamic) dynamics of a contact Hamiltonian H(q, p, s).
+"""The conclusions: discrete evolution (thermodynamic) dynamics, whose steps keep the contact Hamiltonian H(q, p, s).
 
     x1 = x0 + h B(x̄) ∇̄H,    B = [[0, I, 0], [−I, 0, −p], [0, pᵀ, 0]],    x = (q, p, s)
 
-with a discrete gradient, ∇̄H·(x1 − x0) = H(x1) − H(x0). B is antisymmetric, so H(x1) = H(x0). Minus h H̄ ∂_s,
-H̄ = (H0 + H1)/2, it is a step for the contact field X_H, along which H1 − H0 = −h H̄ ∇̄_sH exactly. Neither is a contact
-map: `Stepper` is.
+with a discrete gradient, ∇̄H·(x1 − x0) = H(x1) − H(x0). B is antisymmetric, so H(x1) = H(x0). With −h H̄ ∂_s added,
+H̄ = (H0 + H1)/2, the step follows the contact field X_H, and H1 − H0 = −h H̄ ∇̄_sH exactly. Neither step is a contact
+map; the step of `Stepper` is.
 """
 
 from __future__ import annotations
@@ -17,15 +17,10 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import attached, find_root
+from herglotz.mechanics.scalar_fields import Hamiltonian, gradient, square_jacobian
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
-from herglotz.theory.continuous import (
-    Hamiltonian,
-    contact_vector_field,
-    evolution_vector_field,
-    gradient,
-    square_jacobian,
-)
+from herglotz.theory.continuous import contact_vector_field, evolution_vector_field
 from herglotz.theory.jacobi import sharp_bivector
 
 FIELDS = {"evolution": evolution_vector_field, "contact": contact_vector_field}
@@ -39,12 +34,12 @@ class EvolutionStepper(OneStepMethod):
     H
         Contact Hamiltonian (q, p, s) → (...), batched.
     field
-        "evolution" for E_H (H is kept) or "contact" for X_H (H shrinks by the factor c that the step reports).
+        "evolution" for E_H, which keeps H, or "contact" for X_H, along which H shrinks by the reported factor c.
 
     Raises
     ------
     InputError
-        If `field` is neither of the two.
+        If `field` is unknown.
 
     Source: section 6 of `docs/mathematics.md`.
     """
@@ -55,10 +50,10 @@ class EvolutionStepper(OneStepMethod):
         self.H, self.field = H, field
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
-        """One step. Differentiable once with respect to the state, by the implicit-function theorem.
+        """One step, once differentiable with respect to the state by the implicit-function theorem.
 
-        `c` is (1 − h∇̄_sH/2)/(1 + h∇̄_sH/2): for "contact" exactly H1/H0, for "evolution" a second-order value of the
-        factor by which η shrinks along a level of H.
+        `c` is (1 − h∇̄_sH/2)/(1 + h∇̄_sH/2). For "contact" c is exactly H1/H0; for "evolution" c is a second-order
+        approximation of the factor by which η shrinks along a level of H.
         """
         q, p, s = check_state(state)
         h = check_h(h, q)
@@ -82,7 +77,7 @@ class EvolutionStepper(OneStepMethod):
         return Step.of(new, c, status, root.error, root.iterations)
 
     def _equation(self, x0: Tensor, delta: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Δ − h (B(x̄)∇̄H − H̄∂_s), whose zero is the step x1 = x0 + Δ, and ∇̄_sH."""
+        """The residual Δ − h (B(x̄)∇̄H − H̄∂_s), zero for the step x1 = x0 + Δ, and ∇̄_sH."""
         x1 = x0 + delta
 
         def H(x: Tensor) -> Tensor:
@@ -102,16 +97,17 @@ def midpoint_gradient(
     x0: Tensor,  # (..., m)
     x1: Tensor,  # (..., m)
 ) -> Tensor:
-    """∇f(x̄) + [f(x1) − f(x0) − ∇f(x̄)·Δ] Δ/|Δ|², x̄ = (x0 + x1)/2, Δ = x1 − x0; symmetric, shape (..., m).
+    """∇f(x̄) + [f(x1) − f(x0) − ∇f(x̄)·Δ] Δ/|Δ|², x̄ = (x0 + x1)/2, Δ = x1 − x0; shape (..., m).
 
-    |Δ|² adds components of different units: a rescaled coordinate gives another gradient, of the same order.
+    The gradient is symmetric in x0 and x1. It depends on the units of the coordinates, since |Δ|² adds components of
+    different units; its order does not.
 
     Source: O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996).
     """
     delta = x1 - x0
     _, g, _ = gradient(f, 0.5 * (x0 + x1))
     size = (delta * delta).sum(-1)
-    # The bracket is O(|Δ|³): below this |Δ| it is under round-off, and the quotient would be noise.
+    # The bracket is O(|Δ|³). Below this |Δ| rounding exceeds the bracket, and the quotient would be noise.
     small = size <= torch.finfo(x0.dtype).eps ** (2 / 3) * (1.0 + (x0 * x0).sum(-1))
     lack = (f(x1) - f(x0) - (g * delta).sum(-1)) / torch.where(small, 1.0, size)
     return g + torch.where(small, 0.0, lack)[..., None] * delta

@@ -1,17 +1,17 @@
-"""Explicit time: a discrete Lagrangian L_d(q0, q1, s0, t0, h) whose step begins at t0 (cocontact mechanics).
+"""The conclusions: explicit time, L_d(q0, q1, s0, t0, h) for a step that begins at t0 (cocontact mechanics).
 
-The discrete Herglotz equations are those of L_d^k = L_d(·, ·, ·, t_k, h_k), one Lagrangian a step. Time has momenta,
-too: the energies at the ends of a step, with t1 = t0 + h, are
+The discrete Herglotz equations are those of L_d^k = L_d(·, ·, ·, t_k, h_k), one Lagrangian for each step. The momenta
+of time are the energies at the ends of a step, with t1 = t0 + h:
 
     E⁻ = (∂_t L_d − ∂_h L_d)/c    at t0, as p0 = −D1/c,        E⁺ = −∂_h L_d    at t1, as p1 = D2,
 
-so that a step generates the form η + E dt, not η alone:
+A step conserves the form η + E dt up to the factor c, and not η alone:
 
     ds1 − p1·dq1 + E⁺dt1 = c (ds0 − p0·dq0 + E⁻dt0)            and    E⁺ = c E⁻ − ∂_t L_d,
 
-the discrete law of Ė = −R(H)E + ∂_t H. With an exact L_d both energies are H(q, p, s, t); with a rule of order r those
-of two steps differ by O(h^r) where they meet. S^{k+1}(q_{k+1}, t_{k+1}) follows from S^k by the discrete
-Hamilton–Jacobi equation with the H⁺ of L_d^k, and ∂S/∂t_{k+1} = −E⁺, the discrete S_t + H(q, S_q, S, t) = 0.
+The second equation is the discrete Ė = −R(H)E + ∂_t H. With an exact L_d both energies are H(q, p, s, t); with a rule
+of order r, E⁺ of a step and E⁻ of the next differ by O(h^r). S^{k+1}(q_{k+1}, t_{k+1}) follows from S^k by the discrete
+Hamilton–Jacobi equation with the H⁺ of L_d^k, and ∂S/∂t_{k+1} = −E⁺ is the discrete S_t + H(q, S_q, S, t) = 0.
 
 Source: M. de León, J. Gaset, X. Gràcia, M. C. Muñoz-Lecanda, X. Rivas, Time-dependent contact mechanics, Monatsh. Math.
 201 (2023) 1149, for cocontact systems; section 6 of `docs/mathematics.md`, time-dependent L_d.
@@ -28,16 +28,16 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.partials import partials
+from herglotz.mechanics.scalar_fields import gradient
 from herglotz.stepping import Rollout, State, Stepper
 from herglotz.stepping.state import Step
-from herglotz.theory.continuous import gradient
 
 TimeLagrangian = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class TimeDependent:
-    """L_d(q0, q1, s0, t0, h) as the family of its L_d^k: itself the one of a step that begins at `t0`.
+    """The family of L_d^k of an L_d(q0, q1, s0, t0, h); called, it is the L_d^k of the step that begins at `t0`.
 
     A stepper takes the times t_k as inputs: `Stepper(family).step(state, h, u=t[..., None])`.
     """
@@ -61,7 +61,7 @@ class TimeDependent:
         return Stepper(self).step(state, h, u=t.expand(state.s.shape)[..., None])
 
     def rollout(self, state: State, t0: float, h: float, steps: int, **settings: object) -> Rollout:
-        """K equal steps from t0 on; the settings are those of `Stepper.rollout`."""
+        """Roll out `steps` equal steps from t0; the settings are those of `Stepper.rollout`."""
         t = t0 + h * torch.arange(steps, dtype=state.q.dtype, device=state.q.device)
         return Stepper(self).rollout(*state, h=h, steps=steps, inputs=t[:, None], **settings)  # type: ignore[arg-type]
 
@@ -86,9 +86,10 @@ def time_defect(
     t0: Tensor | float,  # () or (...)
     h: float,
 ) -> tuple[Tensor, Tensor]:
-    """The dt0 and dh parts of ds1 − p1·dq1 + E⁺dt1 − c (ds0 − p0·dq0 + E⁻dt0), (...) each: zero for the step of L_d.
+    """The dt0 and dh components of ds1 − p1·dq1 + E⁺dt1 − c (ds0 − p0·dq0 + E⁻dt0), (...) each.
 
-    The step is differentiated with respect to its time and its length; p1 and the energies come from L_d alone.
+    Both are zero for the step of L_d. The step is differentiated with respect to its time and its length; p1 and the
+    energies come from L_d alone.
     """
     L_d, time = family.L_d, torch.as_tensor(t0, dtype=state.q.dtype).expand(state.s.shape)
 
@@ -107,7 +108,7 @@ def time_defect(
 def _time_slopes(
     L_d: TimeLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, t0: Tensor | float, h: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """∂_t L_d and ∂_h L_d."""
+    """∂_t L_d and ∂_h L_d, (...) each."""
     t, size = (torch.as_tensor(x, dtype=q0.dtype, device=q0.device).expand(s0.shape) for x in (t0, h))
     _, slope, _ = gradient(lambda x: L_d(q0, q1, s0, x[..., 0], x[..., 1]), torch.stack([t, size], -1))
     return slope[..., 0], slope[..., 1]

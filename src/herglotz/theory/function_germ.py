@@ -1,4 +1,4 @@
-"""Functions F on Q with their derivatives, and the sections j¹F of T*Q × R → Q that they give."""
+"""Continuous dynamics: functions F on Q with their derivatives, and the sections j¹F of T*Q × R → Q."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from herglotz.theory.continuous import gradient
+from herglotz.mechanics.scalar_fields import gradient
 
-Function = Callable[[Tensor], Tensor]  # F(q), (..., n) → (...)
+# F(q), (..., n) → (...).
+Function = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -24,22 +25,22 @@ class FunctionGerm:
 
 @runtime_checkable
 class HasGerm(Protocol):
-    """A function on Q that knows its own derivatives."""
+    """A function on Q with derivatives in closed form."""
 
     def germ(self, q: Tensor, /) -> FunctionGerm:
-        """Value and two derivatives at q."""
+        """Value, gradient and Hessian at q."""
         ...
 
 
 def germ(F: Function, q: Tensor) -> FunctionGerm:
-    """Value, gradient and Hessian of F at q: by its own `germ` where it has one, else through the door."""
+    """Value, gradient and Hessian of F at q, by the method `germ` of F or else by autograd."""
     return F.germ(q) if isinstance(F, HasGerm) else FunctionGerm(*gradient(F, q, order=2))
 
 
 def prolongation(F: Function, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """γ(q) = j¹F(q) = (q, dF(q), F(q)), shapes (..., n), (..., n), (...).
 
-    Source: first prolongation in the paper; with F = S_d^k its section γ^k.
+    Source: first prolongation in the paper; with F = S_d^k the section γ^k.
     """
     if isinstance(F, HasGerm):
         at = F.germ(q)

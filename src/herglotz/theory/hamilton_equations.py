@@ -1,7 +1,7 @@
-"""The right and the left discrete contact Hamilton equations, and steps that use nothing but H⁺ or H⁻.
+"""Discrete Hamiltonian dynamics: the right and the left Hamilton equations, and steps by H⁺ or H⁻ alone.
 
-Steppers go through FL⁻, which needs less (erratum E4). These steps are for comparison and for systems that are given
-by a discrete Hamiltonian. Any callable H(a, b, s, h) will do, its derivatives coming through the door `partials`.
+`Stepper` inverts FL⁻, which exists under weaker conditions (erratum E4). The steps of this file serve comparisons, and
+systems given by a discrete Hamiltonian. H is any callable H(a, b, s, h); `partials` differentiates H.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ from torch import Tensor
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
 
-DiscreteHamiltonian = DiscreteLagrangian  # the same kind of callable: two vectors, a scalar and h
+# Both are functions of two vectors, a scalar and h.
+DiscreteHamiltonian = DiscreteLagrangian
 
 
 def right_equations(
-    P: Partials,  # of H⁺ at (q0, p1, s0)
+    P: Partials,
     p1: Tensor,  # (..., n)
     s0: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """q1 = D2H⁺, p0 = D1H⁺/(1 − D3H⁺), s1 = s0 + p1·D2H⁺ − H⁺.
+    """q1 = D2H⁺, p0 = D1H⁺/(1 − D3H⁺), s1 = s0 + p1·D2H⁺ − H⁺, from the partials of H⁺ at (q0, p1, s0).
 
     Source: right discrete contact Hamilton equations of the paper.
     """
@@ -28,11 +29,11 @@ def right_equations(
 
 
 def left_equations(
-    P: Partials,  # of H⁻ at (p0, q1, s1)
+    P: Partials,
     p0: Tensor,  # (..., n)
     s1: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻.
+    """q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻, from the partials of H⁻ at (p0, q1, s1).
 
     Source: left discrete contact Hamilton equations of the paper, corrected by erratum E5.
     """
@@ -46,7 +47,10 @@ def right_step(
     s0: Tensor,  # (...)
     h: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(q1, p1, s1) by the right equations: D1H⁺(q0, p1, s0) = (1 − D3H⁺) p0 is solved for p1; NaN without one."""
+    """(q1, p1, s1) by the right equations: D1H⁺(q0, p1, s0) = (1 − D3H⁺) p0 is solved for p1.
+
+    NaN where Newton's method finds no solution.
+    """
 
     def equations(p1: Tensor) -> tuple[Tensor, Tensor]:
         P = partials(H_plus, q0, p1, s0, h, order=2)
@@ -64,7 +68,10 @@ def left_step(
     s0: Tensor,  # (...)
     h: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(q1, p1, s1) by the left equations: those for q0, s0 are solved for (q1, s1) together; NaN without any."""
+    """(q1, p1, s1) by the left equations: the equations for q0 and s0 are solved for (q1, s1) together.
+
+    NaN where Newton's method finds no solution.
+    """
     n = q0.shape[-1]
 
     def equations(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,7 +83,7 @@ def left_step(
         return torch.cat([q - q0, (s - s0)[..., None]], -1), torch.cat([q_row, s_row[..., None, :]], -2)
 
     start = torch.cat([q0, s0[..., None]], -1)
-    # positions and actions have different units, so each has a size of its own
+    # Positions and actions have different units, and so different scales.
     action = s0.abs() + (p0 * q0).sum(-1).abs()
     scale = torch.cat([q0.abs().amax(-1, keepdim=True).expand(q0.shape), action[..., None]], -1)
     x = find_root(equations, start, torch.maximum(scale, start.abs())).solved

@@ -1,6 +1,6 @@
-"""Functions S on Q that solve the discrete Hamilton–Jacobi equation, and Theorem 3: the projected flow, its diagram.
+"""Discrete Hamilton–Jacobi theory: functions S on Q that solve the equation, the projected flow and its diagram.
 
-S here is the paper's S_d^k = ŝ0 + S^k(q̂0, ·, ŝ0): its values are values of s.
+S is the paper's S_d^k = ŝ0 + S^k(q̂0, ·, ŝ0): the values of S are values of s.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class PointSource:
-    """S¹(y) = ŝ0 + L_d(q̂0, y, ŝ0): all solutions through one point; S⁰ does not exist as a function (erratum E7)."""
+    """S¹(y) = ŝ0 + L_d(q̂0, y, ŝ0) of all solutions through one point; S⁰ is not a function (erratum E7)."""
 
     L_d: DiscreteLagrangian
     q: Tensor  # (..., n) q̂0
@@ -63,9 +63,9 @@ def projected_flow(flow: Flow, S: Function, q: Tensor) -> Tensor:
 def projected_step(
     H_plus: DiscreteLagrangian, S0: Function, S1: Function, q0: Tensor, h: Tensor | float, guess: Tensor | None = None
 ) -> Tensor:
-    """q_{k+1} = D2H⁺(q_k, dS^{k+1}(q_{k+1}), S^k(q_k)), solved for q_{k+1} by Newton; (..., n), NaN where it has none.
+    """q_{k+1} = D2H⁺(q_k, dS^{k+1}(q_{k+1}), S^k(q_k)), solved for q_{k+1} by Newton's method; shape (..., n).
 
-    Source: projected discrete flow of the paper, with S for its s.
+    NaN where there is no solution.  Source: projected discrete flow of the paper, with s = S^k(q_k).
     """
     s0 = germ(S0, q0).S
     eye = torch.eye(q0.shape[-1], dtype=q0.dtype, device=q0.device)
@@ -79,10 +79,10 @@ def projected_step(
 
 
 def commutation_defect(flow: Flow, S0: Function, S1: Function, q: Tensor) -> Tensor:
-    """Φ̃(γ^k(q)) − γ^{k+1}(Φ̃^γ(q)), shape (..., 2n+1), for any map Φ̃ of T*Q × R; its first n components are zero.
+    """Φ̃(γ^k(q)) − γ^{k+1}(Φ̃^γ(q)), shape (..., 2n+1), for any map Φ̃ of T*Q × R; the first n components are zero.
 
-    For the flow of an L_d, S solves the right and the left discrete Hamilton–Jacobi equation on an open set of q
-    exactly where this defect is zero; the right equation alone does not suffice (erratum E10).
+    For the flow of an L_d, the defect is zero on an open set of q exactly if S solves the right and the left discrete
+    Hamilton–Jacobi equation there; the right equation alone is not sufficient (erratum E10).
 
     Source: Theorem 3 of the paper; γ^{k+1} has dS^{k+1} (erratum E8).
     """
@@ -95,7 +95,7 @@ def riccati_step(P: Partials, S: Quadratic) -> Quadratic:
 
     α′ = C − Bᵀ(A + cα)⁻¹B,    β′ = −cBᵀ(A + cα)⁻¹β,    δ′ = cδ − ½c²β·(A + cα)⁻¹β
 
-    P are the second-order partials of L_d at the origin, and S is S^k. The result is not finite at a caustic, where
+    P are the partials of L_d to second order at the origin, and S is S^k. The result is not finite at a caustic, where
     A + cα is singular.
 
     Source: section 3 of `docs/mathematics.md`.

@@ -1,4 +1,4 @@
-"""Right and left discrete Hamiltonians, by the discrete Legendre transforms of L_d and of L⁻."""
+"""Discrete Hamiltonian dynamics: H⁺ and H⁻ by the discrete Legendre transforms of L_d and of L⁻."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from herglotz.theory.left import LeftLagrangian, unforced
 
 
 def right_hamiltonian_on_flow(q1: Tensor, p1: Tensor, L: Tensor) -> Tensor:
-    """H⁺ = p1·q1 − L_d for a step already solved; shape (...)."""
+    """H⁺ = p1·q1 − L_d of a step that is already solved; shape (...)."""
     return (p1 * q1).sum(-1) - L
 
 
@@ -21,15 +21,15 @@ class RightHamiltonian:
 
     D1H⁺ = −D1L_d,    D2H⁺ = q1,    D3H⁺ = −D3L_d  (envelope theorem).
 
-    Exists where det D2D2L_d ≠ 0, which is *not* what stepping needs (erratum E4). NaN where Newton found no q1, or
-    found it where that determinant is zero to rounding; `regularity` names the condition.
+    H⁺ exists where det D2D2L_d ≠ 0; stepping does *not* need this condition (erratum E4). NaN where Newton's method
+    finds no q1, or where that determinant is zero to rounding; `regularity` names the condition.
 
     Parameters
     ----------
     L_d
         The discrete Lagrangian.
     near
-        (..., n) where Newton's iteration for q1 starts: H⁺ can have several branches and this picks one. Default q0.
+        (..., n) start of Newton's method for q1, by default q0. H⁺ can have several branches; `near` selects one.
 
     Source: right discrete Hamiltonian of the paper.
     """
@@ -46,21 +46,23 @@ class RightHamiltonian:
             return P.D2 - p1, P.D22
 
         with torch.no_grad():
-            q0, p1, s0 = _broadcast(q0.detach(), p1.detach(), s0.detach(), h)
+            shape = torch.broadcast_shapes(q0.shape[:-1], p1.shape[:-1], s0.shape, torch.as_tensor(h).shape)
+            q0, p1 = (x.detach().broadcast_to(*shape, x.shape[-1]) for x in (q0, p1))
+            s0 = s0.detach().broadcast_to(shape)
             start = q0 if self.near is None else self.near.broadcast_to(q0.shape)
             q1 = find_root(equations, start).solved
             P = unforced(partials(self.L_d, q0, q1, s0, h, order=2))
-            # (...) where D22, which must be inverted, is singular to rounding beside the other blocks
+            # D22 is inverted. It is singular where its margin is rounding of the blocks of L_d.
             fold = ~(scaled_margin(P.D22, P.D12, P.D11, P.D22) > 1e3 * torch.finfo(q1.dtype).eps)
             return torch.where(fold[..., None], torch.nan, q1)
 
     def __call__(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
-        """H⁺, shape (...); once differentiable (q1 is stationary, so its own derivative does not enter)."""
+        """H⁺, shape (...); once differentiable, since H⁺ is stationary in q1."""
         q1 = self.position(q0, p1, s0, h)
         return right_hamiltonian_on_flow(q1, p1, value(self.L_d, q0, q1, s0, h))
 
     def partials(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1) -> Partials:
-        """H⁺ and its derivatives with respect to (q0, p1, s0): a Legendre transform in the second argument."""
+        """H⁺ and its derivatives with respect to (q0, p1, s0), by the Legendre transform in the second argument."""
         q1 = self.position(q0, p1, s0, h)
         P = partials(self.L_d, q0, q1, s0, h, order)
         first = (right_hamiltonian_on_flow(q1, p1, P.L), -P.D1, q1, -P.D3)
@@ -85,15 +87,15 @@ class LeftHamiltonian:
 
     D1H⁻ = −q0,    D2H⁻ = −D2L⁻,    D3H⁻ = −D3L⁻  (envelope theorem).
 
-    It is the right Hamiltonian of L⁻ with its two positions exchanged, at the momentum −p0. Exists where c ≠ 0 and
-    det D1D1L⁻ ≠ 0; NaN elsewhere, and where Newton found no q0.
+    H⁻ is the right Hamiltonian of L⁻ with the two positions exchanged, at the momentum −p0. H⁻ exists where c ≠ 0 and
+    det D1D1L⁻ ≠ 0; NaN elsewhere, and where Newton's method finds no q0.
 
     Parameters
     ----------
     L_d
-        The (right) discrete Lagrangian; L⁻ is built from it.
+        The (right) discrete Lagrangian, from which L⁻ follows.
     near
-        (..., n) where Newton's iteration for q0 starts. Default q1.
+        (..., n) start of Newton's method for q0, by default q1.
 
     Source: left discrete Hamiltonian of the paper, with the left Lagrangian of erratum E5.
     """
@@ -119,7 +121,7 @@ class LeftHamiltonian:
 
 
 class _Exchanged:
-    """A function of two positions and an action, its positions exchanged."""
+    """L⁻ as a function of (q1, q0, s)."""
 
     def __init__(self, of: LeftLagrangian):
         self.of = of
@@ -134,8 +136,3 @@ class _Exchanged:
 def _exchanged(P: Partials) -> Partials:
     D12 = P.D12 if P.D12 is None else P.D12.mT
     return Partials(P.L, P.D2, P.D1, P.D3, P.D22, D12, P.D11, P.D23, P.D13, P.D33)
-
-
-def _broadcast(q: Tensor, p: Tensor, s: Tensor, h: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
-    shape = torch.broadcast_shapes(q.shape[:-1], p.shape[:-1], s.shape, torch.as_tensor(h).shape)
-    return q.broadcast_to(*shape, q.shape[-1]), p.broadcast_to(*shape, p.shape[-1]), s.broadcast_to(shape)

@@ -1,10 +1,10 @@
-"""The continuous Hamilton–Jacobi theorem on Q: when a field respects the section γ = j¹F of T*Q × R → Q.
+"""Continuous dynamics: Theorem 1, when a field is tangent to the section γ = j¹F of T*Q × R → Q.
 
     continuous   Tγ(X^γ) = X_H∘γ  ⇔  H∘γ = 0            for the contact field X_H
                  Tγ(E^γ) = E_H∘γ  ⇔  d(H∘γ) = 0         for the evolution field E_H
 
-with X^γ = Tρ(X∘γ) the field that γ projects to Q. The paper prints the second condition for the first field; with
-H = p and F = q, d(H∘γ) = 0 and X_H is not related (erratum E2).
+with the projected field X^γ = Tρ(X∘γ) on Q. The paper prints the second condition for the first field. H = p and F = q
+is a counterexample: d(H∘γ) = 0, and X_H is not related (erratum E2).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from herglotz.mechanics.contact import join
-from herglotz.theory.continuous import Hamiltonian, gradient
+from herglotz.mechanics.scalar_fields import Hamiltonian, gradient
 from herglotz.theory.function_germ import Function, prolongation
 from herglotz.theory.jacobi import Field
 
@@ -31,7 +31,7 @@ def projected_field(field: Field, F: Function, q: Tensor) -> Tensor:
 def relatedness_defect(field: Field, F: Function, q: Tensor) -> Tensor:
     """Tγ(X^γ) − X∘γ at q, shape (..., 2n+1); the field is any (q, p, s) → (q̇, ṗ, ṡ).
 
-    For X_H it is (0, d(H∘γ), H∘γ), for E_H (0, d(H∘γ), 0).
+    The defect of X_H is (0, d(H∘γ), H∘γ), that of E_H is (0, d(H∘γ), 0).
 
     Source: Theorem 1 of the paper, erratum E2.
     """

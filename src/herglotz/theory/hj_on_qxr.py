@@ -1,9 +1,9 @@
-"""Hamilton–Jacobi on Q × R: a section γ of T*Q × R → Q × R, p = γ(q, s), that the motion respects.
+"""The conclusions: Hamilton–Jacobi on Q × R, a section p = γ(q, s) of T*Q × R → Q × R tangent to the motion.
 
     continuous   (∂_q + γ ∂_s)(H∘γ) = (H∘γ) γ_s          where γ_q + γ ⊗ γ_s is symmetric
     discrete     γ^{k+1}(q_{k+1}, s_{k+1}) = D2 L_d,    γ^k(q_k, s_k) = −D1 L_d / c
 
-The symmetry says that the image of γ is foliated by prolongations j¹F_a, one for each value of a parameter a.
+Symmetry means that the image of γ is foliated by prolongations j¹F_a, one for each value of a parameter a.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus, momentum_residual
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, partials
-from herglotz.theory.continuous import Hamiltonian, contact_vector_field, derivatives
+from herglotz.mechanics.scalar_fields import Hamiltonian, derivatives
+from herglotz.theory.continuous import contact_vector_field
 
-Section = Callable[[Tensor, Tensor], Tensor]  # p = γ(q, s), (..., n) and (...) → (..., n)
+# p = γ(q, s), (..., n) and (...) → (..., n).
+Section = Callable[[Tensor, Tensor], Tensor]
 
 
 def section_derivatives(gamma: Section, q: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -30,7 +32,7 @@ def section_derivatives(gamma: Section, q: Tensor, s: Tensor) -> tuple[Tensor, T
 
 
 def section_asymmetry(gamma: Section, q: Tensor, s: Tensor) -> Tensor:
-    """The antisymmetric part of γ_q + γ_s ⊗ γ, shape (..., n, n): zero where im γ is foliated by Legendrians."""
+    """The antisymmetric part of γ_q + γ_s ⊗ γ, shape (..., n, n): zero where Legendrians foliate the image of γ."""
     p, g_q, g_s = section_derivatives(gamma, q, s)
     A = g_q + g_s[..., :, None] * p[..., None, :]
     return 0.5 * (A - A.mT)
@@ -39,7 +41,7 @@ def section_asymmetry(gamma: Section, q: Tensor, s: Tensor) -> Tensor:
 def section_hamilton_jacobi_residual(H: Hamiltonian, gamma: Section, q: Tensor, s: Tensor) -> Tensor:
     """(∂_q + γ∂_s)(H∘γ) − (H∘γ) γ_s, shape (..., n).
 
-    Where `section_asymmetry` is zero, this is zero exactly where X_H is tangent to the image of γ.
+    Where `section_asymmetry` is zero, the residual is zero exactly where X_H is tangent to the image of γ.
 
     Source: section 6 of `docs/mathematics.md`; for the damped oscillator γ = 2s/q is a solution.
     """
@@ -49,7 +51,7 @@ def section_hamilton_jacobi_residual(H: Hamiltonian, gamma: Section, q: Tensor, 
 
 
 def section_relatedness_defect(H: Hamiltonian, gamma: Section, q: Tensor, s: Tensor) -> Tensor:
-    """The p-part of Tγ(X^γ) − X_H∘γ, shape (..., n): γ_q q̇ + γ_s ṡ − ṗ; its other parts are zero by definition."""
+    """The p-part γ_q q̇ + γ_s ṡ − ṗ of Tγ(X^γ) − X_H∘γ, shape (..., n); the other parts are zero by definition."""
     p, g_q, g_s = section_derivatives(gamma, q, s)
     q_dot, p_dot, s_dot = contact_vector_field(H, q, p, s)
     return (g_q @ q_dot[..., None])[..., 0] + g_s * s_dot[..., None] - p_dot
@@ -66,7 +68,8 @@ def discrete_section_residuals(
 ) -> tuple[Tensor, Tensor]:
     """γ0(q0, s0) + D1 L_d / c and γ1(q1, s0 + L_d) − D2 L_d, each (..., n), in units of momentum.
 
-    γ0 and γ1 solve the discrete equation if the second vanishes wherever the first does, on an open set of (q0, s0).
+    γ0 and γ1 solve the discrete equation if the second residual is zero wherever the first is zero, on an open set of
+    (q0, s0).
 
     Source: section 6 of `docs/mathematics.md`.
     """
@@ -75,15 +78,15 @@ def discrete_section_residuals(
 
 
 def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | float) -> Section:
-    """The section γ1 that one step carries γ0 to: im γ1 = Φ̃(im γ0).
+    """The section γ1 with im γ1 = Φ̃(im γ0): the image of γ0 under one step.
 
-    At a point (q1, s1) it solves for the point (q0, s0) that the step takes there,
+    At a point (q1, s1), Newton's method from (q1, s1) finds the point (q0, s0) whose step ends there,
 
         D1 L_d(q0, q1, s0) + c γ0(q0, s0) = 0,    s0 + L_d(q0, q1, s0) = s1,
 
-    by Newton with closed derivatives, from (q1, s1), and returns γ1 = D2 L_d. No step of the flow is inverted. γ1 is
-    differentiable once by the implicit-function theorem, so that it can be transported again. It raises `InputError`
-    where no preimage is found: past a caustic of γ0, or for too large an h.
+    and γ1 = D2 L_d. No step of the flow is inverted. γ1 is once differentiable by the implicit-function theorem, so
+    that γ1 can be transported again. γ1 raises `InputError` where no preimage is found: beyond a caustic of γ0, or if h
+    is too large.
     """
 
     def equation(x: Tensor, q1: Tensor, s1: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,12 +108,7 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
                 f"sample {sample}; use a smaller h, or points nearer to the image of the section"
             )
 
-        def residual(x: Tensor) -> Tensor:
-            q0, s0 = x[..., :-1], x[..., -1]
-            P = partials(L_d, q0, q1, s0, h)
-            return torch.cat([momentum_residual(P, gamma0(q0, s0)), (s0 + P.L - s1)[..., None]], -1)
-
-        x = root.with_slope(residual)
+        x = root.with_slope(lambda x: equation(x, q1, s1)[0])
         return momentum_plus(partials(L_d, x[..., :-1], q1, x[..., -1], h))
 
     return gamma1

@@ -1,4 +1,4 @@
-"""The discrete Hopf–Lax form of the Hamilton–Jacobi equation, the well-posed one (erratum E7)."""
+"""Discrete Hamilton–Jacobi theory: the Hopf–Lax form of the equation, which is well-posed (erratum E7)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,18 @@ from herglotz.theory.function_germ import Function, FunctionGerm
 
 @dataclass(frozen=True)
 class HopfLax:
-    """S^{k+N}(y) and its derivatives; NaN where the status is not CONVERGED."""
+    """S^{k+N}(y) and its derivatives; NaN where the status is not CONVERGED.
+
+    `x` is the stationary point q_k and `curve` the characteristic from x to y; `curve.opening` measures the distance
+    from a caustic. The status is SINGULAR at a caustic and beyond.
+    """
 
     S: Tensor  # (...)
     dS: Tensor  # (..., n)
     d2S: Tensor  # (..., n, n)
-    x: Tensor  # (..., n) the stationary point q_k
-    status: Tensor  # (...) Status; SINGULAR at a caustic and beyond it
-    curve: Curve  # the characteristic from x to y; `curve.opening` measures the distance from a caustic
+    x: Tensor  # (..., n)
+    status: Tensor  # (...)
+    curve: Curve
 
 
 def hopf_lax(
@@ -37,29 +41,30 @@ def hopf_lax(
 ) -> HopfLax:
     """S^{k+1}(y) = ext_x [S^k(x) + L_d(x, y, S^k(x))], N times over.
 
-    Stationary in x: D1L_d + c dS^k(x) = 0. All N extremals are sought together, as one discrete curve that ends in y
-    and starts with p_0 = dS(x), s_0 = S(x). By the envelope theorem dS^{k+N}(y) = p_N; d2S is the slope of the family.
+    The extremum satisfies D1L_d + c dS^k(x) = 0. All N extremals are solved together, as one discrete curve that ends
+    in y and starts with p_0 = dS(x), s_0 = S(x). By the envelope theorem dS^{k+N}(y) = p_N; d2S is the slope of the
+    family.
 
-    M may be singular: the extremum needs the pivot W = ∂²/∂x² [S + L_d] only. For a degenerate L_d, whose step is a
-    relation and no map, this is the implicit Hamilton–Jacobi equation. A crossing of a caustic is seen where M is
-    regular, or where W changes its inertia from step to step.
+    M may be singular: only the pivot W = ∂²/∂x² [S + L_d] must be regular. For a degenerate L_d, whose step is a
+    relation and not a map, this is the implicit Hamilton–Jacobi equation. A crossed caustic is detected where M is
+    regular, or where the inertia of W changes from step to step.
 
     Parameters
     ----------
     S
-        S^k: a callable on (..., n), e.g. `Quadratic` or `PointSource`. Values are values of s.
+        S^k: a callable on (..., n) whose values are values of s, e.g. `Quadratic` or `PointSource`.
     h, steps
         A scalar h with a count N, or (N,) or (..., N) steps.
     beyond
-        Accept a solution that has crossed a caustic, where S is not a function on all of Q any more.
+        Accept a solution that has crossed a caustic, beyond which S is no longer a function on all of Q.
     throw
         Raise `StepError` if a sample fails.
 
     Returns
     -------
     HopfLax
-        Status SINGULAR where the second derivative in x is singular (A + cα = 0 for a quadratic S) or where a caustic
-        was passed, which the inertia of W tells (`theory.caustics`).
+        Status SINGULAR where the second derivative in x is singular (A + cα = 0 for a quadratic S), or where the
+        inertia of W shows a crossed caustic (`theory.caustics`).
 
     Source: erratum E7.
     """
@@ -73,7 +78,7 @@ def hopf_lax(
 
 @dataclass(frozen=True)
 class Propagated:
-    """S^{k+N} as a function on Q again, evaluated by Hopf–Lax where it is asked for; NaN at and beyond caustics."""
+    """S^{k+N} as a function on Q: each evaluation solves the Hopf–Lax problem; NaN at and beyond caustics."""
 
     L_d: DiscreteLagrangian
     S: Function

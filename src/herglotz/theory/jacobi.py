@@ -1,7 +1,7 @@
-"""The contact manifold (T*Q × R, η = ds − p·dq) as a Jacobi manifold.
+"""Contact manifolds: (T*Q × R, η = ds − p·dq) as a Jacobi manifold.
 
-Vectors and covectors at a point are (..., 2n+1), ordered q, p, s, as everywhere; they depend on the point through its
-momentum p alone. With dη = dq ∧ dp:
+Vectors and covectors at a point have shape (..., 2n+1), in the order q, p, s. The maps between them depend on the point
+through its momentum p alone. With dη = dq ∧ dp:
 
     R = ∂_s,    ♭(X) = ι_X dη + η(X) η,    ♯ = ♭⁻¹,    Λ(α, β) = −dη(♯α, ♯β),    ♯_Λ(α) = Λ(α, ·) = ♯α − α(R) R
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.contact import Triple, contact_form, jacobian, join, split
-from herglotz.theory.continuous import ScalarField, derivatives
+from herglotz.mechanics.scalar_fields import ScalarField, derivatives
 
 Field = Callable[[Tensor, Tensor, Tensor], Triple]
 
@@ -28,7 +28,7 @@ def differential(f: ScalarField, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
 
 
 def reeb_field(p: Tensor) -> Tensor:
-    """R = ∂_s, the field with ι_R dη = 0 and η(R) = 1; shape (..., 2n+1) for p (..., n)."""
+    """The field R = ∂_s with ι_R dη = 0 and η(R) = 1; shape (..., 2n+1) for p (..., n)."""
     return torch.cat([torch.zeros_like(p), torch.zeros_like(p), torch.ones_like(p[..., :1])], -1)
 
 
@@ -41,11 +41,11 @@ def contact_curvature(X: Tensor, Y: Tensor) -> Tensor:
 def flat(p: Tensor, X: Tensor) -> Tensor:
     """♭(X) = ι_X dη + η(X) η, from vectors to covectors; shape (..., 2n+1).
 
-    Source: musical isomorphism of the paper; it takes R to η and X_H to dH − (R(H) + H) η.
+    Source: musical isomorphism of the paper. ♭(R) = η and ♭(X_H) = dH − (R(H) + H) η.
     """
     X_q, X_p, X_s = split(X)
-    along = X_s - (p * X_q).sum(-1)  # η(X)
-    return join(-X_p - along[..., None] * p, X_q, along)
+    eta_X = X_s - (p * X_q).sum(-1)
+    return join(-X_p - eta_X[..., None] * p, X_q, eta_X)
 
 
 def sharp(p: Tensor, alpha: Tensor) -> Tensor:
@@ -55,7 +55,7 @@ def sharp(p: Tensor, alpha: Tensor) -> Tensor:
 
 
 def sharp_bivector(p: Tensor, alpha: Tensor) -> Tensor:
-    """♯_Λ(α) = ♯α − α(R) R; its kernel is spanned by η. As a matrix it is [[0, I, 0], [−I, 0, −p], [0, pᵀ, 0]]."""
+    """♯_Λ(α) = ♯α − α(R) R, with the matrix [[0, I, 0], [−I, 0, −p], [0, pᵀ, 0]]; η spans the kernel."""
     a_q, a_p, a_s = split(alpha)
     return join(a_p, -a_q - a_s[..., None] * p, (p * a_p).sum(-1))
 
@@ -66,10 +66,10 @@ def bivector(p: Tensor, alpha: Tensor, beta: Tensor) -> Tensor:
 
 
 def jacobi_bracket(f: ScalarField, g: ScalarField) -> ScalarField:
-    """{f, g} = Λ(df, dg) − f R(g) + g R(f) = X_f(g) + g R(f), as a function of (q, p, s) again.
+    """The function {f, g} = Λ(df, dg) − f R(g) + g R(f) = X_f(g) + g R(f) of (q, p, s).
 
-    Antisymmetric, with the Jacobi identity, and [X_f, X_g] = X_{f, g}. {H, f} = 0 says that f is dissipated as H is:
-    ḟ = −H_s f along X_H.
+    The bracket is antisymmetric and satisfies the Jacobi identity, and [X_f, X_g] = X_{f, g}. {H, f} = 0 means that f
+    is dissipated as H is: ḟ = −H_s f along X_H.
 
     Source: the Jacobi structure of a contact manifold, with Λ as in the paper and E = −R.
     """
@@ -83,17 +83,17 @@ def jacobi_bracket(f: ScalarField, g: ScalarField) -> ScalarField:
 
 
 def divergence(field: Field, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-    """Div X with L_X Ω = (div X) Ω for the volume form Ω = η ∧ (dη)ⁿ, shape (...), by differentiating the field.
+    """Div X with L_X Ω = (div X) Ω for the volume form Ω = η ∧ (dη)ⁿ, shape (...), by autograd on the field.
 
-    Ω is ± n! times the volume of the coordinates (q, p, s), so this is the trace of DX. It is −(n+1) R(H) for X_H.
+    Ω is ± n! times the volume of the coordinates (q, p, s), so div X is the trace of DX; div X_H = −(n+1) R(H).
     """
     return jacobian(lambda x: join(*field(*split(x))), join(q, p, s))[1].diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
 def lie_derivative_of_contact_form(field: Field, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-    """L_X η for a vector field X(q, p, s), shape (..., 2n+1), by differentiating the field: DXᵀη − (X_p, 0, 0).
+    """L_X η = DXᵀη − (X_p, 0, 0) of a vector field X(q, p, s), shape (..., 2n+1), by autograd on the field.
 
-    It is −R(H) η for X_H, and dH − R(H) η for E_H.
+    L_X η is −R(H) η for X_H, and dH − R(H) η for E_H.
     """
     X, DX = jacobian(lambda x: join(*field(*split(x))), join(q, p, s))
     turned = (DX.mT @ contact_form(p)[..., None])[..., 0]

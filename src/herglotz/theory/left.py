@@ -1,4 +1,4 @@
-"""The left discrete Lagrangian L⁻(q0, q1, s1) = s1 − s0(q0, q1, s1) of any L_d (erratum E5)."""
+"""Discrete Hamiltonian dynamics: the left discrete Lagrangian L⁻(q0, q1, s1) = s1 − s0(q0, q1, s1) (erratum E5)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ class LeftLagrangian:
 
     1 − D3L⁻ = 1/c,    p0 = −D1L⁻,    p1 = D2L⁻ / (1 − D3L⁻).
 
-    The scalar equation is solved by Newton's method from s0 = s1; its slope is c, so it has one solution where c > 0
-    for every s0. Where c = 0, or no solution was found, value and derivatives are NaN; `regularity` says which.
+    Newton's method solves the scalar equation from s0 = s1. The slope of the equation is c: the solution is unique if
+    c > 0 for every s0. Value and derivatives are NaN where c = 0 or no solution is found; `regularity` names the cause.
 
     Parameters
     ----------
     L_d
         The (right) discrete Lagrangian.
 
-    Source: erratum E5, which replaces the left discrete Hamiltonian's L_d(q_k, q_{k+1}, s_{k+1}) in the paper.
+    Source: erratum E5, for the paper's L_d(q_k, q_{k+1}, s_{k+1}) in the left discrete Hamiltonian.
     """
 
     def __init__(self, L_d: DiscreteLagrangian):
@@ -36,7 +36,7 @@ class LeftLagrangian:
         s1: Tensor,  # (...)
         h: Tensor | float,
     ) -> Tensor:
-        """s0 with s0 + L_d(q0, q1, s0) = s1, without a graph; shape (...), NaN where there is none."""
+        """s0 with s0 + L_d(q0, q1, s0) = s1, shape (...), without a graph; NaN where no s0 exists."""
 
         def equations(x: Tensor) -> tuple[Tensor, Tensor]:
             P = partials(self.L_d, q0, q1, x[..., 0], h)
@@ -48,7 +48,7 @@ class LeftLagrangian:
             return find_root(equations, s1.expand(shape)[..., None]).solved[..., 0]
 
     def __call__(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
-        """L⁻, shape (...), differentiable three times: two Newton steps inside the graph, zero in value."""
+        """L⁻, shape (...), three times differentiable: the graph holds two Newton steps of value zero."""
         s0 = self.previous_action(q0, q1, s1, h)
         if torch.is_grad_enabled():
             for _ in range(2):
@@ -59,9 +59,9 @@ class LeftLagrangian:
     def partials(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float, order: int = 1) -> Partials:
         """Value and derivatives of L⁻ with respect to (q0, q1, s1), by the implicit-function theorem.
 
-        With g = ∂s0 = (−D1, −D2, 1)/c, D_aD_b L⁻ = (D_ab + D_a3 g_b + g_a D_b3 + D33 g_a g_b)/c. Their `c` is 1 + D3L⁻,
-        not the conformal factor, which is 1/(1 − D3L⁻). Raise InputError if L_d comes with forces, for which there is
-        no left Lagrangian.
+        With g = ∂s0 = (−D1, −D2, 1)/c, D_aD_b L⁻ = (D_ab + D_a3 g_b + g_a D_b3 + D33 g_a g_b)/c. The attribute `c` of
+        the result is 1 + D3L⁻; the conformal factor is 1/(1 − D3L⁻). Raise InputError if L_d comes with forces, which
+        have no left Lagrangian.
         """
         s0 = self.previous_action(q0, q1, s1, h)
         P = unforced(partials(self.L_d, q0, q1, s0, h, order))
@@ -87,7 +87,7 @@ class LeftLagrangian:
 
 
 def unforced(P: Partials) -> Partials:
-    """P, unless it comes with forces: those are not derivatives of an action. Raise InputError if there are forces."""
+    """Return P. Raise InputError if P has forces, which are not derivatives of an action."""
     if P.force is not None:
         raise InputError("this L_d comes with forces F⁻, F⁺; actions and discrete Hamiltonians need one without")
     return P

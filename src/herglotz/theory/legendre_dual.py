@@ -1,7 +1,7 @@
-"""The continuous Legendre transform, both ways: p = L_v, H = v·L_v − L, and back v = H_p, L = p·H_p − H.
+"""Continuous dynamics: the Legendre transform p = L_v, H = v·L_v − L, and its inverse v = H_p, L = p·H_p − H.
 
-The transform is an involution, so one function serves both: the dual of f(q, x, s) is f*(q, y, s) = x·y − f(q, x, s)
-where f_x(q, x, s) = y. The dual of a Lagrangian is its Hamiltonian and the dual of that is the Lagrangian.
+The transform is an involution, so one function serves both directions: the dual of f(q, x, s) is
+f*(q, y, s) = x·y − f(q, x, s) with f_x(q, x, s) = y.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.newton import find_root
-from herglotz.theory.continuous import ScalarField, derivatives
+from herglotz.mechanics.scalar_fields import ScalarField, derivatives
 
 
 def fiber_derivative(
@@ -30,10 +30,10 @@ def fiber_inverse(
     y: Tensor,  # (..., n)
     s: Tensor,  # (...)
 ) -> Tensor:
-    """The x with f_x(q, x, s) = y, by Newton from y: v of a momentum (f = L), p of a velocity (f = H).
+    """The x with f_x(q, x, s) = y, by Newton's method from y: v of a momentum (f = L), p of a velocity (f = H).
 
-    Differentiable once with respect to q, y and s, by the implicit-function theorem. Raise InputError if a sample does
-    not converge; the message names it.
+    x is once differentiable with respect to q, y and s, by the implicit-function theorem. Raise InputError if a sample
+    does not converge; the message names the sample.
     """
     q, y = torch.broadcast_tensors(q, y)
 
@@ -46,7 +46,7 @@ def fiber_inverse(
         sample = tuple(int(i) for i in (~root.converged).nonzero()[0])
         raise InputError(
             f"Legendre transform: no x with f_x = {y[sample].tolist()} found at sample {sample} (after "
-            f"{root.iterations} Newton steps); check that there is one, and that f_xx is not singular"
+            f"{root.iterations} Newton steps); check that a solution exists and that f_xx is not singular"
         )
     return root.with_slope(lambda x: fiber_derivative(f, q, x, s) - y)
 
@@ -54,8 +54,8 @@ def fiber_inverse(
 def legendre_dual(f: ScalarField) -> ScalarField:
     """The Legendre transform f*(q, y, s) = x·y − f(q, x, s) with f_x = y: L ↦ H and H ↦ L.
 
-    The value is stationary in x, so a slope of x that is right to first order makes f* right up to third derivatives.
-    It raises `InputError` where `fiber_inverse` does.
+    The value is stationary in x. The first derivative of x therefore makes f* correct up to its third derivatives. f*
+    raises `InputError` where `fiber_inverse` does.
     """
 
     def dual(q: Tensor, y: Tensor, s: Tensor) -> Tensor:

@@ -1,12 +1,12 @@
-"""Legendrian submanifolds, and the graph of a contact map as one (erratum E1).
+"""Contact manifolds: Legendrian submanifolds, and the graph of a contact map as such a submanifold (erratum E1).
 
-A submanifold of T*Q × R is Legendrian if it has the dimension n of Q and η = ds − p·dq vanishes on it. The first
-prolongation of a function, j¹F: q ↦ (q, dF, F), is one. So is the graph of a contact map in the contact product
-T*Q̂×R × T*Q×R × R with the form τη̂ − η, whose Darboux coordinates over (q̂, q, ŝ) are
+A submanifold of T*Q × R is Legendrian if its dimension is that of Q, n, and η = ds − p·dq vanishes on the submanifold.
+The first prolongation of a function, j¹F: q ↦ (q, dF, F), is Legendrian. So is the graph of a contact map in the
+contact product T*Q̂×R × T*Q×R × R with the form τη̂ − η, whose Darboux coordinates over (q̂, q, ŝ) are
 
     momenta (τp̂, −p, −τ),    last coordinate z = −s.
 
-The graph of Φ̃ with τ = σ is therefore j¹W of W = −(ŝ + S), and not of +(ŝ + S) as printed.
+Hence the graph of Φ̃ with τ = σ is j¹W of W = −(ŝ + S), and not of the printed +(ŝ + S).
 """
 
 from __future__ import annotations
@@ -25,16 +25,20 @@ from herglotz.theory.jacobi import sharp_bivector
 
 @dataclass(frozen=True)
 class LegendrianDefect:
-    """How far a parametrised set is from a Legendrian submanifold."""
+    """How far a parametrised set is from a Legendrian submanifold.
 
-    pullback: Tensor  # (..., n) η on the tangent vectors ∂/∂u_i; zero if Legendrian
-    spread: Tensor  # (...) smallest singular value of the parametrisation; zero where it is no submanifold
+    `pullback` is η on the tangent vectors ∂/∂u_i, zero if the set is Legendrian. `spread` is the smallest singular
+    value of the parametrisation, zero where the set is no submanifold.
+    """
+
+    pullback: Tensor  # (..., n)
+    spread: Tensor  # (...)
 
 
 def legendrian_defect(submanifold: Callable[[Tensor], Triple], u: Tensor) -> LegendrianDefect:
-    """η pulled back along u ↦ (q, p, s), at parameters u of shape (..., n).
+    """The pull-back of η along u ↦ (q, p, s), at parameters u of shape (..., n).
 
-    Raise InputError if u has not as many parameters as q has components.
+    Raise InputError if the number of parameters is not n.
     """
     x, T = jacobian(lambda u: join(*submanifold(u)), u)
     _, p, _ = split(x)
@@ -47,7 +51,7 @@ def legendrian_defect(submanifold: Callable[[Tensor], Triple], u: Tensor) -> Leg
 
 
 def contact_complement(p: Tensor, tangent: Tensor) -> Tensor:
-    """Ξ^⊥ = ♯_Λ(Ξ°) of the span Ξ of `tangent`, (..., 2n+1, m) vectors in columns; columns that span it come back.
+    """Columns that span Ξ^⊥ = ♯_Λ(Ξ°), for the span Ξ of the columns of `tangent`, (..., 2n+1, m).
 
     N is Legendrian exactly where TN^⊥ = TN.
 
@@ -61,8 +65,8 @@ def contact_complement(p: Tensor, tangent: Tensor) -> Tensor:
 def contact_product_point(start: Triple, end: Triple, tau: Tensor) -> Triple:
     """A point (x̂, x, τ) of the contact product in the Darboux coordinates of T*(Q̂×Q×R) × R.
 
-    `start` and `end` are (q̂, p̂, ŝ) and (q, p, s), and `tau` is σ on the graph of a map with conformal factor σ. The
-    base is (q̂, q, ŝ), the momenta are (τp̂, −p, −τ), both (..., 2n+1), and z = −s.
+    `start` and `end` are (q̂, p̂, ŝ) and (q, p, s); on the graph of a map with conformal factor σ, `tau` is σ. The base
+    is (q̂, q, ŝ), the momenta are (τp̂, −p, −τ), both (..., 2n+1), and z = −s.
     """
     (q0, p0, s0), (q1, p1, s1) = start, end
     return join(q0, q1, s0), torch.cat([tau[..., None] * p0, -p1, -tau[..., None]], -1), -s1

@@ -1,4 +1,4 @@
-"""A rigid body with contact damping on SO(3): the Moser–Veselov step with the conformal factor of Herglotz.
+"""Beyond the paper: a rigid body with contact damping on SO(3), by the Moser–Veselov step with a conformal factor.
 
 L = ½ Ω·JΩ − γs on SO(3) × R, Ω the body angular velocity. With F = R_kᵀR_{k+1} and E = e^{−γh},
 
@@ -8,7 +8,7 @@ and the discrete Herglotz equation, its derivatives taken to the left (body) fra
 
     F_k m_k = c M_k,    M_{k+1} = m_k,    with (h√E M_k)^ = F_k J_d − J_d F_kᵀ for FL⁻.
 
-So R_{k+1}M_{k+1} = c R_k M_k: the spatial angular momentum is scaled by c and never turned.
+Hence R_{k+1}M_{k+1} = c R_k M_k: the spatial angular momentum keeps its direction and shrinks by c.
 """
 
 from __future__ import annotations
@@ -23,14 +23,27 @@ from herglotz.errors import InputError
 from herglotz.mechanics.newton import attached, find_root
 from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Status, Step, check_h, status_of_root, step_sizes
-from herglotz.theory.rotations import cayley, hat
+
+
+def hat(w: Tensor) -> Tensor:
+    """The matrix of w ×, (..., 3) → (..., 3, 3)."""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def cayley(f: Tensor) -> Tensor:
+    """The rotation (I + f̂)(I − f̂)⁻¹ = I + 2(f̂ + f̂²)/(1 + |f|²) by θ = 2 arctan |f| < π about f (..., 3)."""
+    F = hat(f)
+    eye = torch.eye(3, dtype=f.dtype, device=f.device)
+    return eye + 2.0 / (1.0 + (f * f).sum(-1))[..., None, None] * (F + F @ F)
 
 
 class BodyState(NamedTuple):
     """A point of T*SO(3) × R, in the body frame."""
 
-    R: Tensor  # (..., 3, 3) attitude: body to space
-    M: Tensor  # (..., 3) body angular momentum JΩ
+    R: Tensor  # (..., 3, 3) attitude, from body to space
+    M: Tensor  # (..., 3) angular momentum JΩ
     s: Tensor  # (...) action variable
 
 
@@ -47,7 +60,7 @@ class BodyRollout:
 
     @property
     def ok(self) -> Tensor:
-        """(...) whether every step converged."""
+        """Whether every step converged, shape (...)."""
         return (self.status == Status.CONVERGED).all(-1)
 
 
@@ -84,8 +97,8 @@ class RigidBodyStepper:
     def step(self, state: BodyState, h: Tensor | float) -> Step:
         """One step: solve FL⁻ for F → attitude → momentum → action. Differentiable with respect to the state and h.
 
-        NaN in the samples whose status is not `Status.CONVERGED`: h|M| is then too large for any F. Raise InputError if
-        shapes or dtypes do not fit or h is not positive.
+        Samples whose status is not `Status.CONVERGED` are NaN: h|M| is too large for any F. Raise InputError if shapes
+        or dtypes do not fit or h is not positive.
         """
         R, M, s = _checked(state)
         h = check_h(h, M)
@@ -93,8 +106,8 @@ class RigidBodyStepper:
         g = (h * root)[..., None] * M
         f, status, residual, iterations = self._solve(g)
         F = cayley(f)
-        # tr((I − F) J_d) = 2 f·Jf/(1 + |f|²): the same number without the cancellation of I − F.
-        action = 2.0 * (f * self._times(f)).sum(-1) / (1.0 + (f * f).sum(-1))
+        # tr((I − F) J_d) = 2 f·Jf/(1 + |f|²); the right-hand side has no cancellation.
+        action = 2.0 * (f * (f @ self.inertia.to(f))).sum(-1) / (1.0 + (f * f).sum(-1))
         c = (root**2).expand_as(s)
         new = BodyState(
             _orthogonal(R @ F),
@@ -113,7 +126,7 @@ class RigidBodyStepper:
         steps: int | None = None,
         every: int = 1,
     ) -> BodyRollout:
-        """Step K times from (R, M, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
+        """Roll out from (R, M, s), s = 0 by default; `Stepper.rollout` explains h, steps and every."""
         state = _checked(BodyState(R, M, torch.zeros_like(M[..., 0]) if s is None else s))
         h_all = step_sizes(check_h(h, M), steps)
         single: OneStep = lambda state, h, *_: (self.step(state, h), None)  # noqa: E731
@@ -121,21 +134,18 @@ class RigidBodyStepper:
         R, M, s = track.states
         return BodyRollout(R, M, s, track.sigma, track.status, track.residual)
 
-    def _times(self, f: Tensor) -> Tensor:
-        return f @ self.inertia.to(f)
-
     def _solve(self, g: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
         """The Cayley vector f of F with F J_d − J_d Fᵀ = ĝ, its status, last Newton step, and iterations.
 
-        In f the equation is g + g × f + (g·f) f = 2 J f, quadratic. The branch wanted is the one with f → ½ J⁻¹g as
-        g → 0, and it ends where the Jacobian is singular, so Newton starts there.
+        f solves the quadratic equation g + g × f + (g·f) f = 2 J f. The flow is the branch with f → ½ J⁻¹g as g → 0, so
+        Newton's method starts at ½ J⁻¹g. The branch ends where the Jacobian is singular.
         """
         J2 = 2.0 * self.inertia.to(g)
         with torch.no_grad():
             start = torch.linalg.solve(J2, g.detach()[..., None])[..., 0]
             root = find_root(lambda f: _equation(g.detach(), J2, f), start, torch.ones_like(start))
             f = root.x
-            # The equation has further roots, e.g. π − θ beside θ; the flow's branch ends before a quarter turn, and
+            # The equation has other roots, such as π − θ for θ. The branch of the flow ends before a quarter turn, and
             # at a fold, where the determinant changes sign.
             wanted = ((f * f).sum(-1) < 1.0) & (torch.linalg.det(root.J) < 0)
             status = status_of_root(root, torch.isfinite(f).all(-1), root.converged & ~wanted)
@@ -145,7 +155,7 @@ class RigidBodyStepper:
 
 
 def _equation(g: Tensor, J2: Tensor, f: Tensor) -> tuple[Tensor, Tensor]:
-    """E = g + g × f + (g·f) f − 2 J f and its derivative in f."""
+    """The residual E = g + g × f + (g·f) f − 2 J f and its derivative in f."""
     along = (g * f).sum(-1)
     E = g + torch.linalg.cross(g, f) + along[..., None] * f - f @ J2
     D = hat(g) + f[..., :, None] * g[..., None, :] - J2
@@ -153,7 +163,7 @@ def _equation(g: Tensor, J2: Tensor, f: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _orthogonal(R: Tensor) -> Tensor:
-    """R(3I − RᵀR)/2: one Newton–Schulz step, which squares the rounding left in RᵀR − I, so that it never adds up."""
+    """R(3I − RᵀR)/2: one Newton–Schulz step, which squares RᵀR − I, so that rounding does not accumulate."""
     return 1.5 * R - 0.5 * R @ (R.mT @ R)
 
 

@@ -1,4 +1,4 @@
-"""A generator of an affine point symmetry, and the quantity that belongs to it, in words."""
+"""Names of affine point symmetries, and formulas of their quantities J."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from torch import Tensor
 
 from herglotz.least_squares import least_squares
 
-SMALL = 1e-6  # of the largest entry: not written
+# An entry below this share of the largest counts as 0: printed numbers have four digits.
+MIN_RELATIVE_ENTRY = 1e-6
 
 
 def name_of(A: Tensor, b: Tensor, a: float, coordinates: Sequence[str]) -> str:
     """Words for ξ(q) = A q + b with s ↦ s + ε a s, such as "translation along x"."""
     A, b = _clean(A, b)
-    keeps_s, about = abs(a) <= SMALL, _fixed_point(A, b)
+    keeps_s, about = abs(a) <= MIN_RELATIVE_ENTRY, _fixed_point(A, b)
     if keeps_s and not bool(A.any()):
         return _translation(b, coordinates)
     if keeps_s and about is not None and (plane := _plane(A)):
@@ -41,7 +42,7 @@ def _translation(b: Tensor, coordinates: Sequence[str]) -> str:
 
 
 def _plane(A: Tensor) -> list[int]:
-    """The two coordinates that A turns into one another, as a rotation or along ellipses; none if it does more."""
+    """The two coordinates that A rotates, on circles or ellipses; empty if A is no such rotation."""
     turned = (A != 0).nonzero().tolist()
     return turned[0] if len(turned) == 2 and bool((A * A.mT).sum() < 0) else []
 
@@ -51,7 +52,7 @@ def formula(
 ) -> str:
     """J = p·(A q + b) − a s − χ(q) as text, from (A, b, a) and the (k, w, B) of χ.
 
-    Entries below ten drifts of the largest are left out: a learned χ has terms of that size that mean nothing.
+    Entries below ten times the drift, relative to the largest, are left out: the error of a learned χ has that size.
     """
     (A, b, a), (k, w, B) = generator, boundary
     terms = []
@@ -64,34 +65,34 @@ def formula(
         for j in range(i, len(coordinates)):
             text = f"{name}²" if i == j else f"{name} {coordinates[j]}"
             chi.append((-float(B[i, j]) * (0.5 if i == j else 1.0), text))
-    return _sum([*terms, *chi, (-float(k), "")], min(max(SMALL, 10 * drift), 0.1))
+    return _sum([*terms, *chi, (-float(k), "")], min(max(MIN_RELATIVE_ENTRY, 10 * drift), 0.1))
 
 
-def _sum(terms: list[tuple[float, str]], small: float = SMALL) -> str:
-    """Return `2 x − y + 3` for [(2, "x"), (−1, "y"), (3, "")]."""
+def _sum(terms: list[tuple[float, str]], small: float = MIN_RELATIVE_ENTRY) -> str:
+    """The text `2 x − y + 3` for [(2, "x"), (−1, "y"), (3, "")]."""
     least = small * max(abs(x) for x, _ in terms)
-    terms = [(x, what) for x, what in terms if abs(x) > least]
+    terms = [(x, symbol) for x, symbol in terms if abs(x) > least]
     first = next((i for i, (x, _) in enumerate(terms) if x > 0), 0)
     text = ""
-    for x, what in [*terms[first : first + 1], *terms[:first], *terms[first + 1 :]]:
-        number = f"{abs(x):.4g}" if abs(abs(x) - 1) > SMALL or not what else ""
+    for x, symbol in [*terms[first : first + 1], *terms[:first], *terms[first + 1 :]]:
+        number = f"{abs(x):.4g}" if abs(abs(x) - 1) > MIN_RELATIVE_ENTRY or not symbol else ""
         sign = " − " if x < 0 else " + "
-        text += (sign if text else sign.strip().replace("+", "")) + " ".join(y for y in (number, what) if y)
+        text += (sign if text else sign.strip().replace("+", "")) + " ".join(y for y in (number, symbol) if y)
     return text or "0"
 
 
 def _clean(A: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    least = SMALL * max(float(A.abs().max()), float(b.abs().max()))
+    least = MIN_RELATIVE_ENTRY * max(float(A.abs().max()), float(b.abs().max()))
     return torch.where(A.abs() > least, A, 0.0), torch.where(b.abs() > least, b, 0.0)
 
 
 def _fixed_point(A: Tensor, b: Tensor) -> Tensor | None:
     """The point q with A q + b = 0 nearest to 0, or None."""
     point = least_squares(A, -b[:, None])[:, 0]
-    return point if float((A @ point + b).abs().max()) <= SMALL * max(1.0, float(b.abs().max())) else None
+    return point if float((A @ point + b).abs().max()) <= MIN_RELATIVE_ENTRY * max(1.0, float(b.abs().max())) else None
 
 
 def _around(point: Tensor) -> str:
-    if float(point.abs().max()) <= SMALL:
+    if float(point.abs().max()) <= MIN_RELATIVE_ENTRY:
         return ""
     return f" about ({', '.join(f'{x:.4g}' for x in point.tolist())})"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from herglotz.errors import InputError, refuse
 from herglotz.mechanics import Driven
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
+from herglotz.stepping.continuous_equation import ContinuousEquation, FractionalStepper
 from herglotz.stepping.method import OneStepMethod
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
@@ -26,9 +27,6 @@ from herglotz.training.motion import Motion, free_motion
 from herglotz.training.plan import Plan
 from herglotz.training.predict import Prediction, predict
 from herglotz.training.summary import as_html, one_line, summary
-
-if TYPE_CHECKING:
-    from herglotz.theory import ContinuousEquation
 
 
 @dataclass(frozen=True, repr=False)
@@ -115,7 +113,7 @@ class Run:
         """The continuous equation of the model at its typical step: field, energy H̃, modified Lagrangian L̃."""
         if isinstance(self.model, Driven) and self.data.u is not None:
             raise InputError("the model takes inputs: give them, ContinuousEquation(run.model.at(u), run.h)")
-        return _module("theory").ContinuousEquation(self.model, self.h)
+        return ContinuousEquation(self.model, self.h)
 
     def at_step(self, h: float) -> OneStepMethod:
         """A stepper for any step h > 0 that reproduces the motion of the model at its own step.
@@ -142,7 +140,7 @@ class Run:
         if self.h_range[0] <= h <= self.h_range[1]:
             return self.stepper
         tolerance = {torch.float32: 1e-3, torch.float64: 1e-6}[self.states.q.dtype]
-        return _module("theory").FractionalStepper(self.continuous, tolerance=tolerance)
+        return FractionalStepper(self.continuous, tolerance=tolerance)
 
     def energy(self, state: State) -> Tensor:
         """The energy H̃(q, p, s) of the model at the given states; dH̃/dt = −(∂H̃/∂s) H̃.

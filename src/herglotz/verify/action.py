@@ -1,7 +1,7 @@
 """Checks of the generating functions S^k and of the discrete Hamilton–Jacobi equation.
 
 S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 comes from the flow, its derivatives from the endpoint map, H⁺ from L_d and H⁻ from L⁻. No
-identity is used to compute the side that it is compared with.
+side of an identity is computed by that identity.
 """
 
 from __future__ import annotations
@@ -30,23 +30,31 @@ from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import worst
 from herglotz.verify.subject import Subject
 
-FAN = 4  # momenta p̂0 from each start (q̂0, ŝ0): together they cover an open set of q_k, which erratum E7 asks for
-OPENING = 0.1  # standard deviation of p̂0 within a fan, in standard deviations of p̂0 over all starts
-CAUSTIC = 1e-2  # S^k is not used where the spread of a fan is below this share of k times the spread after one step
-FOLD = 1e-3  # H⁺ and H⁻ are not used where their `scaled_margin` is below this (steps do not need them: E4)
+# Momenta p̂0 from each start (q̂0, ŝ0). The fans of all starts cover an open set of q_k, which erratum E7 requires.
+FAN_MOMENTA = 4
+# Standard deviation of p̂0 within a fan, relative to that over all starts.
+FAN_WIDTH = 0.1
+# S^k is left out near a caustic: where the spread of a fan is below this share of k times the spread after one step.
+MIN_RELATIVE_SPREAD = 1e-2
+# H⁺ and H⁻ are left out near a fold: where their `scaled_margin` is below this. Steps do not need H± (E4).
+MIN_FOLD_MARGIN = 1e-3
 
 ALTERNATES = "one of S^k and S^(k+1) is beside a caustic, for all k that were tried"
 
 
 @dataclass(frozen=True)
 class Fan:
-    """Solutions from common starts (q̂0, ŝ0) with different p̂0, and their S^k for some k."""
+    """Solutions from common starts (q̂0, ŝ0) with different p̂0, and their S^k for some k.
+
+    The dictionaries are by k. `sigma` is the product of the reported c; `keep` marks solutions away from a caustic;
+    `failed` counts the solutions that were dropped, because a step failed or has no finite derivative.
+    """
 
     start: State  # (F, n), (F, n), (F)
-    S: dict[int, GeneratingFunction]  # by k
-    sigma: dict[int, Tensor]  # (F) by k, as the stepper reports c
-    keep: dict[int, Tensor]  # (F) bool by k: away from a caustic
-    failed: int = 0  # solutions dropped because a step failed or has no finite derivative
+    S: dict[int, GeneratingFunction]
+    sigma: dict[int, Tensor]  # (F)
+    keep: dict[int, Tensor]  # (F)
+    failed: int = 0
 
     @property
     def pairs(self) -> list[int]:
@@ -54,12 +62,12 @@ class Fan:
         return [k for k in self.S if k + 1 in self.S]
 
     def alternates(self) -> bool:
-        """Whether some S^k is away from caustics, no step failed, and never S^k and S^{k+1} at once."""
+        """Whether S^k is away from caustics for some k but never for k and k + 1 together, though no step failed."""
         some = any(bool(keep.any()) for keep in self.keep.values()) and not self.failed
         return some and not any(bool((self.keep[k] & self.keep[k + 1]).any()) for k in self.pairs)
 
     def left_out(self) -> str:
-        """Say how many solutions the checks leave out."""
+        """Return a note on how many solutions the checks leave out, empty if none."""
         failed = self.failed * len(self.keep)
         lost = sum(int((~keep).sum()) for keep in self.keep.values()) + failed
         total = sum(keep.numel() for keep in self.keep.values()) + failed
@@ -67,14 +75,14 @@ class Fan:
 
 
 def fan(subject: Subject, steps: int, seed: int) -> Fan:
-    """Open a fan of momenta from every state, and differentiate the k-step maps at k = 1, 2, K−1, K."""
+    """Draw a fan of momenta at every state, and differentiate the k-step maps for k = 1, 2, K−1, K."""
     q, p, s = subject.states
     make = torch.Generator().manual_seed(seed)
     size = p.std(0, correction=0) if len(p) > 1 else p.abs()[0]
     size = torch.where(size > 0, size, 1.0)
-    offset = torch.randn(len(p), FAN, p.shape[-1], generator=make, dtype=torch.float64).to(p)
+    offset = torch.randn(len(p), FAN_MOMENTA, p.shape[-1], generator=make, dtype=torch.float64).to(p)
     offset[:, 0] = 0.0
-    momenta = p[:, None] + OPENING * size * offset
+    momenta = p[:, None] + FAN_WIDTH * size * offset
     start = State(
         q[:, None].expand_as(momenta).flatten(0, 1),
         momenta.flatten(0, 1),
@@ -116,14 +124,15 @@ Side = Callable[[GeneratingFunction, GeneratingFunction], tuple[Tensor, Tensor, 
 def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
     """Check S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k) = 0, relative to its terms.
 
-    H⁺ comes from L_d by a Newton solve of D2 L_d(q_k, ·, s_k) = dS^{k+1}, not from the flow. Where only the map is
-    known, H⁺ is p1·q1 − (s1 − s0) along the step.
+    H⁺ comes from L_d by a Newton solve of D2 L_d(q_k, ·, s_k) = dS^{k+1}, not from the flow. If the target has no L_d,
+    H⁺ is p1·q1 − (s1 − s0) along the step.
     """
 
     def side(before: GeneratingFunction, after: GeneratingFunction) -> tuple[Tensor, Tensor, Tensor]:
         if subject.L_d is None:
             H = right_hamiltonian_on_flow(after.q, after.p, after.s - before.s)
-        else:  # the guess picks the branch of H⁺; it is slightly wrong, so that the solver has to work
+        else:
+            # The guess selects the branch of H⁺. An error of 1e-3 steps in the guess makes the solver iterate.
             guess = after.q + 1e-3 * (after.q - before.q)
             H = RightHamiltonian(subject.L_d, guess)(before.q, after.D2, before.s, subject.h)
         residual = hamilton_jacobi_residual(after.S, before.S, after.D2, after.q, H)
@@ -142,10 +151,11 @@ def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
     H⁻ comes from L_d by Newton solves of s0 + L_d = s_{k+1} and −D1L⁻ = dS^k, not from the flow.
     """
     L_d = subject.L_d
-    assert L_d is not None  # `verify` asks
+    assert L_d is not None
 
     def side(before: GeneratingFunction, after: GeneratingFunction) -> tuple[Tensor, Tensor, Tensor]:
-        guess = before.q - 1e-3 * (after.q - before.q)  # slightly wrong, so that the solver has to work
+        # An error of 1e-3 steps in the guess makes the solver iterate.
+        guess = before.q - 1e-3 * (after.q - before.q)
         H = LeftHamiltonian(L_d, guess)(before.D2, after.q, after.s, subject.h)
         residual = left_hamilton_jacobi_residual(after.S, before.S, before.D2, before.q, H)
         return residual, (before.D2 * before.q).sum(-1), H
@@ -159,7 +169,7 @@ def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
 def _on_fan(
     subject: Subject, f: Fan, side: Side, hessian: Callable[[Partials], Tensor], fold: str
 ) -> tuple[float, list[str]]:
-    """The largest residual over the largest sum of its terms, from S^k and S^{k+1} where the Hamiltonian exists."""
+    """The largest residual over the largest sum of its terms, where S^k, S^{k+1} and the Hamiltonian exist; notes."""
     residuals, sizes, folds = [], [], 0
     for k in f.pairs:
         before, after = f.S[k], f.S[k + 1]
@@ -167,7 +177,7 @@ def _on_fan(
         with torch.no_grad():
             if subject.L_d is not None:
                 P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
-                regular = scaled_margin(hessian(P), mixed_hessian(P), P.D11, P.D22) > FOLD
+                regular = scaled_margin(hessian(P), mixed_hessian(P), P.D11, P.D22) > MIN_FOLD_MARGIN
                 folds += int((keep & ~regular).sum())
                 keep = keep & regular
             b, a = (g.map(lambda x, keep=keep: x[keep]) for g in (before, after))
@@ -181,5 +191,5 @@ def _on_fan(
 
 
 def usable(g: GeneratingFunction, one: GeneratingFunction, k: int) -> Tensor:
-    """Return whether S^k is away from a caustic: the fan has opened, compared with k free steps."""
-    return (g.spread > CAUSTIC * k * one.spread) & torch.isfinite(g.D2).all(-1) & torch.isfinite(g.S)
+    """Return whether S^k is away from a caustic: the spread of the fan is compared with k free steps."""
+    return (g.spread > MIN_RELATIVE_SPREAD * k * one.spread) & torch.isfinite(g.D2).all(-1) & torch.isfinite(g.S)

@@ -1,4 +1,4 @@
-"""Checks that a fitted model predicts its data. The identities cannot tell: every regular L_d satisfies them."""
+"""Checks that a fitted model predicts its data, since every regular L_d satisfies the identities."""
 
 from __future__ import annotations
 
@@ -19,35 +19,37 @@ from herglotz.training.problems.grid import segment_grid, step_inputs
 from herglotz.verify.dissipation import WINDOW, dissipation
 from herglotz.verify.report import Check
 
-# Bound of the one-step error over that of uniform motion, the null model. A fitted model reaches 1e-2 and less on clean
-# data; an empty or a collapsed model has about 1 and more.
+# Bound of the one-step error, relative to that of the null model, uniform motion. A fitted model reaches 1e-2 and less
+# on clean data; an empty or a collapsed model has about 1 and more.
 ONE_STEP = 0.5
-# Bound of free runs over 20 recorded steps, over the spread; noise and a good model stay far below a tenth.
+# Bound of free runs over 20 recorded steps, relative to the spread; noise and a good model stay far below 0.1.
 FOLLOW = 0.1
-# Bound of the free run beyond training, over the spread: the mean of the unseen samples would give exactly 1.
+# Bound of the free run beyond training, relative to the spread: the mean of the unseen samples gives exactly 1.
 FREE_RUN = 1.0
-DECIDABLE = 2.0  # one step is judged where the null model's squared error exceeds this multiple of the noise's
+# One step is judged if the squared error of the null model exceeds this multiple of the squared noise.
+MIN_SIGNAL_TO_NOISE = 2.0
 
 
 def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
     """Return the checks that need recorded motion, and the numbers behind them.
 
-    One step: the RMS of J⁻¹R over the recorded triples, each coordinate in units of its own spread, over that of
-    uniform motion q2 = q1 + (h1/h0)(q1 − q0), the null model. Noise enters both. Before a model fails, the share of the
-    noise, estimated from the data alone, is subtracted from both; the check is left out where the null model's error is
-    mostly noise.
+    One step: the RMS of J⁻¹R over the recorded triples, relative to that of the null model, uniform motion
+    q2 = q1 + (h1/h0)(q1 − q0); each coordinate is in units of its own spread. Noise enters both errors. Before a model
+    fails, the noise, estimated from the data alone, is subtracted from both. The check is left out if the error of the
+    null model is mostly noise.
 
-    Follow: the RMS of free runs over windows of 20 recorded steps of the training part, from the fitted states, over
-    the spread; a step that fails counts as infinite. A collapsed model has small residuals and fails here. (Beyond it
-    the run's states are those of one free run, which the last check judges.)
+    Follow: the RMS of free runs over windows of 20 recorded steps, from the fitted states, relative to the spread. A
+    collapsed model has small residuals and fails here; a failed step counts as infinite. The windows end with the
+    training part, because the states beyond are those of one free run, which the last check judges.
 
     Dissipation: the same windows with γ → −γ, 0, γ/2 and 2γ; a model that follows the data no better fails. A model of
-    rate 0 fails where a rate divides its error by 5. Left out where it has no rate, or the data do not show it.
+    rate 0 fails if some rate divides its error by 5. The check is left out if the model has no rate, or if the data do
+    not show the rate.
 
-    Free run: the RMS of prediction − data over the samples beyond the training part, over their spread; left out where
-    the fit held nothing out.
+    Free run: the RMS of prediction − data over the samples beyond the training part, relative to their spread. The
+    check is left out if the fit held nothing out.
 
-    No check counts samples that the fit takes for gross errors.
+    No check counts samples that the fit treats as gross errors.
     """
     run = _without_spikes(run)
     q = run.data.unwrapped().q
@@ -55,9 +57,10 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
     model, null, floor = _one_step(run, q, spread)
     numbers = {"one_step_rms": model, "null_rms": null, "noise_rms": floor}
     checks, extra = [], ""
-    if null**2 > DECIDABLE * floor**2:
+    if null**2 > MIN_SIGNAL_TO_NOISE * floor**2:
         ratio = model / null if math.isfinite(model) else math.inf
-        if ratio > ONE_STEP:  # perhaps because of noise alone
+        # A ratio above the bound may be due to noise.
+        if ratio > ONE_STEP:
             ratio = math.sqrt(max(model**2 - floor**2, 0.0) / (null**2 - floor**2))
         note = f"RMS {model:.3g}, uniform motion {null:.3g}, noise {floor:.3g}, in units of the data's spread"
         checks.append(Check.at_most("one_step", "predicts a step: |J⁻¹R| over uniform motion", ratio, ONE_STEP, note))
@@ -81,7 +84,7 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
 
 
 def _without_spikes(run: Run) -> Run:
-    """Return the run without the samples that are gross errors, or not complete."""
+    """Return the run without incomplete samples and gross errors."""
     bad = spikes(run.data.unwrapped())
     bad = ~run.data.complete | (bad if run.config.robust != "off" else torch.zeros_like(bad))
     if not bool(bad.any()):
@@ -99,7 +102,7 @@ def _trained(run: Run) -> Run:
 
 
 def _follow(run: Run, spread: Tensor) -> float:
-    """Return RMS over spread of free runs that start again from the run's state every `WINDOW` recorded steps."""
+    """Return the RMS, over the spread, of free runs that restart from the run's state every `WINDOW` recorded steps."""
     q = run.data.q
     grid = segment_grid(run.data, WINDOW, GAP * run.h)
     states = [x[grid.start_sample] for x in run.states]
@@ -118,7 +121,8 @@ def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]
     """Return the RMS errors of the model and of uniform motion, and the noise in both, in units of the spread."""
     t = run.data.unwrapped().triples()
     dtype = next(run.model.parameters()).dtype
-    keep = (t.h0 <= GAP * run.h) & (t.h1 <= GAP * run.h)  # no single step across a gap
+    # A single step across a gap is not judged.
+    keep = (t.h0 <= GAP * run.h) & (t.h1 <= GAP * run.h)
     if not bool(keep.any()):
         keep = torch.ones_like(keep)
     q0, q1, q2, h0, h1, s0 = (x[keep].to(dtype) for x in (t.q0, t.q1, t.q2, t.h0, t.h1, run.states.s[t.index]))
@@ -134,7 +138,8 @@ def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]
     uniform = q2 - q1 - r * (q1 - q0)
     weight = (1 + (1 + r) ** 2 + r**2).mean()
     sigma = precisions(run.data.unwrapped()).to(q)
-    sigma = torch.where(torch.isfinite(sigma), sigma, 0.0)  # infinite where there are too few samples to tell
+    # The precision is infinite if there are too few samples to estimate it.
+    sigma = torch.where(torch.isfinite(sigma), sigma, 0.0)
     return _rms(error / spread), _rms(uniform / spread), _rms(sigma / spread) * float(weight) ** 0.5
 
 
@@ -144,8 +149,8 @@ def _free_run(run: Run) -> tuple[float, str]:
     index = (~leading(run.data.lengths, run.train_lengths)).nonzero()[:, 0]
     note = f"{len(index)} samples the fit did not see"
     error = run.prediction[index].to(q.dtype) - q[index]
-    turning = torch.tensor(run.data.angles, device=q.device)
-    error = torch.where(turning, error - 2 * math.pi * torch.round(error / (2 * math.pi)), error)
+    angles = torch.tensor(run.data.angles, device=q.device)
+    error = torch.where(angles, error - 2 * math.pi * torch.round(error / (2 * math.pi)), error)
     value = _rms(error / _spread(q[index]))
     return (value if math.isfinite(value) else math.inf), note
 

@@ -1,4 +1,4 @@
-"""States for an L_d that comes without any: positions and velocities of size 1, momenta by FL⁻."""
+"""Sample states of an L_d that comes without states: positions and velocities of size 1, momenta by FL⁻."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from herglotz.mechanics import DiscreteLagrangian, momentum_minus, partials
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 
-MOST = 12  # coordinates that are tried
+# Largest number of coordinates that is tried on a function.
+MAX_COORDINATES = 12
 
 
 def drawn_states(L_d: DiscreteLagrangian, h: float, samples: int, make: torch.Generator) -> State:
     """Return (q0, p0, s0) with q0 and q̇ standard normal, s0 in [−1, 1], and p0 = −D1 L_d(q0, q0 + h q̇, s0)/c.
 
-    A learned model has its own sizes of q and q̇, and its number of coordinates. Of a function the smallest number is
-    taken that it does not refuse, so a sum over coordinates is verified for one. Raise InputError if the function takes
-    no number of coordinates up to 12, or gives no finite momentum.
+    A learned model provides the sizes of q and q̇ and the number of coordinates. A function is tried with 1, 2, …
+    coordinates until it accepts the number, so a sum over coordinates is verified for one. Raise InputError if the
+    function accepts no number up to 12, or gives no finite momentum.
     """
     if isinstance(L_d, ContactLagrangian):
         scale, speed = (torch.tensor(x, dtype=torch.float64) for x in (L_d.config.scale, L_d.config.speed))
         dtype = next(L_d.parameters()).dtype
         return _state(L_d, scale.to(dtype), speed.to(dtype), h, samples, make)
     refused = ""
-    for n in range(1, MOST + 1):
+    for n in range(1, MAX_COORDINATES + 1):
         one = torch.ones(n, dtype=torch.float64)
         try:
             return _state(L_d, one, one, h, samples, make)
@@ -34,7 +35,8 @@ def drawn_states(L_d: DiscreteLagrangian, h: float, samples: int, make: torch.Ge
                 raise
             refused = str(error).splitlines()[0]
     raise InputError(
-        f"no states could be drawn: up to {MOST} coordinates the function fails ({refused}); give (L_d, (q, p, s))"
+        f"no states could be drawn: up to {MAX_COORDINATES} coordinates the function fails ({refused}); "
+        "give (L_d, (q, p, s))"
     )
 
 

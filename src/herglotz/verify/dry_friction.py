@@ -1,10 +1,11 @@
-"""Set-valued dry friction: the step map is smooth on branches, and a stuck coordinate has an identity of its own.
+"""Set-valued dry friction: the step map is smooth on branches, and a stuck coordinate has its own identity.
 
-A step stays on a branch while every coordinate keeps to sliding forward, sliding back or standing still (stuck). On a
-branch the map is differentiable, and the identities of a forced contact map hold. A stuck coordinate stays at q1 = q0
-for all states nearby: q1 does not depend on p0, so that M = −c (∂q1/∂p0)⁻¹ is defined for the sliding coordinates
-alone. The holding impulse balances the momentum, F⁻ = −D1 − c p0, and friction can supply the impulse if its part λ of
-dry friction is within c h (τ + ε). Source: `herglotz.stepping.stick_slip`.
+On a branch each coordinate slides forward, slides back or sticks. There the map is differentiable, and the identities
+of a forced contact map hold. A stuck coordinate stays at q1 = q0 for all states nearby: q1 does not depend on p0, so
+that M = −c (∂q1/∂p0)⁻¹ is defined for the sliding coordinates alone. The holding impulse balances the momentum, F⁻ =
+−D1 − c p0. Friction can supply the impulse if the part λ of dry friction is within c h (τ + ε).
+
+Source: `herglotz.stepping.stick_slip`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ HOLDS = "dry friction holds within its bound: |λ| ≤ c h (τ + ε)"
 def forces(known: Subject, w: SampledRollout) -> Forces | None:
     """Return F⁻ and F⁺ at the steps that are ok; None if the subject has no forces.
 
-    For a stuck coordinate F⁻ includes the holding impulse: as much of D1 + c p0 + F⁻ as dry friction can supply.
+    F⁻ of a stuck coordinate includes the holding impulse, the part of D1 + c p0 + F⁻ that dry friction can supply.
     """
     if known.L_d is None:
         return None
@@ -44,10 +45,11 @@ def forces(known: Subject, w: SampledRollout) -> Forces | None:
 def holding(known: Subject, w: SampledRollout, bound: float) -> Check:
     """Check that dry friction can supply the impulse that a stuck coordinate needs.
 
-    The value is the missing impulse, relative to the terms that cancel. Sliding coordinates have no bound.
+    The value is the missing impulse relative to the terms that cancel. Sliding coordinates are not judged.
     """
     assert known.L_d is not None
-    done = w.status == Status.CONVERGED  # the derivative of the map has no say
+    # Not `w.ok`: this check does not need the derivative of the map.
+    done = w.status == Status.CONVERGED
     q0, p0, s0, q1 = (x[done] for x in (w.q[:, :-1], w.p[:, :-1], w.s[:, :-1], w.q[:, 1:]))
     with torch.no_grad():
         P = partials(known.L_d, q0, q1, s0, known.h)
@@ -61,6 +63,6 @@ def holding(known: Subject, w: SampledRollout, bound: float) -> Check:
 
 
 def on_sliding(X: Tensor, slides: Tensor, rest: float) -> Tensor:
-    """X (..., n, n) between sliding coordinates (..., n); for the others `rest` on the diagonal and 0 elsewhere."""
+    """X (..., n, n) in the rows and columns of sliding coordinates; elsewhere `rest` on the diagonal and 0 off it."""
     both = slides[..., :, None] & slides[..., None, :]
     return torch.where(both, X, torch.diag_embed(torch.where(slides, 0.0, rest).to(X)))

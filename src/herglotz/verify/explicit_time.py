@@ -1,4 +1,4 @@
-"""The rows of `verify` for a time-dependent L_d: every step has its own L_d^k = L_d(·; t_k), and time has momenta."""
+"""The checks of a time-dependent L_d: every step has its own L_d^k = L_d(·; t_k), and time has momenta."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from herglotz.verify.subject import Subject
 
 
 def in_time(known: Subject, family: TimeDependent, steps: int, strict: float, bound: float) -> list[Check]:
-    """The checks of motions of K = `steps` steps, the k-th of which begins at t_k = t0 + kh.
+    """Check motions of K = `steps` steps, of which step k begins at t_k = t0 + kh.
 
     `strict` bounds the contact property, `bound` the other identities.
     """
@@ -45,7 +45,7 @@ def in_time(known: Subject, family: TimeDependent, steps: int, strict: float, bo
 
 
 def _rollout(family: TimeDependent, known: Subject, times: Tensor) -> SampledRollout:
-    """Motions with the derivative of every step; a sample whose step fails stays NaN, and is not ok."""
+    """Motions with the derivative of every step; a sample is NaN, and not ok, after a failed step."""
     with torch.no_grad():
         out = Stepper(family).rollout(*known.states, h=known.h, steps=len(times), inputs=times[:, None])
     t, h = times.expand(out.status.shape).flatten(), known.h
@@ -57,7 +57,7 @@ def _rollout(family: TimeDependent, known: Subject, times: Tensor) -> SampledRol
 
 
 def _fan(family: TimeDependent, known: Subject, w: SampledRollout) -> Fan:
-    """S^k for k = 1, 2, K − 1, K along the motions, where all their steps converged."""
+    """S^k for k = 1, 2, K − 1, K along the motions whose steps all converged."""
     whole = (w.status == Status.CONVERGED).all(-1)
     start = State(*(x[whole] for x in known.states))
 

@@ -14,10 +14,8 @@ from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import SampledRollout, worst
 from herglotz.verify.subject import Subject
 
-# Bound of the margin of det M. A kinetic term gives 1/3 (1/2 for a file); models collapsed by trap 2 give 0 or change
-# sign.
-MARGIN = 1e-3
-
+# Smallest margin of det M. A kinetic term gives 1/3 (1/2 for a file); models collapsed by trap 2 give 0 or change sign.
+MIN_MARGIN = 1e-3
 
 RIGHT, LEFT = "discrete Hamilton–Jacobi equation on a fan", "left discrete Hamilton–Jacobi equation"
 NO_H_PLUS = Check.without_object("hamilton_jacobi", RIGHT, "H⁺ does not exist: det D2D2 L_d = 0 at every step (E4)")
@@ -31,7 +29,7 @@ NO_H_MINUS = [
 
 
 def hamiltonians_exist(subject: Subject, w: SampledRollout) -> tuple[bool, bool]:
-    """Return whether H⁺, and whether H⁻, exists at any step; True where there is no L_d or no step to tell.
+    """Return whether H⁺, and whether H⁻, exists at any step; True if there is no L_d or no step to judge by.
 
     Stepping needs neither (erratum E4): L_d = −q0·q1/h has D11 = D22 = 0 and is regular.
     """
@@ -42,7 +40,7 @@ def hamiltonians_exist(subject: Subject, w: SampledRollout) -> tuple[bool, bool]
         P = partials(subject.L_d, q0, w.ends.q, s0, subject.h, 2)
         M = mixed_hessian(P)
         margins = (scaled_margin(X, M, P.D11, P.D22) for X in (P.D22, left_hessian(P)))
-    right, left = (bool((margin > MARGIN).any()) for margin in margins)
+    right, left = (bool((margin > MIN_MARGIN).any()) for margin in margins)
     return right, left
 
 
@@ -56,11 +54,13 @@ def momentum_matching(subject: Subject, w: SampledRollout, bound: float) -> Chec
     both = w.ok[:, :-1] & w.ok[:, 1:]
     size = w.q.abs().amax() + (w.q[:, 1:] - w.q[:, :-1]).abs().amax()
     if subject.L_d is None:
-        statement = "momenta match: |J⁻¹R|/|q|"  # with the mark of its note the row fits a terminal
+        # The short statement leaves room for the mark of the note in a terminal.
+        statement = "momenta match: |J⁻¹R|/|q|"
         note = "no L_d in the file: its derivatives are taken from those of the map"
         D1, D2, Y_p = _from_map(w)
         R = D1[:, 1:] + w.c[:, 1:, None] * D2[:, :-1]
-        error = (Y_p[:, 1:] @ R[..., None])[..., 0] / w.c[:, 1:, None]  # ∂q1/∂p0 = −c J⁻¹
+        # ∂q1/∂p0 = −c J⁻¹.
+        error = (Y_p[:, 1:] @ R[..., None])[..., 0] / w.c[:, 1:, None]
         error = error[both]
     else:
         q0, q1, q2 = (w.q[:, k : w.steps - 1 + k][both] for k in range(3))
@@ -73,16 +73,16 @@ def momentum_matching(subject: Subject, w: SampledRollout, bound: float) -> Chec
 
 
 def left_formalism(subject: Subject, w: SampledRollout, bound: float) -> Check:
-    """Check that the left equations (erratum E5) give back q0, p1 and s0 from (p0, q1, s1), relative to the largest.
+    """Check that the left equations (erratum E5) give q0, p1 and s0 from (p0, q1, s1), relative to the largest.
 
-    q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻, with H⁻ from L_d by its own Newton solves. Steps near a
-    fold of H⁻, where det D1D1L⁻ = 0, are left out.
+    q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻, with H⁻ from L_d by Newton solves. Steps near a fold of
+    H⁻, where det D1D1L⁻ = 0, are left out.
     """
     assert subject.L_d is not None
     (q0, p0, s0), (q1, p1, s1) = w.starts, w.ends
     with torch.no_grad():
         P = partials(subject.L_d, q0, q1, s0, subject.h, 2)
-        keep = scaled_margin(left_hessian(P), mixed_hessian(P), P.D11, P.D22) > MARGIN
+        keep = scaled_margin(left_hessian(P), mixed_hessian(P), P.D11, P.D22) > MIN_MARGIN
         q0, p0, s0, q1, p1, s1 = (x[keep] for x in (q0, p0, s0, q1, p1, s1))
         H = LeftHamiltonian(subject.L_d, near=q0 - 1e-3 * (q1 - q0))
         found = left_equations(partials(H, p0, q1, s1, subject.h), p0, s1)
@@ -100,9 +100,9 @@ def _size(x: Tensor) -> float:
 def regularity(subject: Subject, w: SampledRollout) -> Check:
     """Check det M ≠ 0 with a margin: the smallest singular value of M, scaled so that D11, D22 and M have size 1.
 
-    Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. Determinants of both
-    signs among the samples mean that M is singular between them. M is that of the coordinates that slide: where dry
-    friction holds one, the step does not answer to its momentum (`herglotz.verify.dry_friction`).
+    Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. If det M has both
+    signs among the samples, M is singular between the samples. M is restricted to sliding coordinates, because a step
+    does not depend on the momentum of a stuck coordinate (`herglotz.verify.dry_friction`).
     """
     with torch.no_grad():
         M, sizes, slides, note = _map_hessians(w) if subject.L_d is None else _hessians(subject, w)
@@ -113,7 +113,7 @@ def regularity(subject: Subject, w: SampledRollout) -> Check:
     if not same:
         note = "; ".join(x for x in (note, "det M vanishes or changes sign over the samples") if x)
     value = float(margin.min()) if margin.numel() else float("nan")
-    return Check.more_than("regularity", "regular: margin of det M ≠ 0", value, MARGIN, note, also=same)
+    return Check.more_than("regularity", "regular: margin of det M ≠ 0", value, MIN_MARGIN, note, also=same)
 
 
 def _one_sign(M: Tensor, slides: Tensor) -> bool:
@@ -127,7 +127,7 @@ def _one_sign(M: Tensor, slides: Tensor) -> bool:
 
 
 def _hessians(subject: Subject, w: SampledRollout) -> tuple[Tensor, list[Tensor], Tensor, str]:
-    """Return M, the blocks that scale it and what slides, at every step; rest, q1 = q0, replaces a step that failed."""
+    """Return M, the blocks that scale M, which coordinates slide, and a note; a failed step counts as q1 = q0."""
     q0, q1 = w.q[:, :-1], w.q[:, 1:]
     q1 = torch.where(w.ok[..., None], q1, q0)
     assert subject.L_d is not None
@@ -137,7 +137,7 @@ def _hessians(subject: Subject, w: SampledRollout) -> tuple[Tensor, list[Tensor]
 
 
 def _map_hessians(w: SampledRollout) -> tuple[Tensor, list[Tensor], Tensor, str]:
-    """Return M = −c (∂q1/∂p0)⁻¹ and D22 = ∂p1/∂p0 (∂q1/∂p0)⁻¹ from the derivative of the map, and what slides."""
+    """Return M = −c (∂q1/∂p0)⁻¹, D22 = ∂p1/∂p0 (∂q1/∂p0)⁻¹ from the derivative of the map, what slides, and a note."""
     n = w.q.shape[-1]
     D, slides = w.derivative[w.ok], w.slides[w.ok]
     by_p = D[..., : 2 * n, n : 2 * n]

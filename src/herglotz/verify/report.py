@@ -1,29 +1,35 @@
-"""The result of a verification: data, a table, JSON."""
+"""The result of a verification as data, as a table and as JSON."""
 
 from __future__ import annotations
 
 import math
 import unicodedata
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from html import escape
 from textwrap import fill
 from typing import Any
 
-COLUMNS = 80  # of a terminal as it opens
+# The width of a new terminal window.
+COLUMNS = 80
 
 
 @dataclass(frozen=True)
 class Check:
-    """One claim, the measured value and its bound."""
+    """One claim, the measured value and its bound.
 
-    name: str  # short and stable, for programs
-    statement: str  # the claim, for people
-    value: float  # largest error of all samples; not finite where no sample could be measured
+    `name` is short and stable, for programs, and `statement` is for people. `value` is the largest error of all
+    samples, not finite if no sample could be measured; value and bound must satisfy `relation`. If the claim is about
+    an object that the target does not have, `applies` is False and the note names the object.
+    """
+
+    name: str
+    statement: str
+    value: float
     bound: float
     passed: bool
     note: str = ""
-    relation: str = "<="  # that value and bound must satisfy
-    applies: bool = True  # False: the claim is about an object that this target does not have; the note says which
+    relation: str = "<="
+    applies: bool = True
 
     @classmethod
     def at_most(cls, name: str, statement: str, value: float, bound: float, note: str = "") -> Check:
@@ -39,7 +45,7 @@ class Check:
 
     @classmethod
     def without_object(cls, name: str, statement: str, note: str) -> Check:
-        """Return a check of an object that does not exist for this target: it neither passes nor fails."""
+        """Return a check of an object that does not exist for this target; the check neither passes nor fails."""
         return cls(name, statement, math.nan, math.nan, True, note, applies=False)
 
     @property
@@ -53,26 +59,17 @@ class Check:
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON; a value that is not finite becomes None."""
         value, bound = (x if math.isfinite(x) else None for x in (self.value, self.bound))
-        return {
-            "name": self.name,
-            "statement": self.statement,
-            "value": value,
-            "relation": self.relation,
-            "bound": bound,
-            "passed": self.passed,
-            "applies": self.applies,
-            "note": self.note,
-        }
+        return {**asdict(self), "value": value, "bound": bound}
 
 
 @dataclass(frozen=True, repr=False)
 class Report:
-    """All checks of one target; printed, it is its table."""
+    """All checks of one target; `print` shows the table. `missing` names required checks that could not be judged."""
 
     target: str
     checks: tuple[Check, ...]
     details: dict[str, Any] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()  # names of checks that this target calls for and that could not be judged
+    missing: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -97,7 +94,7 @@ class Report:
         return f"<pre>{escape(self.table())}</pre>"
 
     def table(self, verdict: str = "") -> str:
-        """Return an aligned table (claim, measured, bound, ok or FAIL) with its notes below, and a verdict above."""
+        """Return a verdict, an aligned table (claim, measured, bound, ok or FAIL), and the notes of the checks."""
         rows = [("claim", "measured", "bound", "")]
         notes = list(dict.fromkeys(check.note for check in self.checks if check.note))
         for check in self.checks:
@@ -132,5 +129,5 @@ def _pad(text: str, width: int) -> str:
 
 
 def _width(text: str) -> int:
-    """Return the columns that a text takes; a combining character, such as the tilde of Φ̃, takes none."""
+    """Return the width of a text in columns; a combining character, such as the tilde of Φ̃, has width 0."""
     return sum(not unicodedata.combining(character) for character in text)

@@ -18,15 +18,18 @@ from herglotz.verify.subject import Map, Subject
 
 @dataclass(frozen=True)
 class SampledRollout:
-    """B rollouts of K steps with the derivative of every step, measured on the map itself."""
+    """B rollouts of K steps with the reported c and the derivative DΦ̃ of every step.
+
+    `sticks` says whether set-valued dry friction can hold a coordinate.
+    """
 
     q: Tensor  # (B, K+1, n)
     p: Tensor  # (B, K+1, n)
     s: Tensor  # (B, K+1)
-    c: Tensor  # (B, K) as the stepper reports it
+    c: Tensor  # (B, K)
     status: Tensor  # (B, K)
-    derivative: Tensor  # (B, K, 2n+1, 2n+1) DΦ̃ at entry k
-    sticks: bool = False  # whether set-valued dry friction can hold a coordinate
+    derivative: Tensor  # (B, K, 2n+1, 2n+1)
+    sticks: bool = False
 
     @property
     def ok(self) -> Tensor:
@@ -36,7 +39,7 @@ class SampledRollout:
 
     @property
     def slides(self) -> Tensor:
-        """Return whether each coordinate moves in each step, or no friction can hold it, (B, K, n)."""
+        """Return whether each coordinate moves in each step, (B, K, n); all do if no friction can hold a coordinate."""
         moves = self.q[:, 1:] != self.q[:, :-1]
         return moves if self.sticks else torch.ones_like(moves)
 
@@ -47,7 +50,7 @@ class SampledRollout:
 
     @property
     def ends(self) -> State:
-        """The states after them."""
+        """The states after the steps that are ok."""
         return State(*(x[:, 1:][self.ok] for x in (self.q, self.p, self.s)))
 
     @property
@@ -58,23 +61,23 @@ class SampledRollout:
 
 def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
     """Roll out from the subject's states and differentiate every step by autograd."""
-    held = _Held(subject.step, subject.h)
+    frozen = _FrozenOnFailure(subject.step, subject.h)
     with torch.no_grad():
-        out = held.rollout(*subject.states, h=subject.h, steps=steps)
+        out = frozen.rollout(*subject.states, h=subject.h, steps=steps)
     _, D = flow_derivative(subject.flow(), *(x[:, :-1].flatten(0, 1) for x in (out.q, out.p, out.s)))
-    c = torch.stack(held.factors, 1)
+    c = torch.stack(frozen.factors, 1)
     return SampledRollout(out.q, out.p, out.s, c, out.status, D.unflatten(0, (-1, steps)), subject.sticks)
 
 
-class _Held(Map):
-    """The map, where a sample whose step failed stays where it was: a batch needs finite inputs."""
+class _FrozenOnFailure(Map):
+    """The map with the identity for samples whose step failed, because a batch needs finite inputs."""
 
     def __init__(self, one: Callable[[State, float], Step], h: float):
         super().__init__(one, h)
-        self.factors: list[Tensor] = []  # c of every step
+        self.factors: list[Tensor] = []
 
     def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
-        """One step; what is not finite has a status."""
+        """One step; a sample that is not finite is DIVERGED. The factors c of all steps are kept."""
         step = self.one(state, self.h)
         self.factors.append(step.c)
         good = torch.isfinite(torch.cat([*step.state[:2], step.state.s[:, None]], -1)).all(-1)
@@ -83,17 +86,19 @@ class _Held(Map):
         return Step(state, torch.where(good, step.c, 1.0), status, step.residual, step.iterations)
 
 
-# Of q in one step. The worst of 90 far away (a quartic oscillator, two coupled masses and Kepler, q about 1e5 and 1e7,
-# h = 0.01, 0.1, 0.5, five seeds): 13 for a step, 54 for D1S^k over eight.
+# Roundings of q allowed in an identity of p. The worst of 90 measurements with q about 1e5 and 1e7 (a quartic
+# oscillator, two coupled masses and Kepler; h = 0.01, 0.1, 0.5; five seeds) was 13 for a step and 54 for D1S^k over
+# eight steps.
 ROUNDINGS = 100.0
-BLIND = 1e-4  # no bound is raised beyond this: null models exceed 1e-3
+# No bound is raised beyond this, because null models exceed 1e-3.
+MAX_RAISED_BOUND = 1e-4
 
 
 def rounded(bound: float, w: SampledRollout) -> float:
-    """Return the bound, or what the rounding of q alone leaves in p where that is more.
+    """Return the larger of the bound and the error of p that the rounding of q alone causes.
 
-    q is known to eps |q| and p follows with the slope |c (∂q1/∂p0)⁻¹|: far from the origin of q, with p of
-    size 1, no stepper keeps an identity of p to 1e-11.
+    q has the error eps |q|, and p that error times the slope |c (∂q1/∂p0)⁻¹|. Far from the origin of q, with p of size
+    1, no stepper satisfies an identity of p to 1e-11.
     """
     if not bool(w.ok.any()):
         return bound
@@ -101,11 +106,11 @@ def rounded(bound: float, w: SampledRollout) -> float:
     slope = torch.linalg.inv_ex(D[:, :n, n : 2 * n])[0] * w.c[w.ok][:, None, None]
     p = w.starts.p.abs().max()
     size = torch.finfo(w.q.dtype).eps * w.q.abs().max() * slope.abs().max() / torch.where(p > 0, p, 1.0)
-    return max(bound, min(ROUNDINGS * float(size), BLIND)) if bool(torch.isfinite(size)) else bound
+    return max(bound, min(ROUNDINGS * float(size), MAX_RAISED_BOUND)) if bool(torch.isfinite(size)) else bound
 
 
 def worst(values: Tensor) -> float:
-    """Return the largest entry; NaN, which fails every bound, where `values` is empty or has a NaN."""
+    """Return the largest entry; NaN, which fails every bound, if `values` is empty or has a NaN."""
     return float(values.max()) if values.numel() else float("nan")
 
 
@@ -117,7 +122,7 @@ def convergence(w: SampledRollout) -> Check:
 
 
 def positive_factor(w: SampledRollout) -> Check:
-    """Check c > 0 at every step, so that FL⁻ exists and orientation is kept."""
+    """Check c > 0 at every step: FL⁻ exists and the map keeps the orientation."""
     c = w.c[w.ok]
     return Check.more_than("positive_c", "conformal factor c > 0 (smallest)", -worst(-c), 0.0)
 
@@ -125,7 +130,7 @@ def positive_factor(w: SampledRollout) -> Check:
 def contact(w: SampledRollout, bound: float, force: Forces | None = None) -> Check:
     """Check DΦ̃ᵀ η(x1) = c η(x0) − F⁻dq0 − F⁺dq1, relative to the terms that cancel.
 
-    Without forces this is the contact property. `force` holds the forces at the steps that are ok.
+    Without forces this is the contact property. `force` contains the forces at the steps that are ok.
     """
     p0, p1 = w.starts.p, w.ends.p
     D, c = w.derivative[w.ok], w.c[w.ok]

@@ -1,4 +1,4 @@
-"""The subject of a verification: a step map and sample states, made from any target."""
+"""The subject of a verification: the step map and the sample states of any target."""
 
 from __future__ import annotations
 
@@ -35,18 +35,22 @@ DIFFERENCED = {torch.float64: 1e-9, torch.float32: 2e-3}
 
 @dataclass(frozen=True)
 class Subject:
-    """A step map, its sample states, and the L_d, scene or run behind the map where they are known."""
+    """A step map, its sample states, and the L_d, scene or run behind the map if known.
+
+    `kind` is "scene", "run", "stepper", "L_d" or the kind of a file: "pt2", "aoti", "onnx", "c". `metadata` is that of
+    a file. `differenced` says that the file has no derivatives, so that those of the map are finite differences.
+    """
 
     name: str
-    kind: str  # "scene", "run", "pt2", "aoti", "onnx", "c", "stepper" or "L_d"
+    kind: str
     step: Callable[[State, float], Step]
     states: State  # (B, n), (B, n), (B)
     h: float
-    L_d: DiscreteLagrangian | None = None  # None: only the map itself is known
+    L_d: DiscreteLagrangian | None = None
     scene: Scene | None = None
     run: Run | None = None
-    metadata: Mapping[str, Any] = field(default_factory=dict)  # of a file
-    differenced: bool = False  # whether derivatives of the map are differences: nothing else gives the file's
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    differenced: bool = False
 
     @property
     def dof(self) -> int:
@@ -66,7 +70,7 @@ class Subject:
 
     @property
     def derivative_of(self) -> str:
-        """Whose derivative of the map is judged."""
+        """The source of the derivative that is judged, for the table."""
         return "the file's" if self.metadata and self.kind != "pt2" else "autograd"
 
     def flow(self, k: int = 1) -> Flow:
@@ -74,12 +78,12 @@ class Subject:
         return lambda q, p, s: self.rollout(State(q, p, s), k).final
 
     def rollout(self, start: State, steps: int) -> Rollout:
-        """Steps of the map."""
+        """Roll the map out from `start`."""
         return Map(self.step, self.h).rollout(*start, h=self.h, steps=steps)
 
 
 class Map(OneStepMethod):
-    """A step map at one h, a number, as a stepper for the one driver of rollouts."""
+    """A step map at one number h as a stepper, for `OneStepMethod.rollout`."""
 
     def __init__(self, one: Callable[[State, float], Step], h: float):
         self.one, self.h = one, h
@@ -90,7 +94,7 @@ class Map(OneStepMethod):
 
 
 def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
-    """Turn anything that `verify` takes into a `Subject`.
+    """Return the `Subject` of any target of `verify`.
 
     States are drawn from the `q_range` and `v_range` of a scene with s in [−1, 1], from the fitted states of a run, or
     from the box of a file; for an L_d alone by `drawn_states`. A pair (L_d or stepper, states) brings its own states.
@@ -124,7 +128,7 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
 
 
 def named(target: Any) -> Any:
-    """Return a scene by its name, a run by its folder, an exported file by its path; anything else comes back."""
+    """Return the scene of a name, the run of a folder, the stepper of an exported file; any other target unchanged."""
     if not isinstance(target, str | os.PathLike):
         return target
     if target in scene_names():
@@ -142,7 +146,7 @@ def named(target: Any) -> Any:
 
 
 def _file(target: ExportedStepper, states: State, h: float) -> Subject:
-    """Return the subject of a file: its map has the derivative of autograd, or the file's own, or differences."""
+    """Return the subject of a file; DΦ̃ comes from autograd, from the file or, without either, from differences."""
     whole = Subject(target.path, target.kind, target.step, states, h, metadata=target.metadata)
     if target.differentiable:
         return whole
@@ -152,7 +156,7 @@ def _file(target: ExportedStepper, states: State, h: float) -> Subject:
 
 
 def _pair(source: Any, states: Any, h: float | None) -> Subject:
-    """Return the subject of an L_d, or of anything with `step(state, h) -> Step`, and given states (q, p, s)."""
+    """Return the subject of given states (q, p, s) and an L_d, or an object with `step(state, h) -> Step`."""
     if h is None:
         raise InputError("h must be given with a pair (L_d or stepper, states), e.g. h=0.1")
     state, size = State(*(x.detach() for x in check_batch(states))), _step_size(h, h)
@@ -176,7 +180,7 @@ def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
 
 
 def _run_states(run: Run, samples: int, make: torch.Generator) -> State:
-    """Draw fitted states of a run without repetition; states that are not finite are skipped."""
+    """Draw finite fitted states of a run without repetition."""
     dtype = next(run.model.parameters()).dtype
     states = State(*(x.detach().to(dtype) for x in run.states))
     finite = states.finite.nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""The symmetries of a scene, a run or a discrete Lagrangian: `theory.symmetries` with states and a precision."""
+"""The symmetries of a scene, a run or an L_d: `theory.symmetries` with sample states and a precision."""
 
 from __future__ import annotations
 
@@ -14,9 +14,14 @@ from herglotz.threads import one_thread
 from herglotz.training import Run
 from herglotz.verify.subject import subject
 
-OPENING = 0.3  # standard deviation of what is added to p, in standard deviations of p
-SURE = 3.0  # standard deviations of the free run's error within which J is kept
-STEPS, MOST = 40, 200  # of a motion: those of a scene, and at most of the unseen part of a recording
+# Standard deviation of the offset added to p, relative to that of p.
+MOMENTUM_SPREAD = 0.3
+# J of a symmetry is constant within this many RMS errors of the free run.
+RMS_ERRORS = 3.0
+# Steps of a motion by default.
+STEPS = 40
+# Largest number of steps of a motion over the unseen part of a recording.
+MAX_UNSEEN_STEPS = 200
 
 
 @one_thread()
@@ -36,26 +41,26 @@ def symmetries(
     target, h, samples, seed
         As for `herglotz.verify.verify`: a scene or its name, a run or its folder, an L_d with h, or (L_d, states).
     steps
-        Steps of each motion; by default 40, and of a run those of the unseen part, at most 200.
+        Steps of each motion; by default 40, for a run those of the unseen part, at most 200.
     precision
-        Largest drift of a symmetry. By default 1e-9 for an L_d that is known, and for a run three times the RMS
-        error of its free run over the unseen part (of the training part where nothing is unseen), relative to the RMS
-        size of the motion, where that is more.
+        Largest drift of a symmetry, by default 1e-9. For a run the default is three times the RMS error of the free run
+        over the unseen part, or the training part if nothing is unseen, relative to the RMS size of the motion, if that
+        is more than 1e-9.
 
     Returns
     -------
     herglotz.theory.Symmetries
-        `print` says each in words.
+        `print` names each symmetry.
 
     Raises
     ------
     InputError
-        If the target has no L_d, as an exported file, or its motions cannot be stepped.
+        If the target has no L_d, such as an exported file, or its motions cannot be stepped.
     """
     known = subject(target, h, samples, seed)
     states = known.states
     if known.L_d is None:
-        raise InputError(f"{known.name}: has no L_d to look into; give the run that it was exported from")
+        raise InputError(f"{known.name}: has no L_d to look into; give the run that was exported")
     angles: tuple[bool, ...] = ()
     names: tuple[str, ...] = ()
     length = STEPS
@@ -78,23 +83,23 @@ def symmetries(
 
 
 def _opened(states: State, make: torch.Generator) -> State:
-    """The states with p spread by `OPENING`: on the recorded motions alone J may be one number."""
+    """The states with an offset of p: on the recorded motions alone J may have a single value."""
     q, p, s = states
     offset = torch.randn(p.shape, generator=make, dtype=torch.float64).to(p)
-    return State(q, p + OPENING * p.std(0, correction=0) * offset, s)
+    return State(q, p + MOMENTUM_SPREAD * p.std(0, correction=0) * offset, s)
 
 
 def _unseen_steps(run: Run) -> int:
-    """Model steps of the longest unseen part, at most `MOST`; `STEPS` where nothing is unseen."""
+    """Model steps of the longest unseen part, at most `MAX_UNSEEN_STEPS`; `STEPS` if nothing is unseen."""
     unseen = max(length - seen for length, seen in zip(run.data.lengths, run.train_lengths, strict=True))
-    return min(unseen * run.decided.substeps, MOST) or STEPS
+    return min(unseen * run.decided.substeps, MAX_UNSEEN_STEPS) or STEPS
 
 
 def _precision(run: Run) -> float:
-    """`SURE` RMS errors of the free run over the unseen part, or of the training part, over the motion's RMS size."""
+    """`RMS_ERRORS` errors of the free run, unseen or else training part, over the RMS size of the motion."""
     errors = (run.metrics.get(name) for name in ("extrapolation_rms", "train_rms"))
     error = next((x for x in errors if x is not None), None)
     spread = run.metrics.get("spread")
     if error is None or not spread:
         raise InputError("the run does not say how precise it is; give precision=, the largest drift of a symmetry")
-    return SURE * error / spread
+    return RMS_ERRORS * error / spread

@@ -1,4 +1,4 @@
-"""`verify`: every identity of a contact integrator measured on a scene, a fit, a file or a discrete Lagrangian."""
+"""`verify`: every identity of a contact integrator, measured on a scene, a run, a file or a discrete Lagrangian."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics import DiscreteLagrangian, Forces
 from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
 from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
@@ -37,12 +37,14 @@ from herglotz.verify.sampled_rollout import (
 )
 from herglotz.verify.subject import DIFFERENCED, Subject, subject
 
-# Bounds of the contact property, relative to the terms that cancel. Measured: 2e-13 on models and 8e-13 on the
-# parachute, whose Newton tolerance (64 eps of q ≈ 100 m) is large beside its steps of 0.1 m. Null models exceed 1e-3.
+# Bounds of the contact property, relative to the terms that cancel. Measured: 2e-13 on models, and 8e-13 on the
+# parachute, whose Newton tolerance, 64 eps of q ≈ 100 m, is large for steps of 0.1 m. Null models exceed 1e-3.
 CONTACT = {torch.float64: 1e-11, torch.float32: 5e-4}
-FORCED = "A map with friction or inputs is no contact map: the other checks need the model's forces (--against RUN)"
 # Bounds of the other identities; docs/verification.md lists the measured values.
 IDENTITY = {torch.float64: 1e-10, torch.float32: 1e-3}
+NO_CONTACT_MAP = (
+    "A map with friction or inputs is no contact map: the other checks need the model's forces (--against RUN)"
+)
 
 
 @one_thread()
@@ -60,34 +62,34 @@ def verify(
 
     Rollouts of `steps` steps from `samples` states give convergence, c > 0, DΦ̃ᵀη = cη, det DΦ̃ = c^{n+1}, momentum
     matching and regularity. Fans of solutions give D2S^k = p_k, D1S^k = −σ_k p̂0, 1 + D3S^k = σ_k and the discrete
-    Hamilton–Jacobi equation. A time-dependent L_d (`theory.TimeDependent`) steps at its own times, and the form
-    η + E dt is measured beside. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
-    scene with an exact L_d its closed-form flow, a run its data. The step of an L_d with forces is not a contact map:
-    then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. What set-valued
-    friction holds is judged by `herglotz.verify.dry_friction`.
+    Hamilton–Jacobi equation. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
+    scene with an exact L_d its closed-form flow, a run its data, and a time-dependent L_d (`theory.TimeDependent`),
+    which steps at its own times, the form η + E dt. The step of an L_d with forces is not a contact map: DΦ̃ᵀη = cη −
+    F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. `herglotz.verify.dry_friction`
+    judges coordinates that set-valued friction holds.
 
     Parameters
     ----------
     target
-        A scene or its name, a run or its folder, an exported stepper or its `.pt2` file, an L_d alone (`h` given;
-        states are drawn), or a pair (L_d, states) or (stepper, states), with states (q, p, s) of shapes (B, n), (B, n),
-        (B,).
+        A scene or its name, a run or its folder, an exported stepper or its file, an L_d with `h`, whose states are
+        drawn, or a pair (L_d, states) or (stepper, states), with states (q, p, s) of shapes (B, n), (B, n), (B,).
     h
-        Step, in the target's unit of time; default that of the target, required for a pair.
+        Step, in the target's unit of time; by default that of the target. Required for an L_d and for a pair.
     samples, steps, seed
         Number of states, number of steps from each state, and seed of the drawn states.
     tolerance
-        Bound on every identity, relative to the size of its terms, instead of 1e-11 (contact, with L_d) and 1e-10 in
-        float64, 5e-4 and 1e-3 in float32; 1e-9 and 2e-3 for a file without derivatives (machine code, C beyond 8
-        coordinates), whose map is differentiated by differences.
+        Bound on every identity, relative to the size of its terms. The defaults are 1e-11 (contact, with L_d) and 1e-10
+        in float64, 5e-4 and 1e-3 in float32, and 1e-9 and 2e-3 for a file without derivatives (machine code, C beyond 8
+        coordinates), whose map is differentiated by finite differences.
     model
-        The model that a file was exported from. The map of a forced file is no contact map, and its steps do not tell
-        the forces: with the model it is checked as a forced map, without it by the checks that need no forces.
+        The model from which a file was exported. The map of a forced file is no contact map, and its steps do not
+        determine the forces: with the model the file is checked as a forced map, otherwise by the checks that need no
+        forces.
 
     Returns
     -------
     Report
-        One check a claim. Samples near a caustic are left out and counted; a check without any sample fails.
+        One check for each claim. Samples near a caustic are left out and counted; a check without any sample fails.
 
     Raises
     ------
@@ -108,18 +110,16 @@ def verify(
     force = forces(behind, w)
     checks = [convergence(w), positive_factor(w), regularity(known, w)]
     missing: tuple[str, ...] = ()
-    if not known.differenced:  # else DΦ̃ is made of differences
+    # A differenced DΦ̃ cannot be compared with differences.
+    if not known.differenced:
         checks.append(derivative(known, w))
-    if force is not None:  # not a contact map: no generating function, and the volume is not c^{n+1}
-        checks += [contact(w, strict, force), momentum_matching(behind, w, identity)]
-        checks += [holding(behind, w, identity)] if force.held is not None else []
+    if force is not None:
+        checks += _of_a_forced_map(behind, w, strict, identity, force)
     elif known.forced:
         missing = ("contact", "momentum", *(("holding",) if known.sticks else ()))
-        checks[2] = replace(checks[2], note=f"{checks[2].note}. {FORCED}")
+        checks[2] = replace(checks[2], note=f"{checks[2].note}. {NO_CONTACT_MAP}")
     else:
-        fixed = tolerance is not None
-        loose = identity if fixed else rounded(identity, w)
-        checks.append(contact(w, strict if fixed else rounded(strict, w)))
+        loose = (strict, identity) if tolerance is not None else (rounded(strict, w), rounded(identity, w))
         checks += _of_a_contact_map(known, w, identity, loose, fan(known, steps, seed + 1))
     if known.scene is not None and known.scene.exact:
         checks.append(_exact_flow(known, w, identity))
@@ -142,16 +142,28 @@ def _bounds(known: Subject, tolerance: float | None) -> tuple[float, float]:
     return identity if known.L_d is None else CONTACT[dtype], identity
 
 
-def _of_a_contact_map(known: Subject, w: SampledRollout, bound: float, loose: float, f: Fan) -> list[Check]:
-    """The identities that hold without forces only; `loose` bounds those that the rounding of q enters."""
+def _of_a_forced_map(known: Subject, w: SampledRollout, strict: float, bound: float, force: Forces) -> list[Check]:
+    """The identities of a map with forces, which has no generating function; its volume factor is not c^{n+1}."""
+    checks = [contact(w, strict, force), momentum_matching(known, w, bound)]
+    return checks if force.held is None else [*checks, holding(known, w, bound)]
+
+
+def _of_a_contact_map(
+    known: Subject, w: SampledRollout, bound: float, loose: tuple[float, float], f: Fan
+) -> list[Check]:
+    """The identities of a map without forces.
+
+    The rounding of q enters the contact property and other identities of p, whose bounds are the two of `loose`.
+    """
     right, left = hamiltonians_exist(known, w)
-    checks = [volume(w, bound), momentum_matching(known, w, bound), *derivatives(f, loose, bound)]
+    checks = [contact(w, loose[0]), volume(w, bound), momentum_matching(known, w, bound)]
+    checks += derivatives(f, loose[1], bound)
     checks.append(hamilton_jacobi(known, f, bound) if right else NO_H_PLUS)
     if known.L_d is None:
         return checks
     if not left:
         return [*checks, *NO_H_MINUS]
-    return [*checks, left_formalism(known, w, loose), left_hamilton_jacobi(known, f, bound)]
+    return [*checks, left_formalism(known, w, loose[1]), left_hamilton_jacobi(known, f, bound)]
 
 
 def _details(known: Subject, steps: int, seed: int) -> dict[str, Any]:
@@ -169,7 +181,7 @@ def _details(known: Subject, steps: int, seed: int) -> dict[str, Any]:
 
 
 def _not_judged(known: Subject) -> str:
-    """Notes against misreadings of the table."""
+    """A sentence on what the table does not judge."""
     if known.run is not None:
         return "whether p, s and γ are true, other h, and motions unlike the recorded ones."
     if known.scene is not None and known.scene.exact:

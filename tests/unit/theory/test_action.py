@@ -48,28 +48,6 @@ def test_gradient_vanishes_on_solutions_only():
     assert float(herglotz_action(nonlinear, bent, s0, 0.2).gradient[:, 1:-1].abs().amax((1, 2)).min()) > 1e-4
 
 
-def test_s_blind_action_is_no_critical_point_of_damped_motion():
-    # null model: an L_d blind to s. Fails if damped solutions are critical for it too
-    damped = scene("damped_oscillator").L_d_rules["left"]
-    q, s0, _ = curves(1, 1)
-    out = Stepper(damped).rollout(q[:, 0], q[:, 1], s0, h=0.2, steps=7)
-
-    def blind(q0, q1, s0, h):
-        return damped(q0, q1, 0 * s0, h)
-
-    assert float(herglotz_action(damped, out.q, s0, 0.2).residual.abs().max()) < 1e-12
-    assert float(herglotz_action(blind, out.q, s0, 0.2).residual.abs().amax((1, 2)).min()) > 1e-3
-
-
-def test_each_step_starts_from_the_action_before_it():
-    # fails if s_0 stands in every step: along a curve that is no solution nothing else notices
-    q, s0, _ = curves(2, 5)
-    s = [s0]
-    for k in range(q.shape[-2] - 1):
-        s.append(s[-1] + nonlinear(q[..., k, :], q[..., k + 1, :], s[-1], torch.tensor(0.2, dtype=q.dtype)))
-    torch.testing.assert_close(curve_action(nonlinear, q, s0, 0.2), torch.stack(s, -1), rtol=0, atol=1e-14)
-
-
 def test_a_zero_factor_is_no_division():
     # fails if the products are formed by dividing σ_N by σ_k: at h = 1/γ the left rule has c = 0
     L_d = scene("damped_oscillator").L_d_rules["left"]

@@ -7,7 +7,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import momentum_jacobian, partials
-from herglotz.scenes import damped_oscillator, midpoint_heun, reference_flow, strang
+from herglotz.scenes import damped_oscillator, reference_flow, strang
 from herglotz.stepping import State, Status, Stepper
 from herglotz.theory import (
     ConstrainedStepper,
@@ -188,31 +188,6 @@ def test_the_relation_is_legendrian_whatever_the_rank(L_d):
     assert float(defect.spread.min()) > 0.5
     null = legendrian_defect(lambda u: submanifold(u, 1.01), u)
     assert float(null.pullback.abs().max()) > 1e-3
-
-
-def guiding_centre(q, v, s):
-    """L = (B/2)(xẏ − yẋ) − φ − γs in the symmetric gauge: degenerate, but the midpoint rule's M is not."""
-    x, y = q.unbind(-1)
-    return 0.5 * B * (x * v[..., 1] - y * v[..., 0]) - phi(x, y) - GAMMA * s
-
-
-def test_symmetric_gauge_is_regular_and_has_a_parasitic_mode():
-    # fails if M is singular there, or the sawtooth that a p off the constraint p = A(q) starts goes unnoticed
-    L_d, h, steps = midpoint_heun(guiding_centre), 0.05, 40
-    x = drift_start()
-    A = 0.5 * B * torch.stack([-x.q[:, 1], x.q[:, 0]], -1)
-    kick = torch.tensor([1e-3, 0.0], dtype=torch.float64)
-    on, off = (Stepper(L_d).rollout(x.q, p, x.s, h=h, steps=steps) for p in (A, A + kick))
-    same = LegendrianStepper(L_d, ahead=0).rollout(x.q, A, x.s, h=h, steps=5)
-    torch.testing.assert_close(same.q, on.q[:, :6], rtol=0, atol=1e-13)
-
-    def bend(q):  # second differences: small for a motion, of alternating sign for a sawtooth
-        return q[:, 2:] - 2 * q[:, 1:-1] + q[:, :-2]
-
-    assert float(bend(on.q).abs().max()) < 4 * h**2
-    saw = bend(off.q - on.q)
-    assert float(saw.abs().amax(-1).min()) > 5e-4  # it does not die faster than the motion
-    assert bool(((saw[:, 1:] * saw[:, :-1]).sum(-1) < 0).all())
 
 
 def test_float32_and_wrong_options():

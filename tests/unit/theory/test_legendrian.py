@@ -88,26 +88,6 @@ def test_legendrian_means_its_own_contact_complement():
         assert bool((values[:, 2] > 1e-3).all()) != equal
 
 
-def test_darboux_coordinates_of_the_contact_product():
-    # fails if a sign of (τp̂, −p, −τ; −s) is wrong: dz − π̂dq̂ − πdq − π_s dŝ must be τη̂ − η on any vector
-    make = torch.Generator().manual_seed(5)
-    x = torch.randn(4, 11, generator=make, dtype=torch.float64)
-    direction = torch.randn(4, 11, generator=make, dtype=torch.float64)
-
-    def chart(x):
-        return join(*contact_product_point(split(x[..., :5]), split(x[..., 5:10]), x[..., 10]))
-
-    y, D = jacobian(chart, x)
-    moved = (D @ direction[..., None])[..., 0]
-    (_, momenta, _), (d_base, _, dz) = split(y), split(moved)
-    (_, p0, _), (_, p1, _) = split(x[:, :5]), split(x[:, 5:10])
-    (dq0, _, ds0), (dq1, _, ds1) = split(direction[:, :5]), split(direction[:, 5:10])
-    expected = x[:, 10] * (ds0 - (p0 * dq0).sum(-1)) - (ds1 - (p1 * dq1).sum(-1))
-    torch.testing.assert_close(dz - (momenta * d_base).sum(-1), expected)
-    start, end, tau = contact_product_states(*split(y))
-    torch.testing.assert_close(torch.cat([join(*start), join(*end), tau[:, None]], -1), x)
-
-
 def test_the_graph_of_a_step_is_legendrian_in_the_contact_product():
     # fails if τ is not c: the graph of a contact map with conformal factor c, and with c replaced by 1
     u, step, _ = parachute_graph()
@@ -120,21 +100,6 @@ def test_the_graph_of_a_step_is_legendrian_in_the_contact_product():
     assert exact.pullback.abs().max() < 1e-12
     assert exact.spread.min() > 1e-3
     assert legendrian_defect(lambda u: graph(u, 0), u).pullback.abs().max() > 1e-2
-
-
-def test_the_generating_function_has_a_minus_sign():
-    # fails if W = +(ŝ + S) as printed (E1): on the graph the last coordinate z must be W, and η vanish
-    u, step, S = parachute_graph()
-
-    def graph(u, sign):
-        end, c = step(u)
-        base, momenta, _ = contact_product_point(split(u), end, c)
-        return base, momenta, sign * product_potential(S)(base)
-
-    right, printed = (legendrian_defect(lambda u, k=k: graph(u, k), u).pullback.abs().max() for k in (1, -1))
-    print(f"W = −(ŝ + S): {right:.1e}    W = ŝ + S: {printed:.1e}")
-    assert right < 1e-12
-    assert printed > 1
 
 
 def test_the_prolongation_of_W_is_the_step():

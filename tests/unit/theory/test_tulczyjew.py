@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from herglotz.errors import InputError
 from herglotz.mechanics import contact_form
 from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.scenes import scene
@@ -94,19 +93,6 @@ def test_without_H_plus_the_family_generates_the_same_relation():
         torch.testing.assert_close(
             (*start, *end, tau), (*triple.start, *triple.end, triple.tau), rtol=1e-12, atol=1e-12
         )
-
-
-def test_forces_have_no_triple():
-    # fails if a relation that is not Legendrian gets legs
-    class Pushed:
-        def __call__(self, q0, q1, s0, h):
-            return nonlinear(q0, q1, s0, h)
-
-        def forces(self, q0, q1, s0, h):  # noqa: ARG002
-            return -0.1 * (q1 - q0), 0.0 * q0
-
-    with pytest.raises(InputError, match="comes with forces"):
-        tulczyjew_triple(Pushed(), *points(), 0.2)
 
 
 def test_hopf_lax_finds_the_extremum_of_a_degenerate_lagrangian():

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from herglotz.data import Trajectories, simulate
-from herglotz.data.roughness import precisions
+from herglotz.data import simulate
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State
@@ -160,26 +159,6 @@ def test_noise_is_taken_off_before_a_model_fails():
     checks, numbers = named(run_of(noise=0.0013))
     assert numbers["one_step_rms"] > 0.5 * numbers["null_rms"]
     assert checks["one_step"].passed
-
-
-@pytest.mark.parametrize("irregular", [False, True])
-def test_the_noise_estimate(irregular):
-    # fails if the weights are not normalised, or are those of equal steps
-    make = torch.Generator().manual_seed(0)
-    h = torch.full((2000,), 0.1, dtype=torch.float64)
-    if irregular:
-        h = h * (0.5 + torch.rand(2000, generator=make, dtype=torch.float64))
-    t = h.cumsum(0)
-    q = torch.sin(t) + 0.01 * torch.randn(2000, generator=make, dtype=torch.float64)
-    data = Trajectories.of(t, q)
-    assert float(precisions(data)) == pytest.approx(0.01, rel=0.1)
-
-
-def test_the_noise_estimate_of_clean_coarse_data_is_small():
-    # fails if the motion itself counts as noise: six samples a period
-    t = torch.arange(200, dtype=torch.float64)
-    data = Trajectories.of(t, torch.sin(t))
-    assert float(precisions(data)) < 0.02
 
 
 def test_a_run_folder(tmp_path):

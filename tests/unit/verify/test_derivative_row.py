@@ -53,16 +53,6 @@ def test_the_scale_of_the_sample_does_not_matter():
     assert verify((scaled, start), h=0.1, steps=2)["derivative"].value < 1e-10
 
 
-def test_a_force_that_bends_sharply_is_sound():
-    # fails if a kink of the stiffness inside a stencil is taken for a derivative that is none (3e-5 with two widths)
-    for power in (3.0, 2.5):
-
-        def hard(q0, q1, s0, h, power=power):
-            return kinetic(q0, q1, s0, h) - h * ((0.5 * (q0 + q1)).abs() ** power).sum(-1)
-
-        assert verify(hard, h=0.1).passed
-
-
 def test_a_kink_inside_a_stencil_is_met_by_a_narrower_one():
     # fails if one of the two narrower widths is left out: 1.6e-4 at eight points 2e-4 and less from the kink
     def hard(q0, q1, s0, h):

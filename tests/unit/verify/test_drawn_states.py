@@ -1,4 +1,6 @@
-"""`verify` of an L_d alone, and what `simulate` and `fit` say of one."""
+"""`verify` of an L_d alone and of a scene with its ranges, and what `simulate` and `fit` say of an L_d."""
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -6,6 +8,7 @@ import torch
 import herglotz as hz
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.verify import verify
 from herglotz.verify.subject import subject
 from tests.lagrangians import verlet_pendulum as pendulum
@@ -82,3 +85,16 @@ def test_what_a_function_cannot_do_has_a_remedy(call, message):
     # fails if a newcomer with a lambda meets an AttributeError
     with pytest.raises(InputError, match=message):
         call()
+
+
+def test_every_coordinate_keeps_to_its_own_range():
+    # fails if one coordinate's range is used for all, or low and high are exchanged with the coordinates
+    shared = scene("damped_oscillator")  # isotropic: its L_d takes any n
+    two = replace(shared, coordinates=("x", "y"), q_range=((0.0, 5.0), (1.0, 6.0)), v_range=((-1.0, 2.0), (-0.5, 2.5)))
+    states = subject(two, None, 200, 0).states
+    assert states.q.shape == (200, 2)
+    for x, low, high in ((states.q, (0.0, 5.0), (1.0, 6.0)), (states.p, (-1.0, 2.0), (-0.5, 2.5))):
+        for i in range(2):
+            assert low[i] <= float(x[:, i].min()) < low[i] + 0.1
+            assert high[i] - 0.1 < float(x[:, i].max()) <= high[i]
+    assert verify(two, samples=8, steps=3).passed

@@ -6,8 +6,8 @@ import torch
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
+from herglotz.stepping.continuous_equation import weights
 from herglotz.theory import ContinuousEquation, FractionalStepper, contact_vector_field, inverse_step
-from herglotz.theory.continuous_equation import weights
 
 
 def f64(*x):

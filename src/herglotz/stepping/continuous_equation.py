@@ -1,16 +1,15 @@
 """The continuous equation of a discrete Lagrangian: backward error analysis of the step, without a fit.
 
-The step Φ̃ of L_d at one h is, up to terms that no power of h sees, the time-h flow of a contact vector field X̃. Its
-iterates x_j = Φ̃ʲ(x_0) lie on one smooth motion, so X̃ and the motion between them are sums over iterates:
+The step Φ̃ of L_d at one h is the time-h flow of a contact vector field X̃, up to terms smaller than any power of h. The
+iterates x_j = Φ̃ʲ(x_0) lie on one smooth motion, so X̃ and the motion between the iterates are sums over iterates:
 
     X̃ = (1/h) log Φ̃ = (1/h) Σ_j w_j x_j,    Φ̃^θ(x_0) = Σ_j ℓ_j(θ) x_j,    j = −m … m,
 
-with the weights of differences of order 2m and of Lagrange's polynomials. Both are the series of backward error
-analysis, cut at h^{2m}; m is chosen for every sample where two orders agree best, and their difference is the error
-estimate. The series is asymptotic: a step of a map that is not integrable is the flow of no field beyond an error that
-is exponentially small in 1/h, and that no m removes (Hénon–Heiles at 12 samples a period: 4e-6 with 18 and with 28).
-X̃ is contact because Φ̃ is, and the Hamiltonian needs no integration: H̃ = −η(X̃) = p·q̇ − ṡ, L̃ = ṡ, and
-dH̃/dt = −(∂H̃/∂s) H̃.
+with the weights w_j of differences of order 2m and ℓ_j of Lagrange's polynomials. Both are the series of backward error
+analysis, truncated at h^{2m}. m is the order at which two orders agree best in a sample, and their difference is the
+error estimate. The series is asymptotic. If Φ̃ is not integrable, an error exponentially small in 1/h remains for every
+m (Hénon–Heiles at 12 samples a period: 4e-6 with m = 18 and with m = 28). X̃ is contact because Φ̃ is contact, and the
+Hamiltonian needs no integration: H̃ = −η(X̃) = p·q̇ − ṡ, L̃ = ṡ, and dH̃/dt = −(∂H̃/∂s) H̃.
 
 Sources: M. Vermeeren, A. Bravetti, M. Seri, J. Phys. A 52 (2019) 445206, for contact integrators; S. Ober-Blöbaum,
 C. Offen, J. Comput. Appl. Math. 421 (2023) 114780, for learned Lagrangians; P. Moan, Found. Comput. Math. 6 (2006) 261.
@@ -28,22 +27,24 @@ from herglotz.mechanics import momentum_minus, momentum_plus, partials
 from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials
+from herglotz.mechanics.scalar_fields import gradient
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.stepping.stepper import Stepper
-from herglotz.theory.continuous import gradient
 
-MOST = 18  # largest m: at 31 samples a period of Hénon–Heiles 9 leave dH̃/dt + RH̃ = 4e-9 and 18 leave 1e-11
-AGREED = 1e-13  # of the move to the next iterate: two orders that differ by less differ by rounding
-WHOLE = 1e-9  # of a step, that a multiple of h may be off
+# Largest m. At 31 samples a period of Hénon–Heiles, 9 leaves dH̃/dt + RH̃ = 4e-9 and 18 leaves 1e-11.
+MAX_NEIGHBOURS = 18
+# Two orders whose difference is below this share of the move to the next iterate differ by rounding.
+ROUNDING = 1e-13
+# A time within this share of a multiple of h is that multiple.
+MULTIPLE_TOLERANCE = 1e-9
 
 
 def inverse_step(L_d: DiscreteLagrangian, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
-    """The step backwards: (q0, p0, s0) with Φ̃(q0, p0, s0) = state, differentiable once.
+    """The inverse step: (q0, p0, s0) with Φ̃(q0, p0, s0) = state = (q1, p1, s1), once differentiable.
 
-    FL⁺ is solved for (q0, s0): p1 = D2L_d(q0, q1, s0) + F⁺, s1 = s0 + L_d; then p0 by FL⁻. `c` is that of the step
-    forward.
-    `state` is (q1, p1, s1), and `guess` is (..., n + 1) near (q0, s0), by default (q1, s1).
+    Newton's method inverts FL⁺, p1 = D2L_d(q0, q1, s0) + F⁺ and s1 = s0 + L_d, for (q0, s0); FL⁻ gives p0. `c` is the
+    factor of the forward step. `guess`, (..., n + 1), is near (q0, s0), by default (q1, s1).
     """
     q1, p1, s1 = state
     n = q1.shape[-1]
@@ -73,8 +74,8 @@ def inverse_step(L_d: DiscreteLagrangian, state: State, h: Tensor | float, guess
 
 def weights(nodes: Tensor, theta: float) -> tuple[Tensor, Tensor]:
     """Lagrange's weights ℓ_j(θ) and ℓ_j′(θ) over distinct nodes, (K,) each, float64."""
-    apart = nodes[:, None] - nodes[None, :]
-    below = (apart + torch.eye(len(nodes), dtype=nodes.dtype)).prod(1)
+    distances = nodes[:, None] - nodes[None, :]
+    below = (distances + torch.eye(len(nodes), dtype=nodes.dtype)).prod(1)
     left = (theta - nodes).expand(len(nodes), -1)
     ones = torch.eye(len(nodes), dtype=torch.bool)
     value = left.masked_fill(ones, 1.0).prod(1) / below
@@ -88,17 +89,17 @@ def weights(nodes: Tensor, theta: float) -> tuple[Tensor, Tensor]:
 class ContinuousEquation:
     """X̃, H̃ and L̃ of a discrete Lagrangian at a step h, and the motion between the steps.
 
-    With forces the step is no contact map: X̃ and the motion stand, H̃ = p·q̇ − ṡ is the energy, and dH̃/dt has the
-    power of the forces, too.
+    With forces the step is no contact map. X̃ and the motion remain valid, H̃ = p·q̇ − ṡ is the energy, and dH̃/dt also has
+    the power of the forces.
 
     Parameters
     ----------
     L_d
         The discrete Lagrangian; of a driven one, `L_d.at(u)`.
     h
-        The step at which L_d was learned, or is to be understood.
+        The step at which L_d was learned, or at which its motion is wanted.
     order
-        2m, even; None: chosen for every sample. Order 2m is the series in h cut after h^{2m}.
+        2m, even: the series in h is truncated after h^{2m}. None chooses the order of every sample.
     """
 
     L_d: DiscreteLagrangian
@@ -108,25 +109,25 @@ class ContinuousEquation:
     def __post_init__(self) -> None:
         if not self.h > 0:
             raise InputError(f"h must be > 0, got {self.h}")
-        if self.order is not None and (self.order % 2 or not 2 <= self.order <= 2 * MOST):
-            raise InputError(f"order must be even, from 2 to {2 * MOST}, got {self.order}")
+        if self.order is not None and (self.order % 2 or not 2 <= self.order <= 2 * MAX_NEIGHBOURS):
+            raise InputError(f"order must be even, from 2 to {2 * MAX_NEIGHBOURS}, got {self.order}")
 
     def field(self, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """X̃: (q̇, ṗ, ṡ), shapes (..., n), (..., n), (...); NaN where a step that is needed fails."""
+        """X̃ = (q̇, ṗ, ṡ), shapes (..., n), (..., n), (...); NaN where a step fails."""
         X, _ = self._sum(State(q, p, s), 0.0, 1)
         return split(X[..., :-1] / self.h)
 
     def hamiltonian(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        """H̃(q, p, s) = p·q̇ − ṡ, shape (...): the energy; in units of p·v."""
+        """The energy H̃(q, p, s) = p·q̇ − ṡ, shape (...), in units of p·v."""
         q_dot, _, s_dot = self.field(q, p, s)
         return (p * q_dot).sum(-1) - s_dot
 
     def damping(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        """R(H̃) = ∂H̃/∂s, shape (...): H̃ and the contact form shrink at this rate."""
+        """R(H̃) = ∂H̃/∂s, shape (...): the rate at which H̃ and the contact form shrink."""
         return gradient(lambda s: self.hamiltonian(q, p, s[..., 0]), s[..., None])[1][..., 0]
 
     def momentum(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        """P with q̇ = v, shape (..., n), without a graph; NaN where Newton's iteration finds none."""
+        """The momentum p with q̇ = v, shape (..., n), without a graph; NaN where Newton's method finds no p."""
 
         def equations(p: Tensor) -> tuple[Tensor, Tensor]:
             q_dot, J = jacobian(lambda p: self.field(q, p, s)[0], p)
@@ -135,11 +136,11 @@ class ContinuousEquation:
         return find_root(equations, momentum_plus(partials(self.L_d, q - self.h * v, q, s, self.h))).solved
 
     def lagrangian(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        """L̃(q, v, s) = ṡ at the momentum of v, shape (...): the modified contact Lagrangian; without a graph."""
+        """The modified contact Lagrangian L̃(q, v, s) = ṡ at the momentum of v, shape (...), without a graph."""
         return self.field(q, self.momentum(q, v, s), s)[2]
 
     def error(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        """The estimated error of X̃, (...), relative to the move to the next iterate: two orders differ by so much."""
+        """The error estimate of X̃, (...): the difference of two orders, relative to the move to the next iterate."""
         return self._sum(State(q, p, s), 0.0, 1)[1]
 
     def _sum(self, state: State, theta: float, derivative: int) -> tuple[Tensor, Tensor]:
@@ -147,12 +148,12 @@ class ContinuousEquation:
 
 
 class _Iterates:
-    """The iterates of a state, made on demand: x_j with ln σ_j, (..., 2n+2), j of either sign."""
+    """The iterates x_j of a state with ln σ_j, (..., 2n+2), j of either sign, computed on demand."""
 
     def __init__(self, equation: ContinuousEquation, state: State):
         state = State(*check_state(state))
         self.L_d, self.h, self.stepper = equation.L_d, equation.h, Stepper(equation.L_d)
-        self.most, self.fixed = (MOST, False) if equation.order is None else (equation.order // 2, True)
+        self.most, self.fixed = (MAX_NEIGHBOURS, False) if equation.order is None else (equation.order // 2, True)
         first = torch.cat([join(*state), torch.zeros_like(state.s)[..., None]], -1)
         self.nodes = {0: (first, torch.zeros_like(state.s, dtype=torch.uint8))}
 
@@ -173,16 +174,13 @@ class _Iterates:
         state, log_c = State(*split(x[..., :-1])), x[..., -1]
         n = state.q.shape[-1]
         other = self.nodes.get(last - sign)
-        guess = None if other is None else (2 * x - other[0]).detach()  # uniform motion
-        if sign > 0:
-            start = None if guess is None else torch.where(guess.isfinite(), guess, x)[..., :n]
-            step = self.stepper.step(state, self.h, start)
-        else:
-            start = None
-            if guess is not None:
-                guess = torch.where(guess.isfinite(), guess, x)
-                start = torch.cat([guess[..., :n], guess[..., 2 * n : 2 * n + 1]], -1)
-            step = inverse_step(self.L_d, state, self.h, start)
+        guess, forward = None, sign > 0
+        if other is not None:
+            uniform = (2 * x - other[0]).detach()
+            uniform = torch.where(uniform.isfinite(), uniform, x)
+            q, s = uniform[..., :n], uniform[..., 2 * n : 2 * n + 1]
+            guess = q if forward else torch.cat([q, s], -1)
+        step = self.stepper.step(state, self.h, guess) if forward else inverse_step(self.L_d, state, self.h, guess)
         row = torch.cat([join(*step.state), (log_c + sign * step.c.log())[..., None]], -1)
         self.nodes[last + sign] = (row, torch.where(status == Status.CONVERGED, step.status, status))
 
@@ -190,7 +188,7 @@ class _Iterates:
 def _summed(iterates: _Iterates, centre: int, theta: float, derivative: int) -> tuple[Tensor, Tensor]:
     """Σ weights · (q, p, s, ln σ) at centre + θ, (..., 2n+2), and the error estimate (...).
 
-    Neighbours are added until two orders agree to rounding in every sample, or there are `most` on either side.
+    Neighbours are added until two orders agree to rounding in every sample, or `most` neighbours stand on each side.
     """
     middle, found = iterates.node(centre)[0], []
     size = (iterates.node(centre + 1)[0] - middle).abs().detach()
@@ -201,14 +199,14 @@ def _summed(iterates: _Iterates, centre: int, theta: float, derivative: int) -> 
     for m in range(1, iterates.most + 1):
         window = [iterates.node(j) for j in range(centre - m, centre + m + 1)]
         w = weights(torch.arange(-m, m + 1, dtype=torch.float64), theta)[derivative].tolist()
-        # differences to the centre: a sum with weights that add up to 0 or 1 then loses no digits
+        # The weights add up to 0 or 1. Summing differences to the centre avoids cancellation.
         total = sum(weight * (x - middle) for weight, (x, _) in zip(w, window, strict=True))
         sound = torch.stack([status == Status.CONVERGED for _, status in window]).all(0)
         total = total + (middle if derivative == 0 else 0.0)
         found.append(torch.where(sound[..., None], total, torch.nan))
         if m > 1:
             change.append(((found[-1] - found[-2]).abs() / size).amax(-1).detach().nan_to_num(torch.inf))
-            if not iterates.fixed and bool((torch.stack(change).amin(0) <= AGREED).all()):
+            if not iterates.fixed and bool((torch.stack(change).amin(0) <= ROUNDING).all()):
                 break
     values, differences = torch.stack(found), torch.stack(change)
     best = differences.argmin(0)
@@ -219,19 +217,20 @@ def _summed(iterates: _Iterates, centre: int, theta: float, derivative: int) -> 
 
 
 class FractionalStepper(OneStepMethod):
-    """Steps of any length along the motion of a `ContinuousEquation`: whole steps of L_d, and parts between.
+    """Steps of any length along the motion of a `ContinuousEquation`: whole steps of L_d, and fractions of a step.
 
-    A rollout keeps the iterates of the start, and costs the whole steps over the time, at most `MOST` on either side,
-    and sums.
-    The status is `UNRESOLVED` where two orders differ by more than `tolerance`, relative to a whole step.
+    A rollout keeps the iterates of its start: the cost is one whole step for each h of the duration, up to
+    `MAX_NEIGHBOURS` more on each side, and the sums. The status is `UNRESOLVED` where two orders differ by more than
+    `tolerance`, relative to a whole step.
     """
 
     def __init__(self, equation: ContinuousEquation, *, tolerance: float = 1e-6):
         self.equation, self.tolerance = equation, tolerance
-        self._last: tuple[Tensor, _Iterates, float, Tensor] | None = None  # the last q, its motion, time and ln σ
+        # The last q with its motion, time and ln σ: the next step of a rollout continues them.
+        self._last: tuple[Tensor, _Iterates, float, Tensor] | None = None
 
-    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
-        """A step of a scalar h > 0."""
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
+        """One step of a scalar h > 0; `guess` is not used."""
         state = check_state(state)
         size = check_h(h, state.q)
         if size.ndim:
@@ -255,8 +254,8 @@ class FractionalStepper(OneStepMethod):
 
 
 def _parts(time: float) -> tuple[int, float]:
-    """The whole steps of a time in steps, and the rest, 0 for a multiple."""
+    """The whole steps of a time in units of h, and the rest, 0 for a multiple."""
     whole = round(time)
-    if abs(time - whole) <= WHOLE * max(time, 1.0):
+    if abs(time - whole) <= MULTIPLE_TOLERANCE * max(time, 1.0):
         return whole, 0.0
     return int(time), time - int(time)
