@@ -74,7 +74,6 @@ def test_only_the_door_differentiates_lagrangians():
         "stepping/linearise.py",  # the derivative of a step
         "theory/continuous.py",  # a continuous Hamiltonian
         "training/problems/one_step.py",  # with respect to parameters
-        "training/solvers/matrix_free.py",  # the same
         "training/equation_numbers.py",  # the same
         "training/problems/joint_masses.py",  # the same
         "training/kernel.py",  # the same

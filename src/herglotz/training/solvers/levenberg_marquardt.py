@@ -18,7 +18,7 @@ FREE, LEFT = 1e-6, 0.01  # damping of steps that are Newton's, and the share of 
 
 
 class ByProducts(Protocol):
-    """A matrix JᵀJ that is known by its products (`matrix_free`)."""
+    """A matrix JᵀJ with a structure of its own, which its products and its solver use."""
 
     def __matmul__(self, v: Tensor, /) -> Tensor:
         """JᵀJ v."""
