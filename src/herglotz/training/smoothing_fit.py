@@ -31,7 +31,7 @@ from herglotz.training.trajectory_fit import LOST, STAGE
 ROUNDS = 8  # rounds of the estimate of both noises, which starts with steps as noisy as the data
 FALL = 10.0  # largest factor by which the noise of the steps falls in a round: a poor model explains too little
 SETTLED = 0.1  # the rounds end where the logarithm of that noise changes by less
-SMOOTHED = 20_000  # most numbers in q: a held-out fifth of them is solved for at once (1.3 GB, a few times)
+MAX_NUMBERS = 20_000  # most numbers in q: a held-out fifth of them is solved for at once (1.3 GB, a few times)
 LEAST = 1e-2  # least noise of the steps over that of the data: below, the states are a motion of the model
 FLOOR = 1e-8  # least σ relative to the largest |q|: rounding
 
