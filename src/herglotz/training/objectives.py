@@ -20,7 +20,8 @@ from herglotz.training.smoothing_fit import SmoothingFit, fit_smoothing
 from herglotz.training.task import Task, with_sticking
 from herglotz.training.trajectory_fit import TrajectoryFit, fit_states, fit_trajectories
 
-LOOSE = 0.02  # σ of the short fits that others start from, relative to the motion's size: they shall not follow noise
+# σ of the short fits that others start from, relative to the motion's size: these fits must not follow noise.
+LOOSE = 0.02
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Fitted:
 
 
 def fit_by_one_step(task: Task, seen: Look, plan: Plan) -> Fitted:
-    """Minimise one-step errors; then fit the states, so that the free run does not start from two noisy samples."""
+    """Minimise one-step errors, then fit the states: a free run must not start from two noisy samples."""
     raw = plan.objective == "raw"
 
     def problem(model: ContactLagrangian) -> OneStep:
@@ -71,7 +72,8 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     if task.config.sticking:
         model = with_sticking(model, excess=not plan.fitted_before)
     found = fit_trajectories(task, model, sigma, known=plan.fitted_before)
-    if found is None:  # the model keeps the parameters of the one-step fit
+    # A model that is lost keeps the parameters of the one-step fit.
+    if found is None:
         return _lost(task, model, "trajectory", sigma, "the model cannot follow the data over 20 steps")
     problem = found.fit.problem
     notes = _chosen(found, found.fit) | {"segment_steps": problem.grid.longest, "follows_data": True}
@@ -106,13 +108,13 @@ def _one_step_start(task: Task, plan: Plan) -> tuple[ContactLagrangian, float]:
 
 
 def _lost(task: Task, model: ContactLagrangian, objective: str, sigma: float, why: str) -> Fitted:
-    """The recorded positions in place of states, for a model that follows none of them."""
+    """The result for a model that does not follow the data, whose states are read off the recorded positions."""
     states = states_of_pairs(model, task.data)
     return Fitted(model, states, objective, sigma, {"reason": why, "follows_data": False})
 
 
 def _chosen(found: Chosen, fit: TrajectoryFit | SmoothingFit) -> dict[str, Any]:
-    """What is told of the strength of the prior, held-out RMS by strength, and the end; the model gets its numbers."""
+    """Write the parameters into the model; return the prior's strength, held-out RMS by strength, and the reason."""
     fit.problem.parameters.set(fit.theta)
     held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
     notes = {"departure": found.departure, "held_out_rms": held_out, "reason": fit.result.reason}

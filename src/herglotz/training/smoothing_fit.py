@@ -1,8 +1,8 @@
 """Fitting the parameters and every state at once: joint smoothing, for data that no model follows for long.
 
-Multiple shooting asks for a motion of the model in every segment. Here each step may be off by a little process noise,
-so that pushes, chaos and forces that the model does not know stay where they are (weak-constraint estimation, Trémolet
-2006; for parameters of differential equations Ramsay et al. 2007). The price: what process noise explains is not
+Multiple shooting asks for a motion of the model in every segment. Here each step may be off by a little process noise:
+pushes, chaos and unknown forces stay in the steps in which they act (weak-constraint estimation, Trémolet 2006; for
+parameters of differential equations Ramsay et al. 2007). The price is that a force which process noise explains is not
 learned.
 """
 
@@ -28,19 +28,25 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import LOST, STAGE
 
-ROUNDS = 8  # rounds of the estimate of both noises, which starts with steps as noisy as the data
-FALL = 10.0  # largest factor by which the noise of the steps falls in a round: a poor model explains too little
-SETTLED = 0.1  # the rounds end where the logarithm of that noise changes by less
-MAX_NUMBERS = 20_000  # most numbers in q: a held-out fifth of them is solved for at once (1.3 GB, a few times)
-LEAST = 1e-2  # least noise of the steps over that of the data: below, the states are a motion of the model
-FLOOR = 1e-8  # least σ relative to the largest |q|: rounding
+# Rounds of the estimate of both noises, which starts with steps as noisy as the data.
+ROUNDS = 8
+# Largest factor by which the noise of the steps falls in a round: a poor model explains too little.
+FALL = 10.0
+# The rounds end where the logarithm of that noise changes by less.
+SETTLED = 0.1
+# Most numbers in q: a held-out fifth of them is solved for at once (1.3 GB, a few times).
+MAX_NUMBERS = 20_000
+# Least noise of the steps over that of the data: below, the states are a motion of the model.
+LEAST = 1e-2
+# Least σ relative to the largest |q|: rounding.
+FLOOR = 1e-8
 
 
 @dataclass(frozen=True)
 class SmoothingFit:
     """A fit of parameters and all states at one noise of the steps and one strength of the prior."""
 
-    x: Tensor  # unknowns of the problem: parameters, then states
+    x: Tensor  # (unknowns,) parameters, then states
     problem: SmoothingProblem
     result: OptimiserResult
 
@@ -50,7 +56,7 @@ class SmoothingFit:
         return self.problem.unpack(self.x)[0]
 
     def follows_data(self) -> bool:
-        """Whether free runs from the first states stay within a factor of the noise: whether the model is enough."""
+        """Whether free runs from the first states stay within a factor of the noise, without process noise."""
         problem, states = self.problem, self.problem.unpack(self.x)[1]
         start = state_of(problem.with_s(states[:, 0]))
         with torch.no_grad():
@@ -75,12 +81,11 @@ class SmoothingFit:
 
 
 def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[SmoothingFit] | None:
-    """Fit parameters and all states to positions, and find both noises, the steps' from as much as the data's on.
+    """Fit parameters and all states to positions, and estimate the noise of the data and that of the steps.
 
-    With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. Every prior
-    strength is then fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted with.
-    The strongest whose held-out error is not beaten beyond its spread wins (`cross_validation`). None where a step near
-    the data has no solution.
+    With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. The weakest prior
+    gives the noises. Every prior strength is then fitted in turn, the weakest first, and the strongest whose held-out
+    error is not beaten beyond its spread wins (`cross_validation`). None where a step near the data has no solution.
     """
     config = task.config
     departures = config.departures if model.potential.network is not None else config.departures[:1]
@@ -128,10 +133,10 @@ def _minimised(task: Task, name: str, problem: SmoothingProblem, x: Tensor | Non
 
 
 def _noises(fit: SmoothingFit) -> tuple[float, float]:
-    """Standard deviations of the data's noise, and of the steps' relative to it, where the evidence is stationary.
+    """Standard deviations of the data's noise, and of the steps' noise relative to it, at stationary evidence.
 
-    Of the N·n values recorded, the states take tr H (the sum of their variances over σ²), of which the starts have S·d
-    and the steps' noise the rest: σ² = Σ r² / (N·n − tr H) and w² = Σ e² / (tr H − S·d), as in MacKay (1992).
+    The states use tr H (the sum of their variances over σ²) of the N·n recorded values; the starts use S·d of these and
+    the noise of the steps the rest: σ² = Σ r² / (N·n − tr H) and w² = Σ e² / (tr H − S·d), as in MacKay (1992).
     """
     problem = fit.problem
     misfit, (_, matrix, _) = problem.misfit(fit.x), problem.normal_equations(fit.x, held=True)
@@ -143,7 +148,7 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     sigma = math.sqrt(float((used * misfit.square()).sum()) / max(free, 0.1 * misfit.numel()))
     defect = problem.defects(fit.x)
     by = problem.root_weights(defect).square()
-    w = problem.process * problem.sigma  # in the units of σ
+    w = problem.process * problem.sigma
     w *= math.sqrt(float((by * defect.square()).sum()) / max(taken - starts, 0.01 * starts))
     sigma = max(sigma, problem.sigma / FALL)
     return sigma, max(w / sigma, LEAST)

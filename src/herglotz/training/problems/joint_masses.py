@@ -1,4 +1,4 @@
-"""The masses that momenta at the joints of segments are over, and how they change with the parameters."""
+"""The masses that momenta at the joints of segments are divided by, and their derivatives by the parameters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from herglotz.models.mass import PositionKinetic
 from herglotz.models.terms import Kinetic
 from herglotz.training.parameter_vector import ParameterVector
 
-FEW = 8  # samples that say how large a mass is
+# Samples over which a mass is averaged.
+FEW = 8
 
 
 class JointMasses:
@@ -25,7 +26,7 @@ class JointMasses:
 
     @property
     def move(self) -> bool:
-        """Whether the parameters say how large a mass is: the first coordinate's is 1."""
+        """Whether the masses depend on the parameters; the mass of the first coordinate is 1."""
         return self.q.shape[1] > 1 and self.parameters.model.config.baseline
 
     def at(self, theta: Tensor) -> Tensor:
