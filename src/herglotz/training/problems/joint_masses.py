@@ -6,7 +6,7 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
+from torch.func import functional_call, jacrev
 
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.mass import PositionKinetic
@@ -38,17 +38,7 @@ class JointMasses:
 
     def slopes(self, theta: Tensor) -> Tensor:
         """∂ log mass / ∂θ, (n, P)."""
-        rows = []
-        with torch.enable_grad():
-            at = theta.detach().requires_grad_()
-            for mass in self.at(at).log():
-                known = (
-                    torch.autograd.grad(mass, at, retain_graph=True, allow_unused=True)[0]
-                    if mass.requires_grad
-                    else None
-                )
-                rows.append(torch.zeros_like(theta) if known is None else known)
-        return torch.stack(rows)
+        return jacrev(lambda x: self.at(x).log())(theta)
 
 
 class _Mass(nn.Module):
