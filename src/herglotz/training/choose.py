@@ -37,6 +37,8 @@ NETWORKS = {
     "covered": "the baseline's motions fill the holes between samples: one wide layer learns more",
     "correction": "exact steps show what the rule of order 2 misses",
 }
+# How an objective uses the strengths of the prior.
+PRIORS = {"trajectory": "held-out blocks of time choose among them", "smoothing": "smoothing uses the weakest"}
 # Settings that the search for terms decides.
 AS_FOUND = ("order", "features", "drag", "absent", "dissipation")
 
@@ -93,7 +95,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures, dissipation=c.dissipation,
         input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros, drifts=seen.drifts,
-        reasons=_reasons(seen, user_settings, named=named, one_step=one_step) | {
+        reasons=_reasons(seen, user_settings, named, objective) | {
             "objective": why,
             "network": NETWORKS[network],
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
@@ -103,9 +105,8 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     )  # fmt: skip
 
 
-def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: bool) -> dict[str, str]:
+def _reasons(seen: Look, user_settings: FitConfig, named: bool, objective: str) -> dict[str, str]:
     """The reasons of those fields of a plan that the look at the data decides."""
-    prior = "one-step fits use the last" if one_step else "held-out blocks of time choose among them"
     changed = {name for name in AS_FOUND if getattr(seen.settings, name) != getattr(user_settings, name)}
     why = seen.structure or AS_SET
     return {name: why if name in changed else AS_SET for name in AS_FOUND} | {
@@ -120,7 +121,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),
         "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
-        "departures": "there is no network" if named else prior,
+        "departures": "there is no network" if named else PRIORS.get(objective, "one-step fits use the last"),
     }
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -22,26 +20,6 @@ STAY = 20
 SURE = 10
 # A weaker prior or a richer level must lower the error by more than this factor.
 MARGIN = 1.05
-
-
-class Judged(Protocol):
-    """A fit that gives its errors over held-out blocks of time."""
-
-    def held_out_errors(self) -> Tensor:
-        """Return the RMS of every fold, (FOLDS,), in units of q."""
-        ...
-
-
-F = TypeVar("F", bound=Judged)
-
-
-@dataclass(frozen=True)
-class Chosen(Generic[F]):
-    """The fit with the strength of the prior that held-out blocks chose, and the errors of all strengths."""
-
-    fit: F
-    departure: float
-    held_out: dict[float, Tensor]  # (FOLDS,) in units of q
 
 
 def held_out_errors(
@@ -153,20 +131,3 @@ def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
     """Return the smallest key (the strongest prior) whose held-out errors the best errors do not beat."""
     best = min(errors, key=lambda k: float(errors[k].square().mean()))
     return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))
-
-
-def strongest_not_beaten(departures: Sequence[float], fit: Callable[[float], F | None]) -> Chosen[F] | None:
-    """Fit every strength of the prior, the weakest first; return the strongest that the best strength does not beat.
-
-    None where no fit succeeds.
-    """
-    fits: dict[float, F] = {}
-    held_out: dict[float, Tensor] = {}
-    for departure in sorted(departures, reverse=True):
-        found = fit(departure)
-        if found is not None:
-            fits[departure], held_out[departure] = found, found.held_out_errors()
-    if not fits:
-        return None
-    chosen = simplest_not_beaten(held_out)
-    return Chosen(fits[chosen], chosen, held_out)

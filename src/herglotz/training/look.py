@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from herglotz.data.roughness import roughness
 from herglotz.data.sensors import measured
 from herglotz.data.spikes import spikes
 from herglotz.data.windows import Triples
+from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline, across_translations, estimate_baseline, outliers_pull
 from herglotz.training.baseline_motion import fit_baseline_motion
@@ -23,7 +25,6 @@ from herglotz.training.hold import with_arrival
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import MANY
-from herglotz.training.smoothing_fit import MAX_NUMBERS
 from herglotz.training.stages import Stages
 from herglotz.training.structure import (
     Structure,
@@ -35,8 +36,9 @@ from herglotz.training.structure import (
     terms_are_free,
 )
 from herglotz.training.task import NOISY, Task, drag_starts_the_fit
-from herglotz.training.trajectory_fit import check_size
 
+# Most numbers in q: states, derivatives and held-out residuals take 15 kB of memory each (measured).
+MOST = 300_000
 # Iterations of the short one-step fits: the probe measures the noise, and other fits start from the rest.
 PROBE = 40
 # The baseline explains exact data if its error is below this multiple of the σ of exact data.
@@ -124,7 +126,7 @@ def _seen(
     zeros, drifts = (zeros, drifts) if plan is None else (plan.zeros, plan.drifts)
     recorded, (data, arrival, why) = data, _read(measured(data, zeros, drifts=drifts), settings)
     train, unseen = split(data, settings)
-    check_size(train, *([MAX_NUMBERS] if settings.objective == "smoothing" else []))
+    _check_size(train)
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
     kept, drag = train.keep(~dropped), drag_starts_the_fit(settings)
     outliers = settings.robust == "on" or bool(dropped.any())
@@ -170,6 +172,21 @@ def _read(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Arriva
 def split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Trajectories | None]:
     """The first part of every trajectory, which is fitted, and the rest; None where nothing is held out."""
     return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
+
+
+def _check_size(data: Trajectories) -> None:
+    """Refuse more than `MOST` numbers in q, for which there is no memory.
+
+    InputError names how many samples there are, how many can be, and which thinning leaves as many.
+    """
+    allowed = MOST // data.dof
+    if data.samples <= allowed:
+        return
+    every = math.ceil(data.samples / allowed)
+    raise InputError(
+        f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinates, for 5 GB of memory; "
+        f"thin them (--every {every}, Trajectories.thinned) or take fewer"
+    )
 
 
 def _with_terms(

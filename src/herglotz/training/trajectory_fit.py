@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, spread
-from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
-from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
+from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.problems.grid import segment_grid, segment_lengths
 from herglotz.training.problems.least_squares import StatesOnly
@@ -23,7 +21,6 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import Task
 
-MOST = 300_000  # numbers in q: states, derivatives and held-out residuals take 15 kB of memory each (measured)
 LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
 FOLLOWED = 0.05  # of the spread of q: segments that miss less follow the motion, and grow on to simulation error
 FLOOR = 1e-6  # of the largest |q|: errors below it are no reason to stop growing segments
@@ -75,19 +72,13 @@ class TrajectoryFit:
         return held_out_errors(problem, self.path, self.theta, A)
 
 
-def check_size(data: Trajectories, most: int = MOST) -> None:
-    """That there are no more than `most` numbers in q, which memory is for.
+@dataclass(frozen=True)
+class Chosen:
+    """The fit with the strength of the prior that held-out blocks chose, and the errors of all strengths."""
 
-    InputError names how many samples there are, how many can be, and which thinning leaves as many.
-    """
-    allowed = most // data.dof
-    if data.samples <= allowed:
-        return
-    every = math.ceil(data.samples / allowed)
-    raise InputError(
-        f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinates, for 5 GB of memory; "
-        f"thin them (--every {every}, Trajectories.thinned) or take fewer"
-    )
+    fit: TrajectoryFit
+    departure: float
+    held_out: dict[float, Tensor]  # (FOLDS,) in units of q
 
 
 class SegmentStages:
@@ -113,13 +104,12 @@ class SegmentStages:
         freedom: float | None,
         before: TrajectoryFit | None,
         used: Tensor | None = None,
-        begin: Trajectories | None = None,
         *,
         near: bool = False,
     ) -> TrajectoryFit | None:
-        """Segments of one length, from the states of the stage before or read off `begin`; None where no path is found.
+        """Segments of one length, from the states of the stage before or of the data; None where no path is found.
 
-        `begin` is the data or, less noisy, the same smoothed; `near`: see `optimise`.
+        `near`: see `optimise`.
         """
         task = self.task
         grid = segment_grid(task.data, length, task.base.model_step)
@@ -129,8 +119,8 @@ class SegmentStages:
         )  # fmt: skip
         if before is None:
             start = problem.parameters.get()
-            states = first_states(problem, start, begin)
-            problem.guess_from_states(states_of_pairs(self.model, begin or task.data))
+            states = first_states(problem, start)
+            problem.guess_from_states(states_of_pairs(self.model, task.data))
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
             problem.guess_from(before.problem, before.path)
@@ -197,18 +187,16 @@ class SegmentStages:
             return None
         return None if float(rest.problem.joint_residuals(rest.path, rest.theta).abs().max()) > FAR else rest
 
-    def at_once(
-        self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
-    ) -> TrajectoryFit | None:
+    def at_once(self, sigma: float) -> TrajectoryFit | None:
         """Whole trajectories from parameters that are known; None where no path is found.
 
         The states alone are fitted first: together with them, parameters would make up for poor starts.
         """
         states = SegmentStages(self.task, self.model, frozen=True, label=f", states{self.label}")
         states.patient, states.hurried, self.patient = False, True, False
-        before = states.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
+        before = states.fit(self.lengths[-1], sigma, None, None)
         near = not self.model.capabilities.sticking  # its kinks leave Newton's steps no descent
-        found = None if before is None else self.fit(self.lengths[-1], sigma, freedom, before, near=near)
+        found = None if before is None else self.fit(self.lengths[-1], sigma, None, before, near=near)
         self.patient = True
         return found
 
@@ -245,9 +233,7 @@ def fit_states(task: Task, model: ContactLagrangian, sigma: float, s: Tensor | N
     return None if first is None else stages.grow(first, sigma)
 
 
-def fit_trajectories(
-    task: Task, model: ContactLagrangian, sigma: float, *, known: bool = False
-) -> Chosen[TrajectoryFit] | None:
+def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float, *, known: bool = False) -> Chosen | None:
     """Fit parameters and states to positions.
 
     Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
@@ -291,8 +277,14 @@ def fit_trajectories(
             return Chosen(strongest, least, held_out)
     # The weakest prior twice: the first round finds the noise, which then stays the same for all.
     noise = (fit("noise", max(departures)) or last).noise
-    found = strongest_not_beaten(departures, lambda departure: fit(f"prior {departure:g}", departure))
-    return found or Chosen(last, departures[0], {})
+    fits, held_out = {}, {}
+    for departure in sorted(departures, reverse=True):
+        if (found := fit(f"prior {departure:g}", departure)) is not None:
+            fits[departure], held_out[departure] = found, found.held_out_errors()
+    if not fits:
+        return Chosen(last, departures[0], {})
+    strongest = simplest_not_beaten(held_out)
+    return Chosen(fits[strongest], strongest, held_out)
 
 
 def _longest(
