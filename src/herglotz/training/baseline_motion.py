@@ -34,12 +34,16 @@ STARTS = 256
 
 @dataclass(frozen=True)
 class BaselineMotion:
-    """The baseline's equation of motion with parameters fitted to triples of positions."""
+    """The baseline's equation of motion with parameters fitted to triples of positions.
+
+    A step of the data has `substeps` Runge–Kutta steps. `error` is the RMS of the third position that the equation
+    predicts for the data's triples, in units of q.
+    """
 
     angles: Tensor  # (n,) bool
     parameters: Tensor  # (3, n): k, b and the one rate γ, repeated
-    substeps: int  # Runge–Kutta steps a step of the data
-    error: float = math.inf  # RMS of the predicted third position over the data's triples, in units of q
+    substeps: int
+    error: float = math.inf
 
     def triples(self, data: Trajectories, base: Baseline) -> Triples:
         """Return triples from quasi-random states in the range of the data and a little beyond."""

@@ -26,7 +26,7 @@ def held_out_errors(
     problem: ShootingProblem,
     path: Path,
     theta: Tensor,  # (P,)
-    A: Tensor | Arrowhead,  # JᵀJ of the whole problem at the fit, prior included
+    A: Tensor | Arrowhead,  # (unknowns, unknowns) JᵀJ at the fit, prior included
 ) -> Tensor:
     """Return the RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
 
@@ -96,7 +96,7 @@ def without_rows(H: Tensor, r: Tensor) -> Tensor:
 def left_out_errors(
     r: Tensor,  # (N·n,) residuals of the data, in the order of the samples
     data: Trajectories,
-    left_out: Callable[[Tensor], Tensor],  # residuals of some of their rows, given as bool (N·n,), without them
+    left_out: Callable[[Tensor], Tensor],  # (N·n,) bool, some rows → their residuals without them
     stay: Tensor | None = None,  # (N·n,) bool, rows that are in no fold
 ) -> Tensor:
     """RMS of r in each fold if its rows had been left out, (FOLDS,).

@@ -47,10 +47,10 @@ EXPLAINED = 100.0
 
 @dataclass(frozen=True)
 class Probe:
-    """A short one-step fit with a flexible correction, whose remaining error is noise."""
+    """A short one-step fit with a flexible correction, whose remaining error `rms`, in units of q, is noise."""
 
     model: ContactLagrangian
-    rms: float  # one-step error, in units of q
+    rms: float
     residuals: int
     unknowns: int
 
@@ -62,26 +62,37 @@ class Probe:
 
 @dataclass(frozen=True)
 class Look:
-    """The properties of the data that a plan depends on."""
+    """The properties of the data that a plan depends on.
 
-    data: Trajectories  # all samples, angles unwrapped, with the inputs as they act
-    train: Trajectories  # the first part of every trajectory
-    unseen: Trajectories | None  # the rest; None: nothing is held out
-    kept: Trajectories  # the training part without single spikes
+    `data` are all samples, with angles unwrapped, inputs as they act, and positions without `zeros` and `drifts` of the
+    sensors. `train` is the first part of every trajectory, `unseen` the rest (None: nothing is held out), and `kept`
+    the training part without single `spikes`; `outliers`: there may be more. `arrival` is what happens to recorded
+    inputs before they act, and `turning` is False where angles were found to be positions on a line; `why` has the
+    reasons, also of zeros and drifts. `noise` is the RMS residual of polynomials through nine samples, in units of q,
+    an upper bound of the noise. `settings` are the user's, with the level and the structure that the data call for;
+    `base` has sizes and starting values. `structure` says in words what was found about the terms (None: no terms were
+    searched), and `found` are named terms that follow whole trajectories. `baseline_motion` are motions of a baseline
+    that explains exact data, with their error; `probe` is None where the objective is known without it.
+    """
+
+    data: Trajectories
+    train: Trajectories
+    unseen: Trajectories | None
+    kept: Trajectories
     spikes: Tensor  # (N_train,) bool
-    outliers: bool  # there may be more outliers than single spikes
-    arrival: Arrival  # what happens to recorded inputs before they act
-    why: dict[str, str]  # reasons of the arrival, and of what the search found about the recording
-    zeros: tuple[float, ...]  # (B · n) what the sensors read at 0, recording after recording; empty: 0; `data` has q
-    drifts: tuple[float, ...]  # (n) rates at which these zeros drift; empty: 0; `data` is without
-    noise: float  # RMS residual of polynomials through nine samples, in units of q: an upper bound of the noise
-    settings: FitConfig  # the user's, with the level and the structure that the data call for
-    base: Baseline  # sizes and starting values
-    turning: bool = True  # angles turn; False: they were found to be positions on a line
-    structure: str | None = None  # what was found about the terms, in words; None: no terms were searched
-    found: Structure | None = None  # named terms that follow whole trajectories
-    baseline_motion: tuple[Triples, float] | None = None  # motions of a baseline that explains exact data; their error
-    probe: Probe | None = None  # None: the objective is known without it
+    outliers: bool
+    arrival: Arrival
+    why: dict[str, str]
+    zeros: tuple[float, ...]  # (B · n), recording after recording; empty: 0
+    drifts: tuple[float, ...]  # (n) rates of the zeros; empty: 0
+    noise: float
+    settings: FitConfig
+    base: Baseline
+    turning: bool = True
+    structure: str | None = None
+    found: Structure | None = None
+    baseline_motion: tuple[Triples, float] | None = None
+    probe: Probe | None = None
 
     def task(self, stages: Stages) -> Task:
         """What the stages of a fit to these data share."""

@@ -71,19 +71,26 @@ READING = ("hold", "input_terms", "zeros", "drifts", "turning")
 
 
 class Structure(NamedTuple):
-    """The terms and starting values that were found, and how the recording is to be read for them."""
+    """The terms and starting values that were found, and how the recording is to be read for them.
 
-    config: FitConfig  # the settings with the features, the order and the objective that the data call for
-    base: Baseline  # with starting values
-    reason: str  # in words and numbers
-    sigma: float | None = None  # misfit of whole trajectories, where these were fitted
-    hold: str = ""  # of inputs, where these terms miss the data by far less with it than with the hold that was tried
-    input_terms: tuple[str, ...] = ()  # of inputs, which these terms ask for beside the recorded inputs
-    zeros: tuple[float, ...] = ()  # (B · n) of the sensors, which differ between recordings
-    drifts: tuple[float, ...] = ()  # (n,) rates at which these zeros drift
-    turning: bool = True  # angles turn; False: terms of positions on a line, as of a free spring, miss the data by less
-    why: tuple[tuple[str, str], ...] = ()  # names of these five, each with its reason
-    compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`compared_models`)
+    `config` are the settings with the features, the order and the objective that the data call for, `base` has starting
+    values, and `reason` says so in words and numbers. `sigma` is the misfit of whole trajectories, where these were
+    fitted. For these terms inputs have another `hold` ("": the same) and further `input_terms`, sensors have `zeros`
+    that differ between recordings, and `drifts`, and angles are `turning` or positions on a line; `why` has pairs of a
+    name of these five and its reason. `compared` are the models that a search compared (`compared_models`).
+    """
+
+    config: FitConfig
+    base: Baseline
+    reason: str
+    sigma: float | None = None
+    hold: str = ""
+    input_terms: tuple[str, ...] = ()
+    zeros: tuple[float, ...] = ()  # (B · n)
+    drifts: tuple[float, ...] = ()  # (n,) rates of the zeros
+    turning: bool = True
+    why: tuple[tuple[str, str], ...] = ()
+    compared: Sequence[dict[str, Any]] = ()
 
     @property
     def reading(self) -> dict[str, Any]:

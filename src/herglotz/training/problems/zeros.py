@@ -80,7 +80,7 @@ def by_zeros(problem: ShootingProblem, which: Tensor, grow: Tensor) -> tuple[Ten
     assert problem._at is not None
     count = int(which.max()) + 1
     fit = problem._missed_by(problem.path.x)
-    by = problem.weight * problem.root_weights(fit) / problem.deviations  # ∂r/∂z
+    by = problem.weight * problem.root_weights(fit) / problem.deviations  # (N, n) ∂r/∂z
     slopes = problem.slopes_at_samples(problem._at[: problem.P], problem.path)
     rows = slopes * (by.square() * grow[:, None])[..., None]  # (N, n, P + d)
     segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
