@@ -10,9 +10,9 @@ from herglotz.training.baseline import Differences, differences
 
 
 def acceleration_terms(data: Trajectories) -> Differences:
-    """Stiffness, tilt, damping and inputs as `estimate_baseline` has them, and a little more of each coordinate's own.
+    """The terms of `estimate_baseline`, and for each coordinate second harmonics or powers, and its own friction.
 
-    Each coordinate has its own second harmonics (angles) or powers (lengths), viscous and quadratic friction.
+    Angles have second harmonics, lengths the powers 2 and 3; friction is viscous and quadratic.
     """
     found = differences(data)
     own = []

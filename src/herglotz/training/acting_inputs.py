@@ -1,7 +1,8 @@
 """The terms of inputs that a search offers, and the levels at which inputs saturate.
 
-A level is found twice: where terms of the inputs and a few of each coordinate, by least squares, leave the least of the
-smoothed accelerations; and from there, where the model with the terms that it has taken misses the motion least.
+A level is found in two steps. By least squares, terms of the inputs and a few terms of each coordinate explain the
+smoothed accelerations; the level with the least residual is the first guess. Near that guess the model with the terms
+that were taken is fitted at other levels; the level with the least misfit is taken.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from herglotz.training.acceleration_terms import acceleration_terms, for_each
 from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.trials import Trial, Variant
 
-LEVELS = 24  # of an input, tried between a twentieth of its largest value and that
-LOWEST = 0.05  # of the largest value of an input: the least level that is tried
-AROUND = 1.5  # factor to either side of its first guess within which a level is sharpened
-ROUNDS = 16  # of golden sections, which leave 0.05 % of that range
-GOLDEN = (5**0.5 - 1) / 2  # of an interval, to its inner point
+# Levels of an input that are tried, and the least level over the largest value of the input.
+LEVELS, LOWEST = 24, 0.05
+# A level is sharpened within this factor to either side of the first guess.
+AROUND = 1.5
+# Golden sections: 16 leave 0.05 % of that range.
+SECTIONS, GOLDEN = 16, (5**0.5 - 1) / 2
 
 
 class Driven(Protocol):
@@ -58,7 +60,7 @@ def offered_terms(data: Trajectories) -> tuple[str, ...]:
 
 
 def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
-    """What is left of accelerations (T, n) by columns (T, n, k) and one more (T,) with a coefficient a coordinate."""
+    """Mean square of accelerations (T, n) after a fit of columns (T, n, k) and `more` (T,) of each coordinate."""
     A = torch.cat([columns, for_each(more[:, None, None].expand(-1, a.shape[1], 1))], -1).flatten(0, 1)
     size = A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
     y = a.reshape(-1, 1)
@@ -66,9 +68,9 @@ def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
 
 
 def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
-    """The terms of the inputs that a model with all of them among its offers has taken, if it is better than a trial.
+    """The terms of the inputs that a model takes if all are offered; () if the model is no better than the trial.
 
-    Each level is one more number of it.
+    Each level counts as one more number of the model.
     """
     every = offered_terms(search.data)
     if not every:
@@ -78,7 +80,8 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
         return ()
     if any(map(saturation, _taken(found, every))):
         every = _sharpened(search, found, every)
-    while 0 < len(taken := _taken(found, every)) < len(every):  # terms that made up for others leave with those
+    # Without the terms that left, terms that made up for these may leave, too.
+    while 0 < len(taken := _taken(found, every)) < len(every):
         fewer = _with(search, taken, trial)
         if fewer is None or found.replaces(fewer):
             break
@@ -87,9 +90,9 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
 
 
 def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
-    """A model with these terms of the inputs among its offers, which join a trial that is near the data.
+    """A model with these terms of the inputs among its offers.
 
-    Else they join the simplest model over ever longer segments.
+    The terms join a trial that is near the data, or else the simplest model over ever longer segments.
     """
     other = search.driven_by(terms)
     if trial.near and (same := other.again(beside(trial, len(terms)))) is not None:
@@ -99,7 +102,7 @@ def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
 
 
 def beside(trial: Trial, more: int) -> Trial:
-    """The trial with the names that its numbers of inputs have where there are so many more inputs."""
+    """The trial with its input coefficients renamed for so many more inputs."""
     columns = len(trial.fitter.data.input_labels)
 
     def renamed(name: str) -> str:
@@ -112,7 +115,7 @@ def beside(trial: Trial, more: int) -> Trial:
 
 
 def _taken(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
-    """The terms, of `every` one, whose gains are among the offers that a model has taken; its last inputs are they."""
+    """Those terms of `every` whose gains a model has taken; the last inputs of its data are these terms."""
     columns = len(found.fitter.data.input_labels)
     gains = (int(name.partition("[")[2].rstrip("]")) % columns for name in found.taken if name.startswith(INPUTS))
     recorded = columns - len(every)
@@ -120,7 +123,7 @@ def _taken(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
 
 
 def _sharpened(search: Driven, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
-    """The terms with the levels, of those that a model has taken, at which it misses the data least."""
+    """The terms; those that a model has taken have the levels at which the model misses the data least."""
     terms = list(every)
     for term in _taken(found, every):
         if (of := saturation(term)) is None:
@@ -138,10 +141,10 @@ def _sharpened(search: Driven, found: Trial, every: Sequence[str]) -> tuple[str,
 
 
 def _least(f: Callable[[float], float], low: float, high: float) -> float:
-    """Where f is least between two numbers, by golden sections."""
+    """The minimum of f between two numbers, by golden sections."""
     x, y = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
     of_x, of_y = f(x), f(y)
-    for _ in range(ROUNDS):
+    for _ in range(SECTIONS):
         if of_x < of_y:
             high, y, of_y = y, x, of_x
             x = high - GOLDEN * (high - low)

@@ -1,9 +1,10 @@
 """Motions of the fitted baseline, as triples where there are no data.
 
-The correction is free wherever no triple has been: in a hole of the data, near a separatrix say, it errs most, and a
-rollout that crosses it never recovers. Where q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ (angles; −kᵢ qᵢ − bᵢ − γ q̇ᵢ for others)
-explains the recorded triples up to an RMS of σ_b, its own motions are expected to be as good elsewhere in their range:
-they join the objective as triples of that standard deviation. Baselines that explain less say nothing.
+The correction is free wherever no triple has been. It errs most in a hole of the data, near a separatrix for example,
+and a rollout that crosses the hole never recovers. If q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ (angles; −kᵢ qᵢ − bᵢ − γ q̇ᵢ
+for others) explains the recorded triples up to an RMS of σ_b, the motions of this equation are expected to be as good
+elsewhere in the range of the data: they join the objective as triples of the standard deviation σ_b. A baseline that
+does not explain the data adds no triples.
 """
 
 from __future__ import annotations
@@ -21,20 +22,28 @@ from herglotz.least_squares import least_squares
 from herglotz.progress import beat
 from herglotz.training.baseline import Baseline
 
-ROUNDS = 12  # Gauss–Newton iterations
-TURN = 0.02  # phase of the fastest motion in one Runge–Kutta step, rad: an error of about 1e-10 a triple
-BEYOND = 1.2  # factor by which energy and speed may exceed those of the data
-STARTS = 256  # number of triples for each coordinate
+# Gauss–Newton iterations.
+MAX_ITERATIONS = 12
+# Phase of the fastest motion in one Runge–Kutta step, rad: an error of about 1e-10 a triple.
+MAX_PHASE = 0.02
+# Factor by which energy and speed may exceed those of the data.
+BEYOND = 1.2
+# Number of triples for each coordinate.
+STARTS = 256
 
 
 @dataclass(frozen=True)
 class BaselineMotion:
-    """The baseline's equation of motion with parameters fitted to triples of positions."""
+    """The baseline's equation of motion with parameters fitted to triples of positions.
+
+    A step of the data has `substeps` Runge–Kutta steps. `error` is the RMS of the third position that the equation
+    predicts for the data's triples, in units of q.
+    """
 
     angles: Tensor  # (n,) bool
     parameters: Tensor  # (3, n): k, b and the one rate γ, repeated
-    substeps: int  # Runge–Kutta steps a step of the data
-    error: float = math.inf  # RMS of the predicted third position over the data's triples, in units of q
+    substeps: int
+    error: float = math.inf
 
     def triples(self, data: Trajectories, base: Baseline) -> Triples:
         """Return triples from quasi-random states in the range of the data and a little beyond."""
@@ -65,9 +74,9 @@ class BaselineMotion:
         return v.square() / 2 + (b * q.sin() - k * q.cos() if self.angles[i] else k * q.square() / 2 + b * q)
 
     def linearised(self, t: Triples, v: Tensor) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-        """Errors r of q2 (T, n), their slopes in k, b and γ (3, T, n), and the velocity v at q1 after a step of these.
+        """Errors r of q2 (T, n), their slopes in k, b and γ (3, T, n), and the velocity at q1 after a step of these.
 
-        The velocity that leads back to q0 is eliminated.
+        The velocity is eliminated: the motion always leads back to q0.
         """
         before, back = self._flow(t.q1, v, -t.h0, slopes=True)
         after, on = self._flow(t.q1, v, t.h1, slopes=True)
@@ -80,9 +89,9 @@ class BaselineMotion:
         return after - t.q2 + gain * missed, on[1:] - gain * back[1:], v_of
 
     def _flow(self, q: Tensor, v: Tensor, h: Tensor, slopes: bool = False) -> tuple[Tensor, Tensor]:
-        """Position (T, n) a time h (T,) later, by Runge–Kutta of order 4; slopes in v, k, b and γ, (4, T, n), or none.
+        """Position (T, n) a time h (T,) later, by Runge–Kutta of order 4, and (4, T, n) or (0, T, n) slopes.
 
-        Coordinates do not act on one another: each has its own four slopes.
+        The slopes are those in v, k, b and γ of the same coordinate: no coordinate acts on another.
         """
         (k, b, rate), angles, d = self.parameters, self.angles, (h / self.substeps)[:, None]
 
@@ -117,9 +126,9 @@ def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> Bas
     angles = torch.tensor(base.angles, device=data.t.device)
     parameters = t.q0.new_tensor([base.stiffness, base.tilt, (base.rate,) * n])
     fastest = max(max(v / x for v, x in zip(base.speed, base.scale, strict=True)), max(map(abs, base.stiffness)) ** 0.5)
-    substeps = math.ceil(float(torch.maximum(t.h0, t.h1).max()) * fastest / TURN)
+    substeps = math.ceil(float(torch.maximum(t.h0, t.h1).max()) * fastest / MAX_PHASE)
     v, best = _slopes(t), None
-    for k in range(ROUNDS):
+    for k in range(MAX_ITERATIONS):
         motion = BaselineMotion(angles, parameters, substeps)
         r, columns, v_of = motion.linearised(t, v)
         error = float(r.square().mean().sqrt())

@@ -10,7 +10,7 @@ from herglotz.training.trials import Compared, Fitter, Trial
 
 
 def compared_models(fitters: Iterable[Fitter], trial: Trial) -> list[dict[str, Any]]:
-    """The models that were scored over segments of the length of a trial, which is among them, by their size."""
+    """The models that were scored over segments of the length of a trial, and the trial itself, by their size."""
     rows: dict[frozenset[str], Compared] = {}
     for fitter in fitters:
         for row in fitter.compared:

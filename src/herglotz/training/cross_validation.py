@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -14,60 +12,45 @@ from herglotz.training.arrowhead import Arrowhead, dense
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
-FOLDS = 5  # held-out blocks: fifths of every trajectory, in time
-STAY = 20  # first samples of a driven trajectory, and half of its first fold at most, that are never left out
-SURE = 10  # times better than by σ: starts known so well are never left out
-MARGIN = 1.05  # a weaker prior or a richer level must lower the error by more than this factor
-
-
-class Judged(Protocol):
-    """A fit that knows its errors over held-out blocks of time."""
-
-    def held_out_errors(self) -> Tensor:
-        """Return the RMS of every fold, (FOLDS,), in units of q."""
-        ...
-
-
-F = TypeVar("F", bound=Judged)
-
-
-@dataclass(frozen=True)
-class Chosen(Generic[F]):
-    """The fit with the strength of the prior that held-out blocks chose, and the errors of all strengths."""
-
-    fit: F
-    departure: float
-    held_out: dict[float, Tensor]  # (FOLDS,) in units of q
+# Held-out blocks: fifths of every trajectory, in time.
+FOLDS = 5
+# First samples of a driven trajectory that are never left out, but at most half of the first fold.
+STAY = 20
+# A start is never left out if its deviation is smaller than σ by more than this factor.
+SURE = 10
+# A weaker prior or a richer level must lower the error by more than this factor.
+MARGIN = 1.05
 
 
 def held_out_errors(
     problem: ShootingProblem,
     path: Path,
     theta: Tensor,  # (P,)
-    A: Tensor | Arrowhead,  # JᵀJ of the whole problem at the fit, prior included
+    A: Tensor | Arrowhead,  # (unknowns, unknowns) JᵀJ at the fit, prior included
 ) -> Tensor:
     """Return the RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
 
     Fold j is the j-th fifth, in time, of every trajectory. To first order a least-squares fit without the rows B has
-    there the residual (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B (Allen's PRESS, for blocks). Blocks in time, because what a
-    deterministic model misses comes in long runs: single left-out samples, and a likelihood that takes residuals for
-    white noise, would both be fooled by their neighbours. Starts that are known far better than by σ are never left
-    out: a free run begins there.
+    there the residual (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B (Allen's PRESS, for blocks). The blocks are blocks of time, because the
+    residuals of a deterministic model are correlated over long times: neighbours of a single left-out sample would
+    foretell the sample. Starts whose deviation is far smaller than σ are never left out: a free run begins there.
     """
     r, G = _whitened(*data_rows(problem, path, theta), dense(A))
-    better = problem.better.flatten().to(r)  # counts in r and J, and not in errors in units of q
+    # The higher precision of known starts counts in r and J, and not in errors in units of q.
+    better = problem.better.flatten().to(r)
     errors = left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
     return errors * problem.sigma
 
 
 def foretold_errors(problem: ShootingProblem, path: Path, theta: Tensor, A: Tensor) -> Tensor:
-    """`held_out_errors` over what the fit without a fold expects there: (FOLDS,), 1 where residuals are white, of σ.
+    """`held_out_errors` over their expectation: (FOLDS,), 1 where residuals are white noise of σ.
 
-    With H = J_B A⁻¹ J_Bᵀ a fit without the rows B misses them by e = (I − H)⁻¹ r_B, whose covariance is (I − H)⁻¹ where
-    the model is true: this is the root of eᵀ(I − H) e / |B|. Where parameters are many, errors of left-out blocks are
-    large because these blocks tell what nothing else does.
+    With H = J_B A⁻¹ J_Bᵀ a fit without the rows B misses them by e = (I − H)⁻¹ r_B. If the model is true, e has the
+    covariance (I − H)⁻¹, and the result is the root of eᵀ(I − H) e / |B|. With many parameters left-out blocks
+    have large errors, because each block alone determines some parameters.
     """
-    size = A.diagonal().sqrt()  # weights of waves differ by many orders
+    # The prior's weights of waves differ by many orders of magnitude.
+    size = A.diagonal().sqrt()
     r, J = data_rows(problem, path, theta)
     r, G = _whitened(r, J.double() / size, A / size[:, None] / size)
     each = lambda rows: (r[rows] @ _left_out(G[rows], r[rows]) / rows.sum()).sqrt()[None]  # noqa: E731
@@ -99,7 +82,7 @@ def data_rows(problem: ShootingProblem, path: Path, theta: Tensor) -> tuple[Tens
 
 
 def _left_out(G: Tensor, r: Tensor) -> Tensor:
-    """(I − G Gᵀ)⁻¹ r, by the smaller of the two matrices: it is r + G (I − Gᵀ G)⁻¹ Gᵀ r as well."""
+    """(I − G Gᵀ)⁻¹ r, which is r + G (I − Gᵀ G)⁻¹ Gᵀ r as well, by the smaller of both matrices."""
     if G.shape[0] <= G.shape[1]:
         return without_rows(G @ G.T, r)
     return r + G @ without_rows(G.T @ G, G.T @ r)
@@ -113,12 +96,12 @@ def without_rows(H: Tensor, r: Tensor) -> Tensor:
 def left_out_errors(
     r: Tensor,  # (N·n,) residuals of the data, in the order of the samples
     data: Trajectories,
-    left_out: Callable[[Tensor], Tensor],  # residuals of some of their rows, given as bool (N·n,), without them
+    left_out: Callable[[Tensor], Tensor],  # (N·n,) bool, some rows → their residuals without them
     stay: Tensor | None = None,  # (N·n,) bool, rows that are in no fold
 ) -> Tensor:
     """RMS of r in each fold if its rows had been left out, (FOLDS,).
 
-    The first samples of a driven trajectory stay: motion that forgets where it started does not tell its start.
+    The first samples of a driven trajectory stay: damped motion forgets its start, which later samples do not tell.
     """
     parts = [torch.arange(length) * FOLDS // length for length in data.lengths]
     if data.u is not None:
@@ -127,16 +110,17 @@ def left_out_errors(
     fold = torch.cat(parts).repeat_interleave(data.dof).to(r.device)
     fold = fold if stay is None else fold.masked_fill(stay, -1)
     errors = torch.stack([left_out(fold == k).square().mean().sqrt() for k in range(FOLDS)]).nan_to_num(nan=torch.inf)
-    there = torch.stack([(fold == k).any() for k in range(FOLDS)])  # of short trajectories all of a fold may stay
+    # All rows of a fold may stay where trajectories are short.
+    there = torch.stack([(fold == k).any() for k in range(FOLDS)])
     return torch.where(there, errors, errors[there].square().mean().sqrt())
 
 
 def beaten(errors: Tensor, best: Tensor) -> bool:
-    """Return whether held-out errors of blocks of time, (blocks,), exceed the best ones beyond their spread.
+    """Return whether held-out errors of blocks of time, (blocks,), exceed the best errors beyond their spread.
 
-    Spread: the standard error over blocks of the difference of their squared errors (the one-standard-error rule of
+    The spread is the standard error over blocks of the difference of squared errors (the one-standard-error rule of
     Breiman et al. 1984). An error lower by less than a twentieth beats nothing, however certain: a weaker prior, or a
-    parameter near zero, fits each block a little better, and the free run beyond the data pays for it.
+    parameter near zero, fits each block a little better and makes the free run beyond the data worse.
     """
     difference = errors.square() - best.square()
     spread = float(difference.std() / len(difference) ** 0.5)
@@ -144,23 +128,6 @@ def beaten(errors: Tensor, best: Tensor) -> bool:
 
 
 def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
-    """Return the smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
+    """Return the smallest key (the strongest prior) whose held-out errors the best errors do not beat."""
     best = min(errors, key=lambda k: float(errors[k].square().mean()))
     return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))
-
-
-def strongest_not_beaten(departures: Sequence[float], fit: Callable[[float], F | None]) -> Chosen[F] | None:
-    """Fit every strength of the prior, the weakest first, and keep the strongest that the best one does not beat.
-
-    None where none could be fitted.
-    """
-    fits: dict[float, F] = {}
-    held_out: dict[float, Tensor] = {}
-    for departure in sorted(departures, reverse=True):
-        found = fit(departure)
-        if found is not None:
-            fits[departure], held_out[departure] = found, found.held_out_errors()
-    if not fits:
-        return None
-    chosen = simplest_not_beaten(held_out)
-    return Chosen(fits[chosen], chosen, held_out)

@@ -1,7 +1,7 @@
 """The dictionary that a compiled kernel holds: every named term that coordinates of one kind may have.
 
-One kernel a kind serves every subset, and is compiled once. A model whose terms are all in it is evaluated by that
-kernel, its other numbers being 0; any other model has a kernel of its own.
+One kernel serves all models of a kind of coordinates, and is compiled once. It evaluates every model whose terms are in
+the dictionary, with 0 for the absent numbers; any other model has a kernel of its own.
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ from herglotz.models.config import POWERS
 from herglotz.models.drag import AIR
 from herglotz.models.features import expand, lengths, polar, revolute
 
-HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
-WAVES = 3  # highest harmonic of one angle
+# Highest power of a length in the potential of one coordinate: forces up to x⁵.
+HIGHEST = 6
+# Highest harmonic of one angle.
+WAVES = 3
 COEFFICIENTS = re.compile(r"(potential\.features\.sum|kinetic\.sum|drag|action)\.coefficient(?:\[(\d+)\])?")
 
 
 def dictionary(config: ModelConfig) -> ModelConfig | None:
-    """The configuration with all terms of its kind; None where it has something that no dictionary holds."""
+    """The configuration with all terms of its kind; None where the model has a part that no dictionary holds."""
     c, n = config, len(config.angles)
     if n > 3 or c.alike != (n == 1) or _has_other_parts(c):
         return None
+    # Joints without coupling have a mass matrix whose other entries are 0.
     if any(c.angles) and n > 1 and c.diagonal and not c.coupled:
-        c = replace(c, diagonal=False)  # joints that are apart have no mass between them
+        c = replace(c, diagonal=False)
     features, drag = features_of(c.angles), drag_of(c.angles)
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
     whole = replace(
@@ -39,14 +42,14 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
 
 
 def _has_other_parts(c: ModelConfig) -> bool:
-    """Whether a model has networks, parts that are given, or a potential that no term says."""
+    """Whether a model has networks, parts with given numbers, or a potential that is no named term."""
     given = c.known or c.terms or c.translations or c.input_map or c.level in ("affine", "full")
     unnamed = c.alike and c.order == 2 and (any(c.stiffness) or any(c.tilt))
     return bool(given or unnamed or c.potential_width or c.mass_width or c.correction_width)
 
 
 def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
-    """The terms of L, but those of the distance, which are singular where it is 0."""
+    """The terms of L without those of the distance, which are singular at distance 0."""
     if len(angles) == 1:
         if angles[0]:
             return tuple(f"{f}({'' if k == 1 else k}q1)" for k in range(1, WAVES + 1) for f in ("cos", "sin"))
@@ -58,7 +61,7 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
 
 
 def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
-    """Friction beside the viscous and the dry one: dampers between lengths, for those between joints are `coupled`."""
+    """Friction beside viscous and dry friction; dampers between lengths are here, those between joints in `coupled`."""
     drag = [text for i in range(1, len(angles) + 1) for text in (f"|v{i}| v{i}", f"|v{i}|")]
     drag += [f"load {i}" for i, angle in enumerate(angles, 1) if angle]
     drag += [text for i, angle in enumerate(angles, 1) if not angle for text in (f"q{i} v{i}", f"q{i}^2 v{i}")]
@@ -69,7 +72,7 @@ def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
 
 
 def keys_of(numbers: list[str], config: ModelConfig) -> list[str]:
-    """What each number of a model is, whatever other terms the model has: coefficients go by the text of their term."""
+    """Names of numbers that do not depend on the model's other terms: a coefficient has the text of its term."""
     features = expand(config.features, config.angles)
     texts = {
         "potential.features.sum": [x for x in features if "v" not in x],

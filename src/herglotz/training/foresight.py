@@ -1,13 +1,13 @@
-"""What the data leave open of free runs beyond them: the start, the parameters, and terms too small to be seen.
+"""The uncertainty of free runs beyond the data: by the start, by the parameters, and by terms too small to be seen.
 
-Held-out time says nothing of motion that is longer than what was held out. Around the fit the cost is quadratic with
-A = JᵀJ: start states and parameters have the covariance A⁻¹, and a free run with sensitivities Z changes by Z δ. A term
-that the fit does not have may act all the same: the Bayesian information criterion keeps it out while the cost would
-fall by less than ½ log N, so by up to √(log N) of its standard deviations, which all other unknowns follow.
+Held-out time says nothing about longer motion. Around the fit the cost is quadratic with A = JᵀJ: start states and
+parameters have the covariance A⁻¹, and a free run with sensitivities Z changes by Z δ. A term that the fit does not
+have may act all the same. The Bayesian information criterion leaves a term out if the cost would fall by less than
+½ log N: the term may be as large as √(log N) of its standard deviations, and all other unknowns follow.
 
 Free runs go on from the end of the training part for `TURNS` turns of the motion or over the whole unseen part,
-whatever is longer, with the recorded inputs again where there are no more. Where their start alone makes them uncertain
-they are chaotic, and where they leave the recorded range nothing is known: neither says anything of the model.
+whichever is longer; recorded inputs are repeated where there are no more. Samples do not count where the uncertainty of
+the start alone is large, because the motion is chaotic there, nor where the run has left the recorded range.
 """
 
 from __future__ import annotations
@@ -48,34 +48,44 @@ from herglotz.training.pruning import inverse_of
 from herglotz.training.structure import MOST
 from herglotz.training.task import Task, build_model, with_sticking
 
-UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless
-TURNS = 2.0  # a turn is 2π times the ratio of the spreads of q and q̇: the period of an oscillation
-LONGEST = 10  # times the recorded time: no free run is followed for longer
-ALIKE = 1e-9  # of a term's own information: what less is left of, others do as well; it changes nothing
-RUNS = 4  # trajectories that are followed on
+# Share of the spread: a free run of a larger uncertainty is useless.
+UNCERTAIN = 0.1
+# A turn is 2π times the ratio of the spreads of q and q̇: the period of an oscillation.
+TURNS = 2.0
+# Longest free run, over the recorded time.
+LONGEST = 10
+# A term with a smaller share of its information left is a combination of other terms, and changes nothing.
+MIN_INFORMATION = 1e-9
+# Most trajectories that are continued.
+RUNS = 4
 
 
 @dataclass(frozen=True)
 class Foresight:
-    """How uncertain free runs are, as RMS over their samples of what is open over the spread of each coordinate."""
+    """The uncertainty of free runs: RMS over samples, over the spread of each coordinate.
 
-    start: float  # over the unseen part, by what the data leave open of the state it starts from
-    parameters: float  # over the horizon, by what they leave open of the parameters
-    hidden: float  # the largest change by a term that the fit does not have
-    name: str  # of this term
-    horizon: float  # time beyond the training part
-    reached: bool  # whether all steps were solved
+    `start` is the uncertainty by the start states, over the unseen part. `parameters` is that by the parameters over
+    the `horizon`, the time beyond the training part. `hidden` is the largest change by a term that the fit does not
+    have, of this `name`. `reached`: all steps were solved.
+    """
+
+    start: float
+    parameters: float
+    hidden: float
+    name: str
+    horizon: float
+    reached: bool
 
     @property
     def open(self) -> float:
-        """The larger of what parameters and hidden terms leave open; inf where the model cannot run so far."""
+        """The larger of the uncertainties by parameters and by hidden terms; inf where a step fails."""
         return max(self.parameters, self.hidden) if self.reached else math.inf
 
 
 def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight | None:
     """See the head of this module; None where the model does not follow the data.
 
-    `states` (N, 2n+1) are those of the finished fit at all samples of `seen.data`, of the unseen part by a free run.
+    `states` (N, 2n+1) are those of the finished fit at all samples of `seen.data`; a free run gives the unseen ones.
     """
     if not fitted.notes.get("follows_data", True) or not bool(torch.isfinite(states).all()):
         return None
@@ -118,9 +128,9 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
 class _Ahead:
     """Times and inputs of free runs, each from the start of the last segment of a trajectory."""
 
-    data: Trajectories  # their positions are nothing
+    data: Trajectories  # (N) samples, positions are 0
     rows: Tensor  # (N,) the same samples in all data; −1 beyond them
-    segments: list[int]  # that they start from
+    segments: list[int]  # (runs) segments of the fit, from whose starts the runs start
     beyond: Tensor  # (N,) bool: after the training part
     horizon: float
 
@@ -153,27 +163,27 @@ class _Ahead:
     def stepped_on(self, model: ContactLagrangian, states: Tensor, max_step: float) -> Tensor:
         """States at all samples of these runs, known ones and those of the model's steps; NaN from a failed step on.
 
-        They are the fitted model's own, which steps quicker than one with all terms.
+        The fitted model steps quicker than the model with all terms.
         """
         known, parts = states[self.rows], []
         for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
             last = int((self.rows[first : first + length] >= 0).nonzero()[-1])
             if last < length - 1:
-                parts.append(torch.arange(first + min(last, length - 3), first + length))  # three samples at least
+                # Trajectories have three samples at least.
+                parts.append(torch.arange(first + min(last, length - 3), first + length))
         if not parts:
             return known
         at = torch.cat(parts).to(known.device)
         rest = self.data.rows(at, tuple(map(len, parts)))
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]
-        out = continued(model, x, grid.h, step_inputs(model, rest, grid))
-        known[at] = grid.at_samples(out)  # not what pads the shorter runs
+        known[at] = grid.at_samples(continued(model, x, grid.h, step_inputs(model, rest, grid)))
         return known
 
     def until_lost(self, states: Tensor, low: Tensor, high: Tensor) -> tuple[_Ahead, Tensor | None]:
         """These runs up to where a step fails, with their `states`; None where one fails inside of [low, high], (n,).
 
-        A run that fails after it left the recorded range says no more of the model than others that leave it.
+        A run that fails outside the recorded range says no more about the model than a run that only leaves the range.
         """
         found, q = torch.isfinite(states).all(-1), states[:, : len(low)]
         inside, kept, lengths = ((q >= low) & (q <= high)).all(-1), [], []
@@ -201,7 +211,7 @@ def _turn(data: Trajectories, states: Tensor) -> float:
 def _with_absent_terms(
     task: Task, model: ContactLagrangian
 ) -> tuple[ContactLagrangian, Baseline, dict[str, list[int]]]:
-    """A model of named terms with all other candidates at 0, and where these stand; other models as they are."""
+    """A model of named terms with all other candidates at 0, and the places of these; any other model as it is."""
     c, data, parameters = task.config, task.data, ParameterVector(model)
     own = NamedTerms(c.features, c.drag, c.dissipation, c.coulomb)
     every = _searched(task, own, parameters)
@@ -218,7 +228,7 @@ def _with_absent_terms(
 
 
 def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> NamedTerms | None:
-    """The candidates of a search for a model of these named terms alone; None where no search would give the model."""
+    """The candidates of the search that gives a model of these named terms; None where no search gives the model."""
     c, data = task.config, task.data
     told = any((c.known, c.terms, c.input_map, c.translations and not c.features))
     network = any(name.startswith(NETWORKS) for name in parameters.names)
@@ -237,7 +247,7 @@ def _summary(
 ) -> Foresight:
     """The variances of free runs from A of all unknowns and their sensitivities Z, (N, n, P + d), over the spread.
 
-    Where runs leave the recorded range, and are not `inside`, (N,) bool, nothing is known.
+    Only samples `inside` the recorded range, (N,) bool, count.
     """
     P, d = problem.P, problem.d
     names = [name for name, at in absent.items() for _ in at]
@@ -261,11 +271,12 @@ def _summary(
 
 
 def _open(A: Tensor, absent: dict[str, list[int]], problem: ShootingProblem) -> tuple[Tensor, Tensor]:
-    """Covariance of the unknowns that the fit has, and how all unknowns move with each absent term at its limit."""
+    """Covariance of the fit's unknowns, and the change of all unknowns with each absent term at its limit."""
     others = torch.tensor([i for at in absent.values() for i in at], dtype=torch.long)
     held = torch.zeros(len(A), dtype=torch.bool)
     held[others] = True
-    if DRY in absent:  # what shapes a force of 0 has no effect
+    # The numbers that shape a force of 0 have no effect.
+    if DRY in absent:
         held[shapes_of_dry(problem.parameters)] = True
     free = (~held).nonzero()[:, 0]
     C = torch.zeros_like(A)
@@ -273,7 +284,7 @@ def _open(A: Tensor, absent: dict[str, list[int]], problem: ShootingProblem) -> 
     follow = -C @ A[:, others]
     left = A[others, others] + (A[:, others] * follow).sum(0)
     follow[others, torch.arange(len(others))] = 1.0
-    most, apart = math.log(problem.data.q.numel()), left > ALIKE * A[others, others]
+    most, apart = math.log(problem.data.q.numel()), left > MIN_INFORMATION * A[others, others]
     return C, follow * torch.where(apart, most / left, 0.0).sqrt()
 
 

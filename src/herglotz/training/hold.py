@@ -1,10 +1,10 @@
-"""What happens to recorded inputs before they act, where neither the data nor the user say it.
+"""How recorded inputs arrive, where neither the data nor the user say so: the hold, a delay and the actuator's lag.
 
-The hold between samples, a delay and the lag of an actuator (`herglotz.data.actuator`) make other inputs of the steps.
-One linear problem is solved for each: accelerations by differences against `acceleration_terms`, dry friction and what
-joints move in one another. Differences amplify noise: over short windows the problem is made one
-of positions again, whose noise is white. What misses them less, by more than a tenth and beyond the spread of
-that gain over blocks of time, is taken: first a hold, then a delay or a lag, then both.
+Each arrival (`herglotz.data.actuator`) makes other inputs of the steps. One linear problem compares them: accelerations
+by differences against `acceleration_terms`, dry friction and the forces of other joints. Differences amplify noise, so
+that the problem is turned back into one of positions over short windows, whose noise is white. An arrival is taken if
+it lowers the error by more than a tenth and beyond the spread of that gain over blocks of time: first a hold, then a
+delay or a lag, then both.
 """
 
 from __future__ import annotations
@@ -26,88 +26,99 @@ from herglotz.least_squares import least_squares
 from herglotz.training.acceleration_terms import acceleration_terms, for_each
 from herglotz.training.baseline import differences
 
-# The mean over blocks of log(mean square without / with). Measured: 0.36 to 3.9 for delays of 0.4 and 2.3 steps that
+# Least mean over blocks of log(mean square without / with). Measured: 0.36 to 3.9 for delays of 0.4 and 2.3 steps that
 # noise of 1 % lets see, up to 0.16 for errors of the linear model itself.
-WORTH = 0.2
-BLOCKS = 10  # of time
-CLEARLY = 3.0  # standard errors over blocks
-MOST = 3000  # samples that are looked at
-TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)  # delays and lags, in typical steps
-LEAST = 0.3  # typical steps: errors of the linear model itself look like up to 0.27 of one
-FINEST = 2e-3  # of a typical step
+MIN_LOG_GAIN = 0.2
+# Blocks of time, and the standard errors over them that a gain must exceed.
+BLOCKS, MIN_STANDARD_ERRORS = 10, 3.0
+# Most samples that are compared.
+MAX_SAMPLES = 3000
+# Delays and lags that are tried, in typical steps.
+TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+# Least delay and lag together, in typical steps: errors of the linear model itself look like up to 0.27 of a step.
+MIN_LATENESS = 0.3
+# Shortest step of the search, in typical steps.
+FINEST = 2e-3
+# Directions of the search in (delay, lag); the data determine the sum best.
 DELAY, LAG = (1, 0), (0, 1)
-MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))  # of delay and lag; their sum is known best
-LONGEST = 64  # triples in a window
-SMOOTHED = (0.01, 0.1, 0.3)  # widths of dry friction, in RMS velocities
-STILL = 0.1  # RMS velocities: dry friction may hold what is slower against its input
-RANK = 1e-9  # of the largest singular value: columns below it repeat others
+MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
+# Most triples in a window.
+LONGEST = 64
+# Widths of dry friction, in RMS velocities.
+SMOOTHED = (0.01, 0.1, 0.3)
+# Dry friction may hold a coordinate that is slower, in RMS velocities, against its input.
+STILL = 0.1
+# Singular values below this share of the largest belong to columns that repeat others.
+RANK = 1e-9
 
 
 def with_arrival(data: Trajectories, train: Trajectories) -> tuple[Trajectories, Arrival, dict[str, str]]:
     """The data with their inputs as they act, how recorded inputs arrive, and the reasons.
 
-    What the data do not say is what explains the steps of `train`, the part of them that a fit may see.
+    What the data do not say is found from `train`, the part of the data that a fit may see.
     """
-    said = data.arrival
+    arrival = data.arrival
     if data.u is None:
-        return data, said, dict.fromkeys(Arrival._fields, "there are no inputs")
-    free = [name for name, value in said._asdict().items() if value in ("", None)]
+        return data, arrival, dict.fromkeys(Arrival._fields, "there are no inputs")
+    free = [name for name, value in arrival._asdict().items() if value in ("", None)]
     reasons = dict.fromkeys(Arrival._fields, "the data or the settings say so")
     if free:
-        way, numbers = _searched(train, said)
-        said, reasons = way.arrival, reasons | dict.fromkeys(free, numbers)
-    return acting(replace(data, **said._asdict())), said, reasons
+        arrival, numbers = _searched(train, arrival)
+        reasons |= dict.fromkeys(free, numbers)
+    return acting(replace(data, **arrival._asdict())), arrival, reasons
 
 
 @dataclass(frozen=True)
 class Way:
-    """How inputs arrive, and how far the linear model misses positions with it."""
+    """An arrival of the inputs, and the errors of the linear model with it."""
 
     arrival: Arrival
-    errors: Tensor  # mean squares over blocks of time, (BLOCKS,)
+    errors: Tensor  # (BLOCKS,) mean squares over blocks of time
 
     @property
     def rms(self) -> float:
-        """Over all blocks."""
+        """The error over all blocks."""
         return float(self.errors.mean().sqrt())
 
     def beats(self, other: Way) -> bool:
-        """Whether it misses less, by a tenth and beyond the spread over blocks, which one block cannot decide."""
+        """Whether the error is lower by a tenth and beyond the spread over blocks, which one block cannot decide."""
         gain = (other.errors / self.errors.clamp_min(torch.finfo(self.errors.dtype).tiny)).log()
-        return float(gain.mean()) > max(WORTH, CLEARLY * float(gain.std()) / BLOCKS**0.5)
+        return float(gain.mean()) > max(MIN_LOG_GAIN, MIN_STANDARD_ERRORS * float(gain.std()) / BLOCKS**0.5)
 
 
-def _searched(train: Trajectories, said: Arrival) -> tuple[Way, str]:
-    """What explains the motion best, where `said` leaves it open, and the numbers that say so."""
+def _searched(train: Trajectories, said: Arrival) -> tuple[Arrival, str]:
+    """The arrival that explains the motion best, where `said` leaves it open, and the numbers that say so."""
     ways = Ways(train)
     plain = [ways.of(Arrival(hold, *said.late)) for hold in ([said.hold] if said.hold else HOLDS)]
     best = min(plain, key=lambda way: way.rms)
     found = best if best.beats(plain[0]) else plain[0]
-    told = {way.arrival.hold: way for way in plain}
-    axes = [axis for axis, value in ((DELAY, said.delay), (LAG, said.lag)) if value is None]
-    singles = [ways.along(axis, found.arrival) for axis in axes]
-    told |= {"a delay" if axis == DELAY else "a lag": way for axis, way in zip(axes, singles, strict=True)}
-    single = min(singles, key=lambda way: way.rms, default=found)
-    if ways.inside(single.arrival, found.arrival) and single.beats(found):
+    compared = {way.arrival.hold: way for way in plain}
+    axes = {name: axis for name, axis, x in (("a delay", DELAY, said.delay), ("a lag", LAG, said.lag)) if x is None}
+    singles = {name: ways.along(axis, found.arrival) for name, axis in axes.items()}
+    compared |= singles
+    single = min(singles.values(), key=lambda way: way.rms, default=found)
+    if ways.is_late(single.arrival, found.arrival) and single.beats(found):
         found = single
         if len(axes) == 2:
-            told["both"] = both = ways.nearby(single, MOVES, 0.5)
+            compared["both"] = both = ways.nearby(single, MOVES, 0.5)
             found = both if both.beats(single) else single
-    numbers = ", ".join(f"{name} {way.rms:.3g}" for name, way in told.items())
-    return found, f"a linear model over short windows misses positions by: {numbers}"
+    numbers = ", ".join(f"{name} {way.rms:.3g}" for name, way in compared.items())
+    return found.arrival, f"a linear model over short windows misses positions by: {numbers}"
 
 
 class Ways:
-    """Ways in which the inputs of these data could arrive."""
+    """The errors of the linear model of these data, by the arrival of the inputs."""
 
     def __init__(self, data: Trajectories):
         data = data.to(torch.float64, "cpu")
-        rows, _ = liveliest_rows(data.q, data.lengths, MOST)
-        self.all, self.rows, self.problem = data, rows, Accelerations(data.liveliest(MOST))
-        self.step, self.pieces = data.typical_step, cache(self._pieces)
+        rows, _ = liveliest_rows(data.q, data.lengths, MAX_SAMPLES)
+        self.all, self.rows, self.problem = data, rows, Accelerations(data.liveliest(MAX_SAMPLES))
+        self.step, recorded = data.typical_step, data.u
+        assert recorded is not None
+        self.pieces = cache(lambda hold: InputPieces.of(hold, data.t, recorded, data.lengths))
 
     def of(self, arrival: Arrival) -> Way:
-        """One of them with its errors."""
+        """An arrival with its errors."""
         u = self.pieces(arrival.hold).acting(*arrival.late)
         u = replace(self.all, u=u, hold=arrival.hold).inputs_of_steps()
         assert u is not None
@@ -116,19 +127,21 @@ class Ways:
     def along(self, axis: tuple[int, int], plain: Arrival) -> Way:
         """The best delay, or the best lag."""
         tried = [(x, self._moved(plain, axis, x)) for x in TRIED]
-        ways = [(self.of(arrival), x) for x, arrival in tried if arrival is not None]
-        best, x = min(ways, key=lambda found: found[0].rms)
+        best, x = min(
+            ((self.of(arrival), x) for x, arrival in tried if arrival is not None), key=lambda found: found[0].rms
+        )
         return self.nearby(best, (axis, (-axis[0], -axis[1])), x / 4)
 
-    def inside(self, found: Arrival, plain: Arrival) -> bool:
-        """Whether it is later by more than the linear model may err, and not at the end of what is tried."""
-        return sum(found.late) - sum(plain.late) >= LEAST * self.step and max(found.late) < TRIED[-1] * self.step
+    def is_late(self, found: Arrival, plain: Arrival) -> bool:
+        """Whether `found` is later by more than the linear model may err, and not at the end of the range."""
+        later = sum(found.late) - sum(plain.late)
+        return later >= MIN_LATENESS * self.step and max(found.late) < TRIED[-1] * self.step
 
     def nearby(self, way: Way, moves: Sequence[tuple[int, int]], size: float) -> Way:
-        """The best one that steps along these moves lead to, shorter ones where long ones lead nowhere."""
+        """The best arrival that steps of this size along the moves lead to; the size halves where no step helps."""
         while size > FINEST:
             moved = [self._moved(way.arrival, move, size) for move in moves]
-            best = min((self.of(one) for one in moved if one is not None), key=lambda other: other.rms, default=way)
+            best = min((self.of(x) for x in moved if x is not None), key=lambda other: other.rms, default=way)
             if best.rms < way.rms:
                 way = best
             else:
@@ -136,18 +149,14 @@ class Ways:
         return way
 
     def _moved(self, arrival: Arrival, move: tuple[int, int], size: float) -> Arrival | None:
-        """By so many typical steps; None where time would run backwards, or further than is tried."""
+        """The arrival moved by so many typical steps; None outside the range of delays and lags."""
         delay, lag = (x + by * size * self.step for x, by in zip(arrival.late, move, strict=True))
         allowed = min(delay, lag) >= 0 and max(delay, lag) <= TRIED[-1] * self.step
         return arrival._replace(delay=delay, lag=lag) if allowed else None
 
-    def _pieces(self, hold: str) -> InputPieces:
-        assert self.all.u is not None
-        return InputPieces.of(hold, self.all.t, self.all.u, self.all.lengths)
-
 
 class Accelerations:
-    """What the terms of the linear problem leave of the accelerations for the inputs to explain."""
+    """The part of the accelerations that no term of the linear problem explains, for the inputs to explain."""
 
     def __init__(self, data: Trajectories):
         data = replace(data, u=None)
@@ -164,26 +173,25 @@ class Accelerations:
         columns = [terms.columns, *(torch.diag_embed(torch.tanh(slow / width)) for width in SMOOTHED)]
         self.still = (slow.abs() < STILL).to(q)
         if data.dof > 1:
-            others = torch.cat(list(_of_others(data.angles, q, terms.v)), -1)
+            others = torch.cat(list(_forces_of_others(data.angles, q, terms.v)), -1)
             columns.append(for_each(others[:, None].expand(-1, data.dof, -1)))
-        A = self._whitened(torch.cat(columns, -1))
-        A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
-        U, S, _ = torch.linalg.svd(A, full_matrices=False)
+        U, S, _ = torch.linalg.svd(_scaled(self._whitened(torch.cat(columns, -1))), full_matrices=False)
         self.Q = U[:, RANK * S[0] < S]
-        y = self._whitened(a[..., None])
-        self.y = y - self.Q @ (self.Q.T @ y)
+        self.y = self._unexplained(a[..., None])
 
     def errors(self, u: Tensor) -> Tensor:
         """Mean squares over blocks of time, (BLOCKS,), with these inputs of the steps, (N, m)."""
         each = (u[self.index] + u[self.index + 1]) / 2
         each = (each[:, :, None] * self.directions[:, None]).flatten(1)
         A = for_each(each[:, None].expand(-1, len(self.balance), -1))
-        A = torch.cat([A, A * self.still[:, :, None]], -1)
-        A = self._whitened(A)
-        A = A - self.Q @ (self.Q.T @ A)
-        A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
+        A = _scaled(self._unexplained(torch.cat([A, A * self.still[:, :, None]], -1)))
         left = A @ least_squares(A, self.y) - self.y
         return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])
+
+    def _unexplained(self, x: Tensor) -> Tensor:
+        """The part of the columns (T, n, k) that the terms do not explain, (T' n, k)."""
+        x = self._whitened(x)
+        return x - self.Q @ (self.Q.T @ x)
 
     def _whitened(self, x: Tensor) -> Tensor:
         """(T, n, k) over the balance, as positions whose noise is white, (T' n, k)."""
@@ -191,15 +199,20 @@ class Accelerations:
         return torch.linalg.solve_triangular(self.factor, windows.flatten(2), upper=False).reshape(-1, x.shape[-1])
 
 
+def _scaled(A: Tensor) -> Tensor:
+    """The columns over their RMS."""
+    return A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
+
+
 def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
     """Triples (M, L) of windows in a row, and the factor of their accelerations' covariance, (M, L, L).
 
-    White noise of positions makes D n of accelerations, D being second differences; Σ = D Dᵀ. The noise of the terms,
-    left out there, adds up with time: of a spring ω² it is ω² L^{3/2} h^{1/2} / √3 as large after a time L.
+    White noise n of positions makes noise D n of accelerations, D being second differences; Σ = D Dᵀ. The noise of the
+    terms, left out there, grows with time: of a spring ω² it is ω² L^{3/2} h^{1/2} / √3 as large after a time L.
     """
-    omega = float((t.q2 - t.q0).div((t.h0 + t.h1)[:, None]).square().mean(0).div(t.q1.var(0)).max())  # squared
+    omega2 = float((t.q2 - t.q0).div((t.h0 + t.h1)[:, None]).square().mean(0).div(t.q1.var(0)).max())
     h = data.typical_step
-    longest = max(3, round((3**0.5 / (omega * h**0.5)) ** (2 / 3) / h)) if omega > 0 else 3
+    longest = max(3, round((3**0.5 / (omega2 * h**0.5)) ** (2 / 3) / h)) if omega2 > 0 else 3
     runs = torch.arange(len(t)).tensor_split((t.index.diff() != 1).nonzero()[:, 0] + 1)
     longest = min(longest, LONGEST, *map(len, runs))
     starts = torch.cat([run[: len(run) - longest + 1 : longest] for run in runs])
@@ -212,7 +225,7 @@ def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
     return rows, torch.linalg.cholesky(D @ D.mT)
 
 
-def _of_others(angles: Sequence[bool], q: Tensor, v: Tensor) -> Iterable[Tensor]:
+def _forces_of_others(angles: Sequence[bool], q: Tensor, v: Tensor) -> Iterable[Tensor]:
     """What each coordinate may do to the others: springs, weight, friction and centrifugal forces, (T, k)."""
     for i, angle in enumerate(angles):
         s, c, w = q[:, i].sin(), q[:, i].cos(), v[:, i]

@@ -5,16 +5,16 @@ and its derivative J = ∂R/∂q2. Positions do not determine the scale of L_d (
 
     Σ |J_k⁻¹ R(x)|² / Σ |J_k⁻¹ J(x)|²
 
-is minimised, J_k being the J of the round before: a generalised eigenproblem, whose smallest eigenvalue is 0 where the
-features can make the motion exactly. (With one coefficient fixed instead, the others cancel it: trap 2. A search by
-least squares from a constant mass ends in other valleys.) Noise makes its rounds wander: the coordinate that errs least
-counts ever more, by a mass that grows where others hardly act on it. From the best of the rounds the likelihood of the
-errors e = J(x)⁻¹R(x), each coordinate having a size of its own,
+is minimised, J_k being the J of the round before. This is a generalised eigenproblem, whose smallest eigenvalue is 0 if
+the features make the motion exactly. (If one coefficient were fixed instead, the others would cancel its term: trap 2.
+A least-squares fit from a constant mass ends in other minima.) With noise the rounds do not converge: the coordinate
+with the least error counts ever more, because its mass grows where others hardly act on it. From the best round on,
 
-    Σ_i log Σ_k e_i²
+    Σ_i log Σ_k e_i²,    e = J(x)⁻¹R(x),
 
-is minimised by Levenberg–Marquardt: it is the same in all units, and at all factors of an equation that no other shares
-a coefficient with. Noise biases it, as it does every linear regression: it starts a fit and does not end one.
+the log-likelihood with a size of the errors for each coordinate, is minimised by Levenberg–Marquardt. It is the same in
+all units, and for all factors of an equation that shares no coefficient with another. Noise biases the result, as it
+does every linear regression: the result starts a fit and does not end one.
 """
 
 from __future__ import annotations
@@ -37,11 +37,16 @@ from herglotz.training.parameter_vector import ParameterVector
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
           "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
           "drag.coefficient")  # fmt: skip
-MASS, SHARED = "mass", "mass of two"  # constant ones, of a coordinate and between two of them
-STEPS, ENDS = 40, 1e-4  # of the search from there, and the gain of a log-likelihood at which it ends
-AT_ONCE = 1_000_000  # numbers of J formed together: 8 MB
-LARGE = 2.0**30  # coefficient beside which the fixed masses, of size 1, are lost; a power of two divides out
-ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
+# Constant masses, of a coordinate and between two coordinates.
+MASS, SHARED = "mass", "mass of two"
+# Most steps of Levenberg–Marquardt, which ends at a smaller gain of log-likelihood.
+MAX_STEPS, MIN_GAIN = 40, 1e-4
+# Numbers of J that are formed together: 8 MB.
+AT_ONCE = 1_000_000
+# A coefficient beside which the fixed masses, of size 1, are lost in rounding; a power of two divides out exactly.
+LARGE = 2.0**30
+# Rounds of weights J_k: the unit matrix, then twice the J of the coefficients found.
+ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ class LinearFit:
             p = momentum_plus(before)
             return momentum_residual(after, p), momentum_jacobian(after, p)
 
-        # Linear in every column, and much larger than without it: the difference is its derivative to rounding.
+        # R and J are linear in every coefficient: the difference to a large one is the derivative up to rounding.
         start = parameters.get()
         units = torch.eye(len(start), dtype=start.dtype, device=start.device)[columns]
         large = vmap(both, chunk_size=max(1, AT_ONCE // (n * n * len(t))))(start + LARGE * units)
@@ -103,7 +108,7 @@ class LinearFit:
         return LinearFit(self.R[which], self.J[which], self.names)
 
     def solve(self, columns: Tensor) -> Tensor:
-        """Coefficients (F,) of unit size, zero outside `columns` (F,) bool; all are where none can be had."""
+        """Coefficients (F,) of unit size, 0 outside `columns` (F,) bool; all are 0 where no round is finite."""
         own = LinearFit(self.R[..., columns], self.J[..., columns], ())
         x = min(own._eigenvectors(), key=own._misfit, default=own.R.new_zeros(own.R.shape[-1]))
         out = self.R.new_zeros(len(self.names))
@@ -111,21 +116,22 @@ class LinearFit:
         return out
 
     def _eigenvectors(self) -> Iterator[Tensor]:
-        """Coefficients of unit size by the ratio at the head of this module after each round, while they are finite."""
+        """The coefficients of unit size after each round of the ratio at the head of this module, while finite."""
         R, J, n = self.R, self.J, self.R.shape[1]
         Jk = torch.eye(n, dtype=R.dtype, device=R.device).expand(len(R), n, n)
         for _ in range(ROUNDS):
             inverse = torch.linalg.pinv(Jk)
             top = (inverse @ R).flatten(0, 1)
             bottom = torch.einsum("tij,tjkf->tikf", inverse, J).flatten(0, 2)
-            # In units of the motion: in others the smaller of both parts would be lost in the rounding of the larger.
+            # In the unit of the motion; in other units rounding of the larger part would hide the smaller part.
             unit = float(top[:, 0].norm() / bottom[:, 0].norm())
             top = top / unit if 0 < unit < math.inf else top
             size = bottom.square().sum(0).add(top.square().sum(0)).sqrt()
-            size = torch.where(size > 0, size, 1.0)  # columns differ by powers of the unit of length
+            # Columns differ by powers of the unit of length.
+            size = torch.where(size > 0, size, 1.0)
             # All of R and J in one thin factor: R = Q₁ U, J = Q₂ U with Q₁ᵀQ₁ + Q₂ᵀQ₂ = 1; x = U⁻¹ y, least |Q₁ y|.
             Q, U = torch.linalg.qr(torch.cat([top, bottom]) / size)
-            if not bool(torch.isfinite(Q).all()):  # each has a scale of its own, and some had none
+            if not bool(torch.isfinite(Q).all()):
                 return
             y = torch.linalg.svd(Q[: len(top)], full_matrices=False).Vh[-1]
             x = least_squares(U, y[:, None])[:, 0] / size
@@ -133,16 +139,16 @@ class LinearFit:
             Jk = J @ x
 
     def _misfit(self, x: Tensor) -> float:
-        """What is minimised in the end: Σ_i log of the mean square error of coordinate i; inf without a mass matrix."""
+        """Σ_i log of the mean square error of coordinate i; inf where the masses are no positive definite matrix."""
         M = -(self.J @ x) * x[0].sign()
         if int(torch.linalg.cholesky_ex((M + M.mT) / 2)[1].sum()):
             return math.inf
         return float(self.errors(x).square().mean(0).clamp_min(torch.finfo(x.dtype).tiny).log().sum())
 
     def _polished(self, x: Tensor) -> Tensor:
-        """The minimum of `_misfit` from x, the first mass being held; x where it has no mass matrix."""
+        """The minimum of `_misfit` from x with the first mass held; x where `_misfit` is infinite there."""
         best, damping, tiny = self._misfit(x), 1e-3, torch.finfo(x.dtype).tiny
-        for _ in range(STEPS if best < math.inf else 0):
+        for _ in range(MAX_STEPS if best < math.inf else 0):
             e = self.errors(x)
             size = e.square().mean(0).sqrt().clamp_min(tiny)
             D = torch.linalg.solve(self.J @ x, self.R - torch.einsum("tijf,tj->tif", self.J, e))[..., 1:]
@@ -151,13 +157,14 @@ class LinearFit:
             scale = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
             A = A / scale[:, None] / scale + damping * torch.eye(len(A)).to(A)
             other = x.clone()
-            other[1:] -= torch.linalg.solve_ex(A, D.T @ e / scale)[0] / scale  # no number: no step
-            gain = best - (its := self._misfit(other))
+            other[1:] -= torch.linalg.solve_ex(A, D.T @ e / scale)[0] / scale
+            gain = best - (misfit := self._misfit(other))
+            # A step that is no number has no gain.
             if not gain > 0:
                 damping *= 5
                 continue
-            x, best, damping = other, its, damping / 5
-            if gain < ENDS:
+            x, best, damping = other, misfit, damping / 5
+            if gain < MIN_GAIN:
                 break
         return x
 

@@ -1,13 +1,14 @@
-"""`reason_of`: what the residual of a model that does not fit shows of the reason, in words.
+"""`reason_of`: why a model does not fit, as far as the residual shows, in words.
 
-Free runs of 20 recorded steps, whose starts are fitted, leave a residual. The curvature of parabolas through nine of
-its samples is the acceleration that the model lacks, known to the noise of the data. These reasons are looked for:
+Free runs of 20 recorded steps, whose starts are fitted, leave a residual. The curvature of parabolas through nine
+samples of the residual is the acceleration that the model lacks, known to the noise of the data. Four reasons are
+looked for:
 
 * positions on a circle, which one angle gives;
 * an input that was recorded more slowly than the motion and filled in: its steps act at times between rows;
-* the past: where positions, velocities and inputs of two times are alike, the model lacks other accelerations, which no
-  function of these gives;
-* kicks: it does, a twentieth of the samples has more than half of the sum of squares.
+* the past: the lacking accelerations differ where positions, velocities and inputs of two times are alike, so that no
+  function of these gives the accelerations;
+* kicks: the same, and a twentieth of the samples has more than half of the sum of squares.
 """
 
 from __future__ import annotations
@@ -23,17 +24,22 @@ from herglotz.data.rates import filled_inputs
 from herglotz.data.roughness import SAMPLES, precisions
 from herglotz.data.units import size
 
-MOST = 2000  # samples: the distances between all of them take 32 MB
-FEW = 20  # accelerations at least: a twentieth of them is one
-NEAR = 0.5  # standard deviations of the state: neighbours farther apart differ by forces of a narrow range, too
-# Of the variance of what is lacking, beside the noise: neighbours that differ by more do not tell it. Measured: laws
-# with a memory, and forces that were not recorded, 0.2 to 2; forces of the state that were left out at most 0.11.
+# Most samples: the distances between all of them take 32 MB.
+MOST = 2000
+# Fewest accelerations: a twentieth of them is one.
+FEW = 20
+# Largest distance of neighbours, in standard deviations of the state: forces of a narrow range differ farther apart.
+NEAR = 0.5
+# The state does not give the acceleration if neighbours differ by more than this share of the variance without noise.
+# Measured: laws with a memory, and forces that were not recorded, 0.2 to 2; forces of the state that were left out at
+# most 0.11.
 OTHER = 0.15
-CLEAR = 2.0  # times the noise: curvatures of neighbouring windows share samples, and differ by 1.5 times it by chance
+# The same over the noise: curvatures of windows that share samples differ by 1.5 times the noise by chance.
+CLEAR = 2.0
 
 
 def reason_of_data(data: Trajectories) -> str:
-    """What data that are missed show of the reason, without a residual, and what to try; "" where they show none."""
+    """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
     if hints := with_hints(replace(data, notes=())).notes:
         return hints[0].removeprefix("warning: ")
     if names := filled_inputs(data):
@@ -49,9 +55,9 @@ def reason_of_data(data: Trajectories) -> str:
 def reason_of(
     data: Trajectories,
     miss: Tensor,  # (N, n) residual at the samples, in units of q
-    owner: Tensor,  # (N,) which free run each sample is of
+    owner: Tensor,  # (N,) free run of each sample
 ) -> str | None:
-    """What was missed, and what to try, in sentences; "" where no reason is shown, None where noise hides it."""
+    """The reason of a misfit, and what to try, in sentences; "" where none is shown, None where noise hides it."""
     first = torch.arange(max(0, data.samples - SAMPLES + 1), device=data.t.device)
     first = first[owner[first] == owner[first + SAMPLES - 1]]
     if len(first) < FEW:
@@ -86,16 +92,16 @@ def reason_of(
 
 
 def _kick(lacking: Tensor) -> int | None:
-    """Row of the largest of the accelerations (K, n), where these are kicks; None elsewhere."""
+    """Row of the largest acceleration of (K, n), if the accelerations are kicks; else None."""
     square = lacking.square().sum(1)
     top = square.argsort(descending=True)[: len(square) // FEW]
     return int(top[0]) if float(square[top].sum()) > 0.5 * float(square.sum()) else None
 
 
 def _is_other(lacking: Tensor, noise: float, x: Tensor, row: Tensor) -> bool:
-    """Whether accelerations (K, n) of variance 1, of it `noise`, differ where states (K, m) of other times are alike.
+    """Whether accelerations (K, n) of variance 1 differ where states x (K, m) of other times are alike.
 
-    The quarter of the samples whose neighbours are nearest is compared.
+    `noise` is the share of the variance that is noise. The quarter of the samples with the nearest neighbours counts.
     """
     apart = torch.cdist(x, x).masked_fill((row[:, None] - row).abs() < 2 * SAMPLES, torch.inf)
     distance, other = apart.min(1)

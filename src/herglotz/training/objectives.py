@@ -9,18 +9,18 @@ from typing import Any
 from torch import Tensor
 
 from herglotz.models import ContactLagrangian
-from herglotz.training.cross_validation import Chosen
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.look import PROBE, Look
 from herglotz.training.one_step_fit import NOISE_OF_R, best_restart, fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import OneStep
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.smoothing_fit import SmoothingFit, fit_smoothing
+from herglotz.training.smoothing_fit import fit_smoothing, weakest
 from herglotz.training.task import Task, with_sticking
-from herglotz.training.trajectory_fit import TrajectoryFit, fit_states, fit_trajectories
+from herglotz.training.trajectory_fit import fit_states, fit_trajectories
 
-LOOSE = 0.02  # σ of the short fits that others start from, relative to the motion's size: they shall not follow noise
+# σ of the short fits that others start from, relative to the motion's size: these fits must not follow noise.
+LOOSE = 0.02
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Fitted:
 
 
 def fit_by_one_step(task: Task, seen: Look, plan: Plan) -> Fitted:
-    """Minimise one-step errors; then fit the states, so that the free run does not start from two noisy samples."""
+    """Minimise one-step errors, then fit the states: a free run must not start from two noisy samples."""
     raw = plan.objective == "raw"
 
     def problem(model: ContactLagrangian) -> OneStep:
@@ -71,10 +71,15 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     if task.config.sticking:
         model = with_sticking(model, excess=not plan.fitted_before)
     found = fit_trajectories(task, model, sigma, known=plan.fitted_before)
-    if found is None:  # the model keeps the parameters of the one-step fit
+    # A model that is lost keeps the parameters of the one-step fit.
+    if found is None:
         return _lost(task, model, "trajectory", sigma, "the model cannot follow the data over 20 steps")
     problem = found.fit.problem
-    notes = _chosen(found, found.fit) | {"segment_steps": problem.grid.longest, "follows_data": True}
+    problem.parameters.set(found.fit.theta)
+    held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
+    notes = {"departure": found.departure, "held_out_rms": held_out, "reason": found.fit.result.reason,
+             "robust": problem.freedom is not None, "segment_steps": problem.grid.longest,
+             "follows_data": True}  # fmt: skip
     return Fitted(model, found.fit.states(), "trajectory", problem.sigma, notes, problem.used)
 
 
@@ -84,9 +89,11 @@ def fit_by_smoothing(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG
     found = fit_smoothing(task, model, sigma)
     if found is None:
         return _lost(task, model, "smoothing", sigma, "the model has no step near the data")
-    fit, problem = found.fit, found.fit.problem
-    notes = _chosen(found, fit) | {"follows_data": fit.follows_data(), "process": problem.process}
-    return Fitted(model, problem.states(fit.x), "smoothing", problem.sigma, notes)
+    problem = found.problem
+    problem.parameters.set(found.theta)
+    notes = {"departure": weakest(task.config, model), "reason": found.result.reason, "process": problem.process,
+             "robust": problem.freedom is not None, "follows_data": found.follows_data()}  # fmt: skip
+    return Fitted(model, problem.states(found.x), "smoothing", problem.sigma, notes)
 
 
 OBJECTIVES: dict[str, Callable[[Task, Look, Plan], Fitted]] = {
@@ -106,14 +113,6 @@ def _one_step_start(task: Task, plan: Plan) -> tuple[ContactLagrangian, float]:
 
 
 def _lost(task: Task, model: ContactLagrangian, objective: str, sigma: float, why: str) -> Fitted:
-    """The recorded positions in place of states, for a model that follows none of them."""
+    """The result for a model that does not follow the data, whose states are read off the recorded positions."""
     states = states_of_pairs(model, task.data)
     return Fitted(model, states, objective, sigma, {"reason": why, "follows_data": False})
-
-
-def _chosen(found: Chosen, fit: TrajectoryFit | SmoothingFit) -> dict[str, Any]:
-    """What is told of the strength of the prior, held-out RMS by strength, and the end; the model gets its numbers."""
-    fit.problem.parameters.set(fit.theta)
-    held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
-    notes = {"departure": found.departure, "held_out_rms": held_out, "reason": fit.result.reason}
-    return notes | {"robust": fit.problem.freedom is not None}

@@ -7,24 +7,34 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.data.windows import Triples
+from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
 from herglotz.training.problems.one_step import OneStep, ResidualProblem
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.solvers.adam import DECAY, adam
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
-from herglotz.training.solvers.matrix_free import DENSE, MatrixFree
 from herglotz.training.stages import Callback
 from herglotz.training.task import Task
 
-NOISE_OF_R = 6**0.5  # standard deviation of q2 − 2 q1 + q0, hence of r, over that of independent noise in q
-ITERATIONS_BEFORE_SELECTION = 30  # of each restart, at most a third of all iterations together; only the best goes on
-SEED_STRIDE = 7919  # between the seeds of restarts: no seed below 7919 shares a draw with another
-ADAM_STEPS = 20  # steps of Adam for one iteration of Levenberg–Marquardt: Adam needs no Jacobian, and many more steps
-SHORT_ROWS = 10  # triples for each coefficient in a short fit
-RTOL, HURRIED = 1e-6, 1e-3  # least gains, relative, of iterations; of fits that only measure or decide
-UNLIKELIER = 0.01  # of log-likelihood, where σ is that of rounding: lower costs say nothing more about the model
-ROWS = 50  # residuals for each coefficient in a one-step fit of found features: more only cost time
+# The standard deviation of r, as of q2 − 2 q1 + q0, over that of independent noise in q.
+NOISE_OF_R = 6**0.5
+# Iterations of each restart, at most a third of all iterations together; only the best restart goes on.
+ITERATIONS_BEFORE_SELECTION = 30
+# Seeds of restarts differ by this: no seed below 7919 shares a draw with another.
+SEED_STRIDE = 7919
+# Steps of Adam for one iteration of Levenberg–Marquardt: Adam needs no Jacobian, and many more steps.
+ADAM_STEPS = 20
+# Levenberg–Marquardt builds JᵀJ: 800 MB at this number of parameters, of which a search holds three.
+MAX_PARAMETERS = 10_000
+# Triples for each coefficient in a short fit.
+SHORT_ROWS = 10
+# Residuals for each coefficient in a one-step fit of found features: more residuals only cost time.
+ROWS = 50
+# Least relative gain of an iteration: of a fit, and of a fit that only measures or decides.
+RTOL, HURRIED = 1e-6, 1e-3
+# Least gain of log-likelihood where σ is that of rounding: smaller gains say nothing more about the model.
+MIN_LIKELIHOOD_GAIN = 0.01
 
 
 def one_step_problem(
@@ -62,17 +72,19 @@ def fit_one_step(task: Task, problem: OneStep, name: str, iterations: int) -> tu
 
 
 def _optimised(task: Task, problem: OneStep, x: Tensor, total: int, callback: Callback) -> OptimiserResult:
-    """The end of a search from x; Levenberg–Marquardt forms no matrix where there are too many parameters for one."""
+    """Minimise by the optimiser of the settings; raise InputError where the model is too large for its matrix."""
     c = task.config
     if c.optimiser != "lm":
         return adam(
             problem, x, max_iterations=total, learning_rate=c.learning_rate,
             decay=DECAY if c.optimiser == "adamw" else 0.0, batch=c.batch, seed=c.seed, callback=callback,
         )  # fmt: skip
-    large = isinstance(problem, ResidualProblem) and not problem.carries_s and problem.P > DENSE
-    target = MatrixFree(problem) if large and isinstance(problem, ResidualProblem) else problem
-    rtol, atol = HURRIED if task.hurried else RTOL, UNLIKELIER if problem.sigma <= task.exact else 0.0
-    return levenberg_marquardt(target, x, max_iterations=total, rtol=rtol, atol=atol, callback=callback)
+    refuse({
+        f"the model has {problem.P} parameters, more than the {MAX_PARAMETERS} that Levenberg–Marquardt takes; set "
+        "optimiser='adam' and objective='residual', or make the network smaller": problem.P > MAX_PARAMETERS,
+    })  # fmt: skip
+    rtol, atol = HURRIED if task.hurried else RTOL, MIN_LIKELIHOOD_GAIN if problem.sigma <= task.exact else 0.0
+    return levenberg_marquardt(problem, x, max_iterations=total, rtol=rtol, atol=atol, callback=callback)
 
 
 def best_restart(

@@ -98,7 +98,7 @@ def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagra
     model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device="cpu")
     model.s_enters_motion = s_enters_motion(model, kept)
     seen = Look(
-        data, train, unseen, kept, dropped, False, data.arrival, {}, (), "", (),
+        data, train, unseen, kept, dropped, False, data.arrival, {}, (), (),
         noise=roughness(kept), settings=config, base=base,
     )  # fmt: skip
     return model, seen

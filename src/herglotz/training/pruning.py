@@ -1,27 +1,27 @@
-"""Selection of features: the one the fit loses least without is removed, one after the other."""
+"""Backward elimination: the coefficient whose removal costs the fit least goes, one after the other."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-NULL = 1e-13  # eigenvalue, relative to the largest, that rounding leaves of a null direction
+# Eigenvalue of a null direction, relative to the largest: what rounding leaves.
+NULL = 1e-13
 
 
 def prune(
     A: Tensor,  # (P, P) JᵀJ at the fit, residuals over their RMS
     x: Tensor,  # (P,) the fit
-    candidates: Tensor,  # indices of the coefficients that may be left out
-    worth: float,  # twice the cost above which a coefficient stays; log N by the Bayesian information criterion
-    least: int = 0,  # how many stay whatever they cost
-    simplest: Tensor | None = None,  # those of them that go only where no other one can
+    candidates: Tensor,  # (k,) indices of the coefficients that may go
+    worth: float,  # (1) twice the cost above which a coefficient stays
+    simplest: Tensor | None = None,  # (j,) those candidates that go only where no other candidate can
 ) -> tuple[Tensor, Tensor]:
-    """(kept, x): the candidates that stay, and the parameters moved to where the others' absence sends them.
+    """(kept, x): the candidates that stay, and the parameters at the minimum without the others.
 
-    Leaving out coefficient i costs ½ x_i² / (A⁻¹)_ii in the quadratic model of the fit; the one that costs least goes
-    while that is less than ½ `worth`: backward elimination without fitting again (Schwarz 1978 for log N, N the number
-    of residuals). Where two sets of terms make nearly the same force, rounding and noise would choose; the set with
-    the simplest terms is kept instead (marginality, Nelder 1977).
+    Leaving out coefficient i costs ½ x_i² / (A⁻¹)_ii in the quadratic model of the fit. The cheapest coefficient goes
+    while its cost is less than ½ `worth`, which is log N by the Bayesian information criterion, N being the number of
+    residuals (Schwarz 1978); nothing is fitted again. Where two sets of terms make nearly the same force, rounding and
+    noise would choose between them; the set with the simplest terms is kept instead (marginality, Nelder 1977).
     """
     keep = torch.ones(len(x), dtype=torch.bool, device=x.device)
     out, x = torch.zeros_like(keep), x.clone()
@@ -30,7 +30,7 @@ def prune(
     late[candidates[:0] if simplest is None else simplest] = True
     scale = A.diagonal().clamp_min(1e-300).sqrt()
     S, y = A / scale[:, None] / scale, x * scale
-    while int((out & keep).sum()) > least:
+    while bool((out & keep).any()):
         rows = keep.nonzero()[:, 0]
         C = torch.linalg.pinv(S[rows][:, rows], hermitian=True)
         cost = torch.where(out[rows], y[rows].square() / C.diagonal().clamp_min(1e-300), torch.inf)
@@ -46,9 +46,9 @@ def prune(
 
 
 def inverse_of(A: Tensor) -> Tensor:
-    """A⁻¹ of a matrix that may have null directions: very large along them, where a pseudo-inverse would have 0.
+    """A⁻¹ of a matrix that may have null directions, along which it is very large; a pseudo-inverse would be 0 there.
 
-    Scaled to a unit diagonal, so that no unit decides what is a null direction.
+    A is scaled to a unit diagonal, so that units do not decide which directions are null.
     """
     size = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
     values, vectors = torch.linalg.eigh(A / size[:, None] / size)

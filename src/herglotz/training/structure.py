@@ -1,11 +1,13 @@
-"""The structure of several coordinates, found from the data.
+"""The terms of several coordinates, found from the data.
 
-Every planar chain of revolute joints, in absolute or relative angles, has its mass and its weight in the dictionary
-`revolute` (`herglotz.models.features`); coordinates without an angle among them have constant masses of their own, and
-springs, powers and distances in the dictionary `lengths`. Either starts as a linear problem (`linear_start`). For
-joints the one with a constant mass is solved too, without a fifth of the data at a time; the richer one is taken where
-it predicts that fifth better, beyond the spread of the fifths. A short one-step fit then leaves out the features that
-the data do not need, and tells noise from what the rule lacks.
+`search` finds named terms of one to three coordinates, which whole trajectories ask for. Where no search is made, or it
+finds none, `structured` takes a dictionary of features. Every planar chain of revolute joints, in absolute or relative
+angles, has its mass and its weight in the dictionary `revolute` (`herglotz.models.features`); coordinates without an
+angle among them have constant masses of their own, and springs, powers and distances in the dictionary `lengths`.
+Either starts as a linear problem (`linear_start`). For joints the problem with a constant mass is solved too, without a
+fifth of the data at a time; the mass that depends on the angles is taken where it predicts that fifth better, beyond
+the spread of the fifths. A short one-step fit then leaves out the features that the data do not need, and tells noise
+from the error of the rule.
 """
 
 from __future__ import annotations
@@ -46,39 +48,63 @@ from herglotz.training.task import EXACT, NOISY, build_model
 from herglotz.training.trades import listed
 from herglotz.training.trials import Trial
 
-MOST = 3  # most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n²
-TRIPLES, ENOUGH = 4000, 5  # most triples in the linear problem, and least number of residuals for each coefficient
-NUMBERS = 3e7  # most numbers in the derivatives of the linear problem: 240 MB
-THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the rule of order 2 for short ones
-MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
-BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
-EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
+# Most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n².
+MOST = 3
+# Most triples in the linear problem, and least number of residuals for each coefficient.
+TRIPLES, ENOUGH = 4000, 5
+# Most numbers in the derivatives of the linear problem: 240 MB.
+MAX_NUMBERS = 3e7
+# Strides of the samples that are tried: noise asks for long steps, the rule of order 2 for short ones.
+STRIDES = (1, 2, 4)
+# A residual above this multiple of the noise: a force is missing from the dictionary.
+MISSED = 2.0
+# Order 4 is kept where it lowers the one-step error below this share.
+MAX_ERROR_RATIO = 0.5
+# A one-step error below this share of the motion's size needs no rule of order 4.
+EXPLAINED = 1e-7
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent", "dissipation")  # fmt: skip
-
 VISCOUS = "friction.viscous"
+# What a search may find about the recording beside its terms; `look` reads the data so.
+READING = ("hold", "input_terms", "zeros", "drifts", "turning")
 
 
 class Structure(NamedTuple):
-    """The terms and starting values that were found for several coordinates."""
+    """The terms and starting values that were found, and how the recording is to be read for them.
 
-    config: FitConfig  # the settings with the features, the order and the objective that the data call for
-    base: Baseline  # with starting values
-    reason: str  # in words and numbers
-    sigma: float | None = None  # misfit of whole trajectories, where these were fitted
-    zeros: tuple[float, ...] = ()  # (B · n) of the sensors, which differ between recordings; found terms are without
-    why_zeros: str = ""  # them in words
-    drifts: tuple[float, ...] = ()  # (n,) rates at which these zeros drift; found terms are without
-    why_drifts: str = ""  # them in words
-    turning: bool = True  # angles turn; False: these terms are those of positions on a line, as of a free spring
-    compared: Sequence[dict[str, Any]] = ()  # the models that a search compared (`compared_models`)
-    input_terms: tuple[str, ...] = ()  # of inputs, which these terms ask for beside the recorded ones
-    hold: str = ""  # of inputs, with which these terms miss the data by far less than with the one that was tried
+    `config` are the settings with the features, the order and the objective that the data call for, `base` has starting
+    values, and `reason` says so in words and numbers. `sigma` is the misfit of whole trajectories, where these were
+    fitted. For these terms inputs have another `hold` ("": the same) and further `input_terms`, sensors have `zeros`
+    that differ between recordings, and `drifts`, and angles are `turning` or positions on a line; `why` has pairs of a
+    name of these five and its reason. `compared` are the models that a search compared (`compared_models`).
+    """
+
+    config: FitConfig
+    base: Baseline
+    reason: str
+    sigma: float | None = None
+    hold: str = ""
+    input_terms: tuple[str, ...] = ()
+    zeros: tuple[float, ...] = ()  # (B · n)
+    drifts: tuple[float, ...] = ()  # (n,) rates of the zeros
+    turning: bool = True
+    why: tuple[tuple[str, str], ...] = ()
+    compared: Sequence[dict[str, Any]] = ()
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """What was found about the recording: those of `READING` that are not as they were."""
+        own = self._asdict()
+        return {name: own[name] for name in READING if own[name] != self._field_defaults[name]}
+
+    def read(self) -> Structure:
+        """The same terms for data that are read so."""
+        return self._replace(**{name: self._field_defaults[name] for name in (*READING, "why")})
 
 
 def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
-    """Whether the structure of these data is left to `structured`: several coordinates, no motors, nothing said."""
+    """Whether `structured` may choose: several coordinates, no inputs, and the user names no term."""
     c = user_settings
     driven = data.u is not None and c.use_inputs
     several = data.dof > 1 and (data.dof <= MOST or not any(data.angles))
@@ -86,7 +112,7 @@ def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 
 def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
-    """Whether the terms of these data are left to `search`: one to three coordinates, nothing said but translations."""
+    """Whether `search` may choose: one to three coordinates, and the user names no term but translations."""
     c = user_settings
     few = (2 if c.translations else 1) <= data.dof <= MOST
     alone = c.objective == "auto" and c.substeps == 1 and not c.input_map
@@ -99,10 +125,11 @@ def _nothing_named(c: FitConfig) -> bool:
 
 
 def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
-    """All features and, of coordinates without an angle, the springs between them alone, which need fewer samples.
+    """The whole dictionary and, for coordinates without an angle, the springs between them alone.
 
-    A dictionary takes part where the samples suffice for its coefficients and their derivatives take no more than
-    `NUMBERS`: at 200 samples the whole one up to 14 coordinates, springs up to 22.
+    Springs alone need fewer samples. A dictionary takes part where the samples suffice for its coefficients and where
+    the derivatives take no more than `MAX_NUMBERS`: at 200 samples the whole dictionary up to 14 coordinates, springs
+    up to 22.
     """
     if any(data.angles):
         return [tuple(revolute(data.angles))]
@@ -117,12 +144,12 @@ def kept_structure(
     """What `find` finds, or what the checkpoint remembers of it under this name."""
     numbers = ("stiffness", "tilt", "rate", "start", "spreads", "model_step")
 
-    def search() -> dict[str, Any]:
+    def plain() -> dict[str, Any]:
         found = find()
         start = {name: getattr(found.base, name) for name in numbers}
         return found._asdict() | {"config": found.config.to_dict(), "base": start}
 
-    kept = stages.keep(name, search)
+    kept = stages.keep(name, plain)
     settings = replace(FitConfig.from_dict(kept["config"]), device=config.device)
     return Structure(**kept | {"config": settings, "base": replace(base, **kept["base"])})
 
@@ -134,35 +161,40 @@ def search(
 
     Where they miss the data, inputs are tried with these other `holds`.
     """
-    data = data.to(torch.float64, "cpu")  # a kernel has no other numbers
+    # A kernel has float64 on the CPU alone.
+    data = data.to(torch.float64, "cpu")
     own = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
-    asked, rates, why_drifts = Questions(wanted, holds), (), ""
+    asked, rates, why = Questions(wanted, holds), (), {}
     best = asked.best
     drift = None if best is None or (asked.differ is None and best.at_the_noise) else drifts(wanted.part)
     if best is not None and drift is not None:
         found = tuple(drift[0].tolist())
         again = Questions(wanted.of(measured(data, drifts=found)), holds)
         if again.best is not None and again.best.at_the_noise and again.best.fits_better(best, len(found)):
-            asked, rates, why_drifts = again, found, f"rates {sure(*drift)}"
-    if asked.read.better_on_a_line(asked.best):  # whose search, with inputs and sizes of its own, finds the terms again
+            asked, rates, why["drifts"] = again, found, f"rates {sure(*drift)}"
+    # With positions on a line, whose inputs and sizes differ, `look` searches again.
+    if asked.read.better_on_a_line(asked.best):
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if asked.best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
     for question in (asked.how_inputs_act, asked.functions, asked.all_data):
         question()
-    found, differ = asked.best, asked.differ
+    found, differ, zeros = asked.best, asked.differ, ()
     if found is None:
         return Structure(config, base, "no dictionary of terms: what follows a part of the data does not follow all")
     settings, found_base = settings_of_trial(found, asked.wanted.config)
     settings = replace(settings, dtype=config.dtype, device=config.device)
     base = replace(found_base, low=base.low, high=base.high)
-    zeros, why, compared = (), "", compared_models(asked.read.fitters.values(), found)
+    if asked.hold:
+        why["hold"] = f"the terms that were found with hold {data.hold} miss the data by less with {asked.hold}"
+    if asked.input_terms:
+        why["input_terms"] = "held-out blocks of time are missed by less with them"
     if differ is not None:
-        zeros, why = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
-    words, terms = _told(found, data), asked.input_terms
+        zeros, why["zeros"] = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     return Structure(
-        settings, base, words, found.rms, zeros, why, rates, why_drifts, True, compared, terms, asked.hold,
+        settings, base, _told(found, data), found.rms, asked.hold, asked.input_terms, zeros, rates,
+        why=tuple(why.items()), compared=compared_models(asked.read.fitters.values(), found),
     )  # fmt: skip
 
 
@@ -177,7 +209,7 @@ def _told(found: Trial, data: Trajectories) -> str:
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:
-    """Settings and starting values with the structure that the data show; unchanged where they show none."""
+    """Settings and starting values with the dictionary that the data show; unchanged where the data show none."""
     joints, size = any(data.angles), max(base.scale)
 
     def without(reason: str) -> Structure:
@@ -212,25 +244,25 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
 
 
 def _largest(data: Trajectories, base: Baseline) -> tuple[tuple[str, ...], tuple[int, LinearFit, Tensor] | None]:
-    """The largest dictionary that the samples suffice for, and its linear problem; none of either where none does."""
+    """The largest dictionary that the samples suffice for, and its linear problem; (), None where none does."""
     tried = ((names, _linear(data, base, names)) for names in dictionaries(data))
     return next(((names, found) for names, found in tried if found), ((), None))
 
 
 def explains_steps(order4: float, order2: float, size: float) -> bool:
-    """Whether the rule of order 4 is what one-step errors ask for, or leaves none."""
-    return order4 <= max(BETTER * order2, EXPLAINED * size)
+    """Whether the rule of order 4 lowers the one-step errors enough, or leaves next to none."""
+    return order4 <= max(MAX_ERROR_RATIO * order2, EXPLAINED * size)
 
 
 def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> Baseline:
     """The baseline with starting values for the features that a user names, from one linear problem.
 
-    A search from a constant mass ends in another valley at some data sets. As it was where that problem is not the
-    model's: shared or known coefficients, a mass network, inputs, s in L, features that the baseline has too.
+    From a constant mass some fits end in another minimum. The baseline stays as it is where the linear problem is not
+    the model's: shared or known coefficients, a mass network, inputs, s in L, features that the baseline has too.
     """
     names = tuple(expand(config.features, data.angles))
     other = any(getattr(config, name) for name in ("known", "terms", "alike", "mass_width", "coulomb", "translations"))
-    other = other or data.u is not None or config.objective == "raw"  # a network alone
+    other = other or data.u is not None or config.objective == "raw"
     own = set(baseline_features(data.angles, base.stiffness, base.tilt)[0])
     if other or config.level not in ("conservative", "linear", "forced") or own & set(names):
         return base
@@ -238,7 +270,8 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     start = None if linear is None else linear[1].start(linear[2])
     if start is None:
         return base
-    if not any(data.angles):  # there is no mass between them in the linear problem
+    # The linear problem has no mass between coordinates without an angle.
+    if not any(data.angles):
         start.pop("kinetic.base.off_diagonal")
     found = started(base, data, by_term(start, holders(names)), replace(config, features=names))
     viscous = {VISCOUS: tuple(start[VISCOUS].tolist())} if config.level == "forced" else {}
@@ -246,18 +279,22 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
 
 
 def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit, Tensor] | None:
-    """The thinning whose one-step errors are least beside the motion's curvature, the linear problem, its solution."""
+    """The stride with the least ratio of one-step errors to the motion's curvature, its linear problem, the solution.
+
+    None where the samples do not suffice at any stride.
+    """
     best: tuple[float, int, LinearFit, Tensor] | None = None
     n = data.dof
-    coefficients = len(names) + (n * n if any(data.angles) else 4 * n)  # lengths: mass, spring, tilt, friction of each
-    for every in THINNED:
-        most = min(TRIPLES, int(NUMBERS / (n * n * (len(names) + n * (n + 4)))))
+    # Each coordinate that is no angle has a mass, a spring, a tilt and a friction.
+    coefficients = len(names) + (n * n if any(data.angles) else 4 * n)
+    for every in STRIDES:
+        most = min(TRIPLES, int(MAX_NUMBERS / (n * n * (len(names) + n * (n + 4)))))
         t = data.thinned(every).triples(every * base.max_step).spread_out(most)
         if len(t) * n < ENOUGH * coefficients:
             break
         fit = LinearFit.of(data.angles, names, t, data.balance)
-        # A linear system of n coordinates has n Lagrangians that are not multiples of one another, one of which has
-        # masses between all coordinates and no springs; of its diagonal masses one set alone will do.
+        # A linear system of n coordinates has n independent Lagrangians. One of these has masses between all
+        # coordinates and no springs; without masses between coordinates the Lagrangian is unique.
         columns = [any(data.angles) or name != SHARED for name in fit.names]
         (x,) = of_first(fit.solve(torch.tensor(columns)))
         moved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / data.balance
@@ -284,7 +321,7 @@ def _held_out(fit: LinearFit, columns: Tensor) -> Tensor:
 def _short_fit(
     data: Trajectories, base: Baseline, config: FitConfig, max_step: float
 ) -> tuple[dict, tuple[str, ...], float]:
-    """Values by term or parameter, the features that stay and the one-step error of a short fit of order 4."""
+    """A short fit of order 4: values by term or parameter, the features that stay, and the one-step error."""
     model = build_model(base, config, "potential")
     prior = prior_of(model, base, None)
     most = ROWS * prior.start.numel() // data.dof

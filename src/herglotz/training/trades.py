@@ -1,10 +1,9 @@
-"""Combinations of numbers that data do not determine: eigenvectors of their information with small eigenvalues.
+"""Combinations of numbers that data do not determine: eigenvectors of the information with small eigenvalues.
 
-Scaled to a unit diagonal the information has no units, and a small eigenvalue λ is a combination that moves the
-prediction √(λ_max/λ) times less than the best determined one: the condition index of Belsley, Kuh & Welsch (1980), who
-call 30 harmful. Its eigenvector says which numbers are traded. Where eigenvalues are equal, as those of exact null
-directions are, any basis of their span consists of eigenvectors; the span is then described by sparse vectors
-(`sparse_basis`).
+Scaled to a unit diagonal the information has no units. A combination with a small eigenvalue λ moves the prediction
+√(λ_max/λ) times less than the best determined combination does: the condition index of Belsley, Kuh & Welsch (1980),
+who call 30 harmful. The eigenvector says which numbers are traded. Eigenvectors of equal eigenvalues, as those of exact
+null directions, may be any basis of their span; sparse vectors then describe the span (`sparse_basis`).
 """
 
 from __future__ import annotations
@@ -15,13 +14,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-HARMFUL = 30.0  # condition index above which parameters are not determined one by one (Belsley, Kuh & Welsch 1980)
-LARGEST = 1e7  # condition index of an exact null direction, up to rounding
-PART = 0.05  # a parameter with a smaller share of a combination is not named
-# Eigenvalues of the scaled information closer than this (of the largest) count as equal: rounding moves them by some
-# 1e-15, which turns eigenvectors across a gap g by 1e-15/g, so that names stay below PART by a margin of 1e4.
+# Condition index above which parameters are not determined one by one (Belsley, Kuh & Welsch 1980).
+HARMFUL = 30.0
+# Condition index of an exact null direction, up to rounding.
+LARGEST = 1e7
+# A parameter with a smaller share of a combination is not named.
+PART = 0.05
+# Eigenvalues of the scaled information closer than this (of the largest) count as equal. Rounding moves eigenvalues by
+# some 1e-15, which turns eigenvectors across a gap g by 1e-15/g: names stay below PART by a margin of 1e4.
 EQUAL = 1e-10
-NEAR_LARGEST = 0.9  # pivots this near the largest are ties, and the first is taken: rounding must not choose
+# Pivots above this share of the largest are ties, of which the first is taken: rounding must not choose.
+NEAR_LARGEST = 0.9
 WORDS = {
     "kinetic.log_diagonal": "the mass",
     "kinetic.off_diagonal": "the coupling of masses",
@@ -41,10 +44,14 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Trade:
-    """Parameters of which the data determine some combination, and not each one alone."""
+    """Parameters of which the data determine some combination, and not each one alone.
 
-    index: float  # condition index: how many times less the combination moves the prediction than the best known one
-    parts: tuple[tuple[str, float], ...]  # parameters and their shares of the combination, the largest first
+    The condition `index` says how many times less the combination moves the prediction than the best determined
+    combination does. `parts` are parameters and their shares of the combination, the largest first.
+    """
+
+    index: float
+    parts: tuple[tuple[str, float], ...]
 
     def __str__(self) -> str:
         names = [in_words(name) for name, _ in self.parts]
@@ -56,7 +63,7 @@ class Trade:
 
 
 def joined(trades: Sequence[Trade]) -> list[Trade]:
-    """Trades that share a parameter as one, with the index of the worst."""
+    """The trades, those that share a parameter joined to one trade with the larger index."""
     found: list[Trade] = []
     for trade in trades:
         parts, apart = {name for name, _ in trade.parts}, []
@@ -86,7 +93,7 @@ def listed(names: Sequence[str]) -> str:
 def combinations(M: Tensor, alone: Tensor, names: Sequence[str]) -> list[Trade]:
     """The combinations of numbers with the information M (K, K) that are not determined, the worst first.
 
-    `alone` (K,) is what there would be of each, prior included, were all others known.
+    `alone` (K,) is the information on each number, prior included, if all other numbers were known.
     """
     # A parameter of no effect has a diagonal of rounding size, of either sign.
     seen = M.diagonal() > alone / LARGEST**2
@@ -97,7 +104,8 @@ def combinations(M: Tensor, alone: Tensor, names: Sequence[str]) -> list[Trade]:
     size = M.diagonal().sqrt()
     M = M / size[:, None] / size
     values, vectors = torch.linalg.eigh(M)
-    for vector in _within_equal(values, vectors).T:  # values ascend
+    # Eigenvalues ascend.
+    for vector in _within_equal(values, vectors).T:
         value = vector @ M @ vector
         condition = float((values[-1] / value.clamp_min(values[-1] / LARGEST**2)).sqrt())
         if condition < HARMFUL:

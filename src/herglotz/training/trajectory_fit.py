@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, spread
-from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
-from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
+from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.problems.grid import segment_grid, segment_lengths
 from herglotz.training.problems.least_squares import StatesOnly
@@ -23,8 +21,6 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import Task
 
-# Numbers in q. Each takes 15 kB of memory for states, derivatives and held-out residuals (measured): 5 GB in all.
-MAX_POSITIONS = 300_000
 # Segments stop growing if their error exceeds this multiple of the error of shorter segments.
 LOST = 2.0
 # Segments of a sticking model grow further as long as their error is below this share of the spread of q: without a
@@ -86,14 +82,13 @@ class TrajectoryFit:
         return held_out_errors(problem, self.path, self.theta, A)
 
 
-def check_size(data: Trajectories, most: int = MAX_POSITIONS) -> None:
-    """Raise InputError if q has more than `most` numbers, which memory limits; the message says how to thin them."""
-    allowed = most // data.dof
-    every = math.ceil(data.samples / allowed)
-    refuse({
-        f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinates, for 5 GB of memory; "
-        f"thin them (--every {every}, Trajectories.thinned) or take fewer": data.samples > allowed,
-    })  # fmt: skip
+@dataclass(frozen=True)
+class Chosen:
+    """The fit with the strength of the prior that held-out blocks chose, and the errors of all strengths."""
+
+    fit: TrajectoryFit
+    departure: float
+    held_out: dict[float, Tensor]  # (FOLDS,) in units of q
 
 
 class SegmentStages:
@@ -122,13 +117,12 @@ class SegmentStages:
         freedom: float | None,
         before: TrajectoryFit | None,
         used: Tensor | None = None,
-        begin: Trajectories | None = None,
         *,
         near: bool = False,
     ) -> TrajectoryFit | None:
-        """Segments of one length, from the states of the fit `before`, or read off `begin`; None if no path is found.
+        """Segments of one length, from the states of the fit `before` or of the data; None if no path is found.
 
-        `begin` holds the samples, raw (None) or smoothed; `near`: see `optimise`.
+        `near`: see `optimise`.
         """
         task = self.task
         grid = segment_grid(task.data, length, task.base.model_step)
@@ -138,8 +132,8 @@ class SegmentStages:
         )  # fmt: skip
         if before is None:
             start = problem.parameters.get()
-            states = first_states(problem, start, begin)
-            problem.guess_from_states(states_of_pairs(self.model, begin or task.data))
+            states = first_states(problem, start)
+            problem.guess_from_states(states_of_pairs(self.model, task.data))
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
             problem.guess_from(before.problem, before.path)
@@ -207,19 +201,17 @@ class SegmentStages:
             return None
         return None if float(rest.problem.joint_residuals(rest.path, rest.theta).abs().max()) > FAR else rest
 
-    def at_once(
-        self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
-    ) -> TrajectoryFit | None:
+    def at_once(self, sigma: float) -> TrajectoryFit | None:
         """Whole trajectories from known parameters; None if no path is found.
 
         The states are fitted first, with the parameters fixed: else the parameters would compensate poor start states.
         """
         states = SegmentStages(self.task, self.model, frozen=True, label=f", states{self.label}")
         states.patient, states.hurried, self.patient = False, True, False
-        before = states.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
+        before = states.fit(self.lengths[-1], sigma, None, None)
         # With the kinks of set-valued friction an undamped Newton step may not descend.
         near = not self.model.capabilities.sticking
-        found = None if before is None else self.fit(self.lengths[-1], sigma, freedom, before, near=near)
+        found = None if before is None else self.fit(self.lengths[-1], sigma, None, before, near=near)
         self.patient = True
         return found
 
@@ -252,9 +244,7 @@ def fit_states(task: Task, model: ContactLagrangian, sigma: float, s: Tensor | N
     return None if first is None else stages.grow(first, sigma)
 
 
-def fit_trajectories(
-    task: Task, model: ContactLagrangian, sigma: float, *, known: bool = False
-) -> Chosen[TrajectoryFit] | None:
+def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float, *, known: bool = False) -> Chosen | None:
     """Fit parameters and states to positions.
 
     Segments grow from 20 steps to whole trajectories, or to the longest that the model follows (None: it does not
@@ -299,8 +289,14 @@ def fit_trajectories(
             return Chosen(strongest, least, held_out)
     # The weakest prior is fitted twice: the first fit measures the noise, which then is the same for all strengths.
     noise = (fit("noise", max(departures)) or last).noise
-    found = strongest_not_beaten(departures, lambda departure: fit(f"prior {departure:g}", departure))
-    return found or Chosen(last, departures[0], {})
+    fits, held_out = {}, {}
+    for departure in sorted(departures, reverse=True):
+        if (found := fit(f"prior {departure:g}", departure)) is not None:
+            fits[departure], held_out[departure] = found, found.held_out_errors()
+    if not fits:
+        return Chosen(last, departures[0], {})
+    strongest = simplest_not_beaten(held_out)
+    return Chosen(fits[strongest], strongest, held_out)
 
 
 def _longest(

@@ -1,14 +1,16 @@
-"""Adam: the best point, minibatches, an end by itself."""
+"""Adam: the best point, minibatches, an end by itself; and the models that only Adam takes."""
 
+import sys
 from typing import Any
 
 import pytest
 import torch
 
 from herglotz.data import simulate
+from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
-from herglotz.training import Prior, ResidualProblem, adam
+from herglotz.training import FitConfig, Prior, ResidualProblem, adam, fit
 from herglotz.training.problems.supervised import SupervisedProblem
 
 
@@ -96,3 +98,13 @@ def test_a_batch_stands_for_all(supervision):
     parts = [problem.cost_and_gradient(x, rows) for rows in torch.arange(problem.rows).split(problem.rows // 2)]
     torch.testing.assert_close(sum(part[0] for part in parts) / 2, cost)
     torch.testing.assert_close(sum(part[1] for part in parts) / 2, gradient)
+
+
+def test_a_model_too_large_for_a_matrix_is_refused_in_words(monkeypatch):
+    # fails if JᵀJ of a huge network fills the memory without a word, or Adam is refused, too
+    monkeypatch.setattr(sys.modules["herglotz.training.one_step_fit"], "MAX_PARAMETERS", 20)
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=20, h=0.5, seed=0)
+    settings = {"objective": "residual", "correction_width": 4, "iterations": 1}
+    with pytest.raises(InputError, match="more than the 20 that Levenberg–Marquardt takes; set optimiser='adam'"):
+        fit(data, FitConfig(**settings), progress=False)
+    assert fit(data, FitConfig(optimiser="adam", **settings), progress=False).metrics["iterations"] == 20

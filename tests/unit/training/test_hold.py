@@ -82,8 +82,8 @@ def test_another_hold_is_tried_with_the_terms_that_were_found(monkeypatch):
     # fails if a resumed fit takes what was found with other zeros
     assert {"terms, zeros (0.1,)", "terms, zeros (0.1,), hold zero"} <= set(stages.kept)
     assert seen.arrival.hold == "zero"
-    assert "zero" in seen.why_arrival["hold"]
-    assert "first" in seen.why_arrival["hold"]
+    assert "zero" in seen.why["hold"]
+    assert "first" in seen.why["hold"]
     assert seen.found is not None
     said = look_at.look(replace(data, hold="first"), FitConfig(), Stages())
     assert said.arrival.hold == "first"  # as the data say

@@ -25,7 +25,7 @@ def weakly_coupled(seed: int, noise: tuple[float, float], samples: int = 500) ->
     return LinearFit(R, J, NAMES)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("noise", [(0.5, 0.1), (0.1, 0.5)])
 def test_a_mass_is_not_made_large_by_small_errors_of_its_coordinate(seed, noise):
     # fails if the eigenvector is the start: the coordinate that errs least counts ever more, and its mass came out 500

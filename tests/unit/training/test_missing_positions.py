@@ -89,5 +89,6 @@ def test_single_steps_are_fitted_to_readings_alone():
     own = missed(data, known, 0.3)
     assert weighed(own, "residual", "q").samples == weighed(own, "auto", "qs").samples == int(known.all(1).sum())
     assert weighed(own, "auto", "q") is own
-    seen: Any = SimpleNamespace(kept=own, settings=FitConfig(), found=None, structure="the data need none")
+    seen: Any = SimpleNamespace(kept=own, settings=FitConfig(), found=None, structure="the data need none",
+                                probe=None, baseline_motion=None, base=estimate_baseline(data))  # fmt: skip
     assert choose_objective(seen, FitConfig())[0] == "trajectory"

@@ -15,7 +15,7 @@ from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, choose, fit, look
-from herglotz.training.choose import RULES, choose_objective
+from herglotz.training.choose import RULES, answers, choose_objective
 from herglotz.training.plan import DECISIONS, WORDS
 from herglotz.training.stages import Stages
 
@@ -41,11 +41,11 @@ def seen(noise=0.0, **settings):
 def drawing():
     """The choice of the objective as a mermaid flowchart."""
     lines = ["flowchart TD", '    look["look: spikes, outliers, noise, baseline, structure, probe"] --> q1']
-    for k, rule in enumerate(RULES, 1):
+    for k, (question, objective) in enumerate(RULES.items(), 1):
         if k == len(RULES):
-            lines.append(f'    q{k}["{rule.question.lower()}"] --> o{k}(["{rule.objective}"])')
+            lines.append(f'    q{k}["{question.lower()}"] --> o{k}(["{objective}"])')
         else:
-            lines.append(f'    q{k}{{"{rule.question}"}} -- yes --> o{k}(["{rule.objective}"])')
+            lines.append(f'    q{k}{{"{question}"}} -- yes --> o{k}(["{objective}"])')
             lines.append(f"    q{k} -- no --> q{k + 1}")
     return "\n".join(lines)
 
@@ -70,8 +70,7 @@ def test_the_drawing_in_the_docs_is_the_code():
 def test_the_first_rule_that_is_answered_decides(noise, settings, number, objective):
     # fails if a rule is skipped, asked in another order, or gives another objective
     found, config = seen(noise, **settings)
-    answered = [k for k, rule in enumerate(RULES[:-1]) if rule.answer(found, config) is not None]
-    assert (answered[0] if answered else len(RULES) - 1) == number
+    assert next(k for k, reason in enumerate(answers(found, config)) if reason) == number
     assert choose_objective(found, config)[0] == objective
 
 

@@ -621,10 +621,10 @@ def test_a_line_and_zeros_are_found_one_after_the_other(monkeypatch):
     data, seen, zeros = replace(data, p=None, s=None), [], (0.0, 0.3)
     first = look(data, FitConfig(find_zeros=False), Stages())
     found = there(first.found)
-    more = {"zeros": zeros, "why_zeros": "so", "hold": "first", "drifts": (0.1,), "why_drifts": "since"}
+    more = {"zeros": zeros, "hold": "first", "drifts": (0.1,), "why": (("zeros", "so"), ("drifts", "since"))}
     answers = [found._replace(turning=False), found._replace(**more), found]
 
-    def asked(data, _settings, stages, _plan, zeros, drifts, known=None):
+    def asked(data, _settings, stages, _plan, zeros=(), drifts=(), known=None):
         seen.append((stages.label, data.angles, data.hold, zeros, drifts, known))
         return replace(first, found=answers.pop(0))
 
@@ -634,7 +634,7 @@ def test_a_line_and_zeros_are_found_one_after_the_other(monkeypatch):
         ((True,), "", (), (), None), ((False,), "", (), (), None), ((False,), "first", zeros, (0.1,), found)
     ]  # fmt: skip
     assert len({label for label, *_ in seen}) == 3  # a checkpoint remembers each by its own name
-    assert (last.turning, last.why_zeros, last.why_drifts) == (False, "so", "since")
+    assert (last.turning, last.why["zeros"], last.why["drifts"]) == (False, "so", "since")
 
 
 def test_an_angle_with_a_spring_is_a_position_on_a_line():

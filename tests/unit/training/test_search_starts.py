@@ -226,7 +226,7 @@ def test_drifts_stay_where_the_terms_that_are_found_without_them_meet_the_noise(
     drift = torch.tensor([0.2]), torch.tensor([0.01])
     found, _ = asked(zeros=zeros, drifts=drift)
     assert found.drifts == (pytest.approx(0.2),)
-    assert found.why_drifts == "rates 0.2 ± 0.01"
+    assert dict(found.why)["drifts"] == "rates 0.2 ± 0.01"
     rough, seen = asked(zeros=zeros, drifts=drift, rough=True)
     assert rough.drifts == ()
     assert ("whole", "drifts") in seen

@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, SmoothingProblem, fit
 from herglotz.training.cross_validation import left_out_errors, without_rows
 from herglotz.training.problems.grid import segment_grid
-from herglotz.training.smoothing_fit import ROUNDS, _hat
+from herglotz.training.smoothing_fit import ROUNDS
 
 NOISE = 0.01
 RTOL = 1e-10  # of the largest entry; differences and closed forms differ by 2e-14 to 3e-12 (AVX-512, AVX2, SSE)
@@ -54,7 +53,7 @@ def dense(matrix):
     return torch.stack([matrix @ e for e in torch.eye(len(matrix.diagonal()), dtype=torch.float64)], 1)
 
 
-@pytest.mark.parametrize(("level", "n"), [("linear", 1), ("affine", 1), ("linear", 2), ("affine", 2)])
+@pytest.mark.parametrize(("level", "n"), [("linear", 1), ("affine", 2)])
 def test_normal_equations_match_finite_differences(level, n):
     # fails if a block, the border, the anchor of s, the prior, the padding or a weight is wrong
     problem, x = problem_of(level, n)
@@ -97,10 +96,6 @@ def test_elimination_solves_the_whole_system():
     matrix, damping = dense(A), 0.1 * A.diagonal()
     torch.testing.assert_close(A.diagonal(), matrix.diagonal())
     torch.testing.assert_close(A.solve(b, damping), torch.linalg.solve(matrix + torch.diag(damping), b))
-    rows = torch.tensor([problem.P, problem.P + problem.d, problem.P + 2 * problem.d])
-    by = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    expected = by[:, None] * torch.linalg.inv(matrix)[rows][:, rows] * by
-    torch.testing.assert_close(_hat(A, rows, by), expected)
 
 
 @pytest.mark.parametrize("driven", [False, True])
@@ -162,7 +157,7 @@ def test_undisturbed_motion_is_left_to_the_model():
     run = fit(data, FitConfig(objective="smoothing", departures=(2e-4, 2e-3)), progress=False)
     assert run.metrics["process"] < 0.1
     assert run.metrics["follows_data"]
-    assert set(run.metrics["held_out_rms"]) == {"0.0002", "0.002"}
+    assert run.metrics["departure"] == 2e-3
     assert run.metrics["extrapolation_rms"] < 2 * NOISE
     assert run.metrics["sigma"] == pytest.approx(NOISE, rel=0.15)
     assert bool(torch.isfinite(torch.cat([x.flatten() for x in run.states])).all())
@@ -178,17 +173,3 @@ def test_pushes_of_some_steps_are_outweighed():
     run = fit(replace(data, q=data.q + jump), settings, progress=False)
     assert run.metrics["robust"]
     assert run.metrics["rate"] == pytest.approx(0.2, rel=0.1)
-
-
-def test_smoothing_takes_no_supervision():
-    # fails if the setting is dropped without a word
-    with pytest.raises(InputError, match="one-step objective"):
-        FitConfig(objective="smoothing", supervision="qs")
-
-
-def test_too_many_samples_are_refused():
-    # fails if a long record runs out of memory at the held-out blocks instead of ending in an error with a remedy
-    t = torch.arange(20_100, dtype=torch.float64)
-    data = Trajectories.of(t, t.sin()[:, None], (len(t),))
-    with pytest.raises(InputError, match=r"at most 20000 can be.*--every 2"):
-        fit(data, FitConfig(objective="smoothing", train_fraction=1.0), progress=False)

@@ -41,8 +41,9 @@ def damped_by_s(count=24, steps=14, h=0.1):
     return Trajectories.of(t, q, (steps + 1,) * count, angles=(True,), s=s, p=p)
 
 
-@pytest.mark.parametrize(("level", "momenta"), [("linear", False), ("affine", True), ("full", True)])
-@pytest.mark.parametrize("freedom", [None, 4.0])
+@pytest.mark.parametrize(
+    ("level", "momenta", "freedom"), [("linear", False, 4.0), ("affine", True, None), ("full", True, 4.0)]
+)
 def test_gradients_match_finite_differences(level, momenta, freedom):
     # fails if a residual lacks its derivative by a parameter or by the unit
     data = pendulum(2.0, trajectories=3, steps=12, h=0.2, seed=4, gaps=1)

@@ -1,4 +1,4 @@
-"""The masses that momenta at the joints of segments are over, and how they change with the parameters."""
+"""The masses that momenta at the joints of segments are divided by, and their derivatives by the parameters."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
+from torch.func import functional_call, jacrev
 
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.terms import Kinetic
 from herglotz.training.parameter_vector import ParameterVector
 
-FEW = 8  # samples that say how large a mass is
+# Samples over which a mass is averaged.
+FEW = 8
 
 
 class JointMasses:
@@ -25,7 +26,7 @@ class JointMasses:
 
     @property
     def move(self) -> bool:
-        """Whether the parameters say how large a mass is: the first coordinate's is 1."""
+        """Whether the masses depend on the parameters; the mass of the first coordinate is 1."""
         return self.q.shape[1] > 1 and self.parameters.model.config.baseline
 
     def at(self, theta: Tensor) -> Tensor:
@@ -37,17 +38,7 @@ class JointMasses:
 
     def slopes(self, theta: Tensor) -> Tensor:
         """∂ log mass / ∂θ, (n, P)."""
-        rows = []
-        with torch.enable_grad():
-            at = theta.detach().requires_grad_()
-            for mass in self.at(at).log():
-                known = (
-                    torch.autograd.grad(mass, at, retain_graph=True, allow_unused=True)[0]
-                    if mass.requires_grad
-                    else None
-                )
-                rows.append(torch.zeros_like(theta) if known is None else known)
-        return torch.stack(rows)
+        return jacrev(lambda x: self.at(x).log())(theta)
 
 
 class _Mass(nn.Module):

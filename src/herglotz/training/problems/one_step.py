@@ -8,7 +8,6 @@ smaller. A smaller M does shrink the raw residual R_k, which is an objective onl
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -124,12 +123,6 @@ class OneStep(LeastSquares, ABC):
         A[: self.P, : self.P] += of_prior[1]
         b[: self.P] += of_prior[2]
         return cost + of_prior[0], A, b
-
-    def pieces(self) -> Iterator[tuple[Tensor, Callable[[Tensor], Tensor]]]:
-        """The chunks of triples of this process, each with r/σ as a function of θ; only if the motion has no s."""
-        for _, part in own_parts(self.rows, self.chunk, self.triples.h0.device):
-            rows = self._rows(part, None)
-            yield part, lambda theta, rows=rows, by=self.deviation[part]: (self._local(theta, *rows) / by).reshape(-1)
 
     def _inputs(self, rows: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Inputs of the two steps of the triples that start at these rows; None, None for a model without inputs."""

@@ -1,4 +1,4 @@
-"""Smoothing: every state of a trajectory an unknown, steps with a little noise.
+"""Smoothing: every state of a trajectory is an unknown, and every step has a little noise.
 
 Minimises, over the states X_k = (q, p[, s]) at all nodes (and over the parameters θ, where they are fitted too),
 
@@ -6,8 +6,8 @@ Minimises, over the states X_k = (q, p[, s]) at all nodes (and over the paramete
 
 by Gauss–Newton. The matrix is block tridiagonal, bordered by the parameters: the cost grows with the number of samples,
 not with its cube. With θ held this is the fixed-interval smoother of Rauch, Tung & Striebel (1965), iterated for a
-nonlinear step (Bell 1994). w > 0 lets the motion leave the model a little at every step, so that a push, or a force the
-model does not know, is followed; with w → 0 it is the fit of the start states alone.
+nonlinear step (Bell 1994). w > 0 lets the motion leave the model a little at every step, so that a push, or an unknown
+force, is followed; w → 0 gives the fit of the start states alone.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.solvers.bordered import Bordered
 from herglotz.training.solvers.lifted_newton import all_steps, parameter_derivatives
 
-DAMPING = 1e-9  # of the first step of Levenberg–Marquardt: the stiff steps, not the data, make the diagonal
+# Damping of the first step of Levenberg–Marquardt: the stiff steps, not the data, make the diagonal.
+DAMPING = 1e-9
 
 
 class SmoothingProblem(StatesProblem):
     """The sum of squares above, over parameters and the states of all nodes of a grid of whole trajectories.
 
-    `process` is the standard deviation of what a step leaves of the model in v, relative to sigma, in the natural units
-    of both; that times the mass of each coordinate in p, the same share of the natural size in s, and h/√3 of v's in q,
-    as a random force would add. The other settings are those of `LeastSquares`; `freedom` is for the residuals of data
-    and steps.
+    `process` is the standard deviation of a step's noise in v, relative to sigma, in the natural units of both. The
+    noise in p is that times the mass of each coordinate, the noise in s the same share of the natural size of s, and
+    the noise in q h/√3 times that in v, as of a random force. The other settings are those of `LeastSquares`; `freedom`
+    is for the residuals of data and steps.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class SmoothingProblem(StatesProblem):
         self.seen, self.target = data.q.new_zeros(S * M, n), data.q.new_zeros(S * M, n)
         self.seen[grid.node], self.target[grid.node] = 1.0 if data.observed is None else data.observed, data.q
         self.seen, self.target = self.seen.reshape(S, M, n), self.target.reshape(S, M, n)
-        # What a force that the model does not know adds to v and p in a step, to q by the way, and to s.
+        # Standard deviations that an unknown force adds in a step: to v, to q by way of v, to p, and to s.
         v = (self.deviations * self.speed / self.scale).expand(*grid.h.shape, n)
         s = (self.sigma * v.new_tensor([self.action]) / self.scale.max()).expand(*grid.h.shape, 1)
         self.w = process * torch.cat([grid.h[..., None] / 3**0.5 * v, self.mass * v, s], -1)[..., :d]  # (S, K, d)
@@ -71,7 +72,8 @@ class SmoothingProblem(StatesProblem):
             x[b, :, :n] = self.data.q[rows[right - 1]] * (1 - share) + self.data.q[rows[right]] * share
         with torch.no_grad():
             _, p, _ = legendre_minus(self.parameters.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
-        step = torch.arange(K + 1, device=p.device).minimum(grid.end[:, None] - 1)  # last nodes and padding: the last
+        # The last nodes and the padding have the momentum of the last step.
+        step = torch.arange(K + 1, device=p.device).minimum(grid.end[:, None] - 1)
         x[..., n : 2 * n] = p[torch.arange(S, device=p.device)[:, None], step]
         return torch.cat([theta, x.flatten()])
 
@@ -93,11 +95,10 @@ class SmoothingProblem(StatesProblem):
         theta, states = self.unpack(x)
         stepped, (S, M, d), P = self._stepped(x), states.shape, 0 if held else self.P
         diagonal, upper, lower = x.new_zeros(3, S, M, d, d)
-        border, corner = x.new_zeros(S, M, d, P), x.new_zeros(P, P)
-        top, gradient = x.new_zeros(P), x.new_zeros(S, M, d)
+        border, gradient = x.new_zeros(S, M, d, P), x.new_zeros(S, M, d)
         if not everywhere(stepped is not None) or stepped is None:
-            unknown = torch.cat([top, gradient.flatten()])
-            return x.new_full((), torch.inf), Bordered(corner, border, (diagonal, upper, lower)), unknown
+            unknown = x.new_zeros(P + gradient.numel())
+            return x.new_full((), torch.inf), Bordered(x.new_zeros(P, P), border, (diagonal, upper, lower)), unknown
         y, A = stepped[0], stepped[1][..., :d, :d]
         fit, defect = self._residuals(states, y)
         by_fit = self.seen * self.root_weights(fit) / self.deviations  # (S, M, n)
@@ -107,7 +108,8 @@ class SmoothingProblem(StatesProblem):
         diagonal[..., : self.n, : self.n] += torch.diag_embed(by_fit.square())
         diagonal[:, :-1] += A.mT @ WA
         diagonal[:, 1:] += torch.diag_embed(weight[..., 0])
-        diagonal += torch.diag_embed((1 - self.inside).expand(-1, -1, d))  # padding stays where it is
+        # Padding stays where it is.
+        diagonal += torch.diag_embed((1 - self.inside).expand(-1, -1, d))
         upper[:, :-1], lower[:, 1:] = -WA.mT, -WA
         gradient[..., : self.n] = by_fit * self.root_weights(fit) * fit
         gradient[:, :-1] += (A.mT @ weighted[..., None])[..., 0]
@@ -115,20 +117,17 @@ class SmoothingProblem(StatesProblem):
         if d > 2 * self.n:
             diagonal[:, 0, -1, -1] += 1 / self.action**2
             gradient[:, 0, -1] += self._anchor(states) / self.action
+        B, of_prior = A.new_zeros(S, M - 1, d, 0), (self.prior_cost(theta), 0.0, 0.0)
         if not held:
-            q1 = y[..., : self.n]
             L_d = self.parameters.at(theta, self.u)
-            B = parameter_derivatives(L_d, self.with_s(states), q1, A, self.grid.h)
-            WB = weight * B
-            corner, top = torch.einsum("skdp,skdr->pr", B, WB), torch.einsum("skdp,skd->p", B, weighted)
-            border[:, :-1] += A.mT @ WB
-            border[:, 1:] -= WB
-        cost = self.loss(fit, defect) + self._anchor(states).square().sum() / 2
-        if held:
-            cost = cost + self.prior_cost(theta)
-        else:
+            B = parameter_derivatives(L_d, self.with_s(states), y[..., : self.n], A, self.grid.h)
             of_prior = self.prior_equations(theta)
-            cost, corner, top = cost + of_prior[0], corner + of_prior[1], top + of_prior[2]
+        WB = weight * B
+        border[:, :-1] += A.mT @ WB
+        border[:, 1:] -= WB
+        cost = self.loss(fit, defect) + self._anchor(states).square().sum() / 2 + of_prior[0]
+        corner = torch.einsum("skdp,skdr->pr", B, WB) + of_prior[1]
+        top = torch.einsum("skdp,skd->p", B, weighted) + of_prior[2]
         corner, border, diagonal, upper, lower = of_first(corner, border, diagonal, upper, lower)
         return cost, Bordered(corner, border, (diagonal, upper, lower)), torch.cat([top, gradient.flatten()])
 
@@ -143,14 +142,15 @@ class SmoothingProblem(StatesProblem):
         return self._residuals(self.unpack(x)[1], stepped[0])[1]
 
     def states(self, x: Tensor) -> Tensor:
-        """States (q, p, s) at every sample, (N, 2n+1); where s does not enter the motion it counts along from 0."""
+        """States (q, p, s) at every sample, (N, 2n+1); where s does not enter the motion, s is summed from 0."""
         theta, states = self.unpack(x)
         full = self.with_s(states)
         if self.d == 2 * self.n:
             with torch.no_grad():
                 L_d = self.parameters.at(theta, self.u)
                 P = partials(L_d, full[:, :-1, : self.n], full[:, 1:, : self.n], 0 * self.grid.h, self.grid.h)
-            for k in range(self.grid.longest):  # L_d = L_d(s = 0) + (c − 1) s
+            # L_d = L_d(s = 0) + (c − 1) s
+            for k in range(self.grid.longest):
                 full[:, k + 1, -1] = P.c[:, k] * full[:, k, -1] + P.L[:, k]
         return self.grid.at_samples(full)
 
@@ -160,11 +160,12 @@ class SmoothingProblem(StatesProblem):
             theta, states = self.unpack(x)
             with torch.no_grad():
                 stepped = all_steps(self.parameters.at(theta, self.u), self.with_s(states), self.grid.h)
-            self._stepped_at = x.clone(), stepped  # an accepted step has been solved for its cost
+            # The normal equations of an accepted step use the solution that its cost has made.
+            self._stepped_at = x.clone(), stepped
         return self._stepped_at[1]
 
     def _residuals(self, states: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the data, (S, M, n), and of the steps, (S, K, d); 0 where there is no sample or no step."""
+        """Residuals of the data, (S, M, n), and of the steps, (S, K, d); 0 where there is no sample or no step."""
         fit = self.seen * (states[..., : self.n] - self.target) / self.deviations
         return fit, self.inside[:, 1:] * (y[..., : self.d] - states[:, 1:]) / self.w
 

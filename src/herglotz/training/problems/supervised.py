@@ -1,8 +1,8 @@
 """The one-step objective where more than positions is recorded: s, or s and p.
 
-Positions determine L_d up to a gauge; recorded s and p remove it, and with it the unknown s₀ that makes the full level
-unreliable from positions alone. What is left is their unit: the model's first mass is 1, the recorded one is not, so
-s and p are those of the model times one factor κ > 0 that is fitted beside the parameters.
+Positions determine L_d up to a gauge. Recorded s and p remove the gauge, and with it the unknown s₀ that makes the full
+level unreliable from positions alone. Their unit remains unknown: the model's first mass is 1 and the recorded mass is
+not, so that s and p are those of the model times one factor κ > 0, which is fitted beside the parameters.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class SupervisedProblem(OneStep):
 
         r_q = J⁻¹R at the recorded s,    r_s = (s₁ − s₀)/κ − L_d,    r_p = p₁/κ − D2 L_d − F⁺ (with momenta only),
 
-    r_s and r_p brought to units of q by the natural sizes of s and p. Settings are those of `ResidualProblem`. Raise
-    InputError if s, or p where it is asked for, is not recorded.
+    r_s and r_p brought to units of q by the natural sizes of s and p; r_p counts with `momenta` only. Settings are
+    those of `ResidualProblem`. Raise InputError if s, or p with `momenta`, is not recorded.
     """  # noqa: D400  the formula is part of the sentence
 
     def __init__(
@@ -35,7 +35,7 @@ class SupervisedProblem(OneStep):
         model: ContactLagrangian,
         data: Trajectories,
         *,
-        momenta: bool,  # whether recorded momenta are used too
+        momenta: bool,
         max_step: float | None = None,
         **settings: Any,
     ):

@@ -1,7 +1,7 @@
 """Zeros of sensors as unknowns of a fit: y = q + z.
 
-Either z = 0 in the reference, the recording of most samples, or no term of the model is odd: where q and −q move alike,
-symmetry says where 0 is.
+Either z = 0 in the reference, the recording of most samples, or no term of the model is odd: then q and −q move alike,
+and this symmetry determines 0.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ def reference_of(data: Trajectories) -> int:
 class WithZeros:
     """A shooting problem with zeros of sensors as further unknowns: (unknowns of the problem, then (B − 1) · n).
 
-    Each recording but the reference has zeros of its own, (B · n) with the reference's where parameters are `held`.
-    Where zeros are `shared` there are n, those of all recordings; where they `grow`, (N,), each sample has so many
-    times its zero.
+    Each recording but the reference has zeros of its own. With `held` parameters, the places of those of odd terms, the
+    reference has zeros, too: (B · n). Zeros that are `shared` are n numbers, the same in all recordings. With `grow`,
+    (N,), each sample has so many times its zero.
     """
 
     def __init__(
         self,
         problem: ShootingProblem,
-        held: Tensor | None = None,  # places of the parameters of odd terms, which stay as they are
+        held: Tensor | None = None,
         *,
         shared: bool = False,
         grow: Tensor | None = None,
@@ -71,20 +71,20 @@ class WithZeros:
 
 
 def by_zeros(problem: ShootingProblem, which: Tensor, grow: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """What (JᵀJ, Jᵀr) have of zeros z of sensors, where the normal equations of all unknowns were made last.
+    """The parts of (JᵀJ, Jᵀr) that belong to zeros z of sensors: columns (unknowns, Z, n), diagonal, gradient (Z, n).
 
-    `which` zero, from 0, each sample has, (N,), and how many times it, `grow` (N,); −1: none. Columns (unknowns, Z, n),
-    diagonal and gradient (Z, n).
+    They hold where the normal equations of all other unknowns were made last. Sample k has the zero `which[k]`, −1 for
+    none, times `grow[k]`; both are (N,).
     """
     assert problem.path is not None
     assert problem._at is not None
     count = int(which.max()) + 1
     fit = problem._missed_by(problem.path.x)
-    by = problem.weight * problem.root_weights(fit) / problem.deviations  # ∂r/∂z
+    by = problem.weight * problem.root_weights(fit) / problem.deviations  # (N, n) ∂r/∂z
     slopes = problem.slopes_at_samples(problem._at[: problem.P], problem.path)
     rows = slopes * (by.square() * grow[:, None])[..., None]  # (N, n, P + d)
     segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
-    # Of every segment, whose samples have one zero: (S, P + d, n).
+    # Samples of a segment have the same zero.
     S, of = problem.grid.segments, torch.full((problem.grid.segments,), -1, device=which.device)
     of[segment] = which
     own = rows.new_zeros(S, *rows.shape[:0:-1]).index_add(0, segment, rows.mT)

@@ -1,51 +1,39 @@
-"""Adam and AdamW with a cosine schedule, on all rows or on minibatches: for comparison, and for very many rows."""
+"""Adam and AdamW with a cosine schedule, on all rows or on minibatches: for comparison, and for large networks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, Progress
 
-DECAY = 1e-2  # of AdamW's weights (Loshchilov & Hutter 2019)
-QUIET, PATIENCE = 1e-8, 50  # so many costs in a row that differ by less than this, relative, end the search
-
-
-class Differentiable(Protocol):
-    """A scalar objective with its gradient, a sum over rows."""
-
-    @property
-    def rows(self) -> int:
-        """How many there are."""
-        ...
-
-    def cost(self, x: Tensor) -> Tensor:
-        """The whole cost, a scalar."""
-        ...
-
-    def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """(cost, ∂cost/∂x); with `rows`, their share of it made to stand for all."""
-        ...
+# Decay of AdamW's weights (Loshchilov & Hutter 2019).
+DECAY = 1e-2
+# The search ends after so many costs in a row that differ by less than this, relative.
+QUIET, PATIENCE = 1e-8, 50
 
 
 def adam(
-    problem: Differentiable,
+    problem: Any,
     x: Tensor,  # (P,) start
     *,
-    max_iterations: int = 2000,  # length of the schedule
-    learning_rate: float = 3e-3,  # its peak
-    decay: float = 0.0,  # of the weights, as in AdamW
-    batch: int | None = None,  # rows a step, each once a round; None: all
-    seed: int = 0,  # of the order of the rows
-    callback: Progress | None = None,  # called after each iteration; a search goes on from what it holds, bit for bit
+    max_iterations: int = 2000,
+    learning_rate: float = 3e-3,
+    decay: float = 0.0,
+    batch: int | None = None,
+    seed: int = 0,
+    callback: Progress | None = None,
 ) -> OptimiserResult:
-    """Adam with a cosine schedule; returns the best finite point visited.
+    """Adam with a cosine schedule over `max_iterations`; returns the best finite point visited.
 
-    The search ends earlier where the cost has stopped to change. With batches the cost of all rows is taken, and the
-    best point chosen by it, once a round.
+    `problem` is a sum over `rows`, with `cost(x)` and `cost_and_gradient(x, rows)`, as `OneStep`. `decay` of the
+    weights makes Adam AdamW. A step takes `batch` rows (None: all), each row once a round, in an order drawn by `seed`;
+    the cost of all rows is taken, and the best point chosen by this cost, once a round. The search ends earlier where
+    the cost has stopped to change. `callback` is called after each iteration; a search goes on from what it holds, bit
+    for bit.
     """
     current = x.clone().requires_grad_()
     optimiser = torch.optim.AdamW([current], lr=learning_rate, weight_decay=decay)
@@ -96,7 +84,7 @@ def adam(
 
 
 def _rounds(count: int, batch: int | None, seed: int) -> Iterator[tuple[Tensor | None, bool]]:
-    """Batches of row numbers, None for all, and whether each is the last of its round; the same on every machine."""
+    """Batches of rows (None: all rows), and whether a batch is the last of its round; the same on every machine."""
     make = torch.Generator().manual_seed(seed)
     while batch is None or batch >= count:
         yield None, True

@@ -38,24 +38,18 @@ class Bordered:
 
     def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
         """(matrix + diag(damping))⁻¹ b, or None if there is no finite solution."""
-        y = self.solve_many(b[:, None], damping)
-        finite = y is not None and bool(torch.isfinite(y).all())
-        return of_first(y[:, 0])[0] if everywhere(finite) and y is not None else None
-
-    def solve_many(self, b: Tensor, damping: Tensor | None = None) -> Tensor | None:
-        """`solve` for columns b (P + S·M·d, R); None if the reduced matrix is not positive definite."""
         P, shape = len(self.corner), self.border.shape
-        corner, (diagonal, *beside) = self.corner.double(), (x.double() for x in self.blocks)
-        if damping is not None:
-            corner = corner + torch.diag(damping[:P].double())
-            diagonal = diagonal + torch.diag_embed(damping[P:].double().reshape(shape[:3]))
+        diagonal, *beside = (x.double() for x in self.blocks)
+        corner = self.corner.double() + torch.diag(damping[:P].double())
+        diagonal = diagonal + torch.diag_embed(damping[P:].double().reshape(shape[:3]))
         border = self.border.double()
-        columns = torch.cat([border, b[P:].double().reshape(*shape[:3], -1)], -1)
+        columns = torch.cat([border, b[P:].double().reshape(*shape[:3], 1)], -1)
         solved = eliminate((diagonal, beside[0], beside[1]), columns)
         by_border, by_b = solved[..., :P], solved[..., P:]
         reduced = corner - torch.einsum("smdp,smdr->pr", border, by_border)
         factor, info = torch.linalg.cholesky_ex((reduced + reduced.T) / 2)
-        if int(info) != 0:
-            return None
-        top = torch.cholesky_solve(b[:P].double() - torch.einsum("smdp,smdr->pr", border, by_b), factor)
-        return torch.cat([top, (by_b - by_border @ top).flatten(0, 2)]).to(b.dtype)
+        right = b[:P, None].double() - torch.einsum("smdp,smdr->pr", border, by_b)
+        top = torch.cholesky_solve(right, factor)
+        y = torch.cat([top, (by_b - by_border @ top).flatten(0, 2)]).to(b.dtype)[:, 0]
+        solved_here = int(info) == 0 and bool(torch.isfinite(y).all())
+        return of_first(y)[0] if everywhere(solved_here) else None

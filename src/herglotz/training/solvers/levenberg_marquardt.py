@@ -20,7 +20,7 @@ NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
 
 
 class ByProducts(Protocol):
-    """A matrix JᵀJ given by products with vectors (`matrix_free`)."""
+    """A matrix JᵀJ with a structure of its own, which its products and its solver use."""
 
     def __matmul__(self, v: Tensor, /) -> Tensor:
         """JᵀJ v."""
