@@ -17,7 +17,7 @@ from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import parted, with_missing
 from herglotz.data.polar import named_by
-from herglotz.data.readers import angles_like, as_told, load, with_angles
+from herglotz.data.readers import angles_like, as_meant, load, with_angles
 from herglotz.data.sensors import calibrated
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame, plain, seconds
@@ -105,10 +105,10 @@ def as_trajectories(
     if isinstance(data, Trajectories):
         refuse({OF_TRAJECTORIES: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         changed = any(x is not None for x in (degrees, polar, input_terms))
-        found = as_told(data, AS_THEY_ARE, **meant) if changed else data
+        found = as_meant(data, AS_THEY_ARE, **meant) if changed else data
     elif _is_table(data, h):
         wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
-        found = as_told(_table(data, wanted), wanted, **meant)
+        found = as_meant(_table(data, wanted), wanted, **meant)
         found = found if like is None else angles_like(found, like)
         return _shown(_marked(calibrated(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
@@ -116,7 +116,7 @@ def as_trajectories(
         refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
         return calibrated(_of_each(data, {"h": h, "time": time, **names, **meant}), sensor_zeros)
     else:
-        found = as_told(_array(data, h, time, names), AS_THEY_ARE, **meant)
+        found = as_meant(_array(data, h, time, names), AS_THEY_ARE, **meant)
     return _noted(_marked(calibrated(found, sensor_zeros, sensor_scales), angles), data)
 
 

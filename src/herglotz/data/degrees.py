@@ -19,7 +19,7 @@ from herglotz.errors import check_coordinates
 TURN = {"rad": 2 * math.pi, "deg": 360.0}
 
 
-def in_told_degrees(
+def with_angles_in_degrees(
     data: Trajectories,  # as recorded, angles not yet unwrapped
     degrees: Names | None,  # coordinates in degrees; () for none; None: as the motion shows
     angles: Names | bool | None,  # coordinates that the user calls angles in rad
