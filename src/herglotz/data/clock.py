@@ -1,4 +1,4 @@
-"""Stamps that repeat: a clock that counts more slowly than samples come, or rows that were written twice."""
+"""Repeated time stamps: a clock that counts more slowly than samples come, or rows that were written twice."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import numpy as np
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.rates import Recording
 
-NEARLY = 1e-3  # of a count: stamps of float64 are whole counts to within this
+# Stamps within this part of a count are whole counts: decimal numbers are rounded in float64.
+COUNT_TOLERANCE = 1e-3
 
 
 def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
-    """The recording with stamps that increase, and what was made of those that repeat; it itself where some decrease.
+    """The recording with increasing stamps, and a note on the repair; unchanged if no stamp repeats or some decrease.
 
-    Where all stamps are whole counts and equal steps miss none of them by more than a count, the samples were taken in
-    equal steps, and get their times from their number. Otherwise the first row of each stamp is kept.
+    If all stamps are whole counts, and equal steps miss no stamp by more than a count, the samples were taken in equal
+    steps: the number of a sample gives its time. Otherwise the first row of each stamp is kept.
     """
     t = one.values[:, 0]
     d = np.diff(t)
@@ -23,7 +24,7 @@ def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
     count, steps = float(d[d > 0].min()), np.arange(len(t)) - (len(t) - 1) / 2
     h = float(steps @ (t - t.mean()) / (steps @ steps))
     even, counts = t.mean() + h * steps, (t - t[0]) / count
-    whole = bool((np.abs(counts - counts.round()) <= NEARLY).all()) and bool((np.abs(even - t) <= count).all())
+    whole = bool((np.abs(counts - counts.round()) <= COUNT_TOLERANCE).all()) and bool((np.abs(even - t) <= count).all())
     twice = d == 0
     same = _written_twice(one.values[1:][twice], one.values[:-1][twice])
     if whole and int(twice.sum()) >= MIN_SAMPLES and not same:

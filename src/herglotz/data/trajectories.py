@@ -14,7 +14,7 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
 from herglotz.data.column_table import INPUT_TERM, column_table, summary_of
-from herglotz.data.holds import Arrival, check_arrival, held
+from herglotz.data.holds import Arrival, check_arrival, interpolated_input
 from herglotz.data.missing import interpolated, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
@@ -200,7 +200,7 @@ class Trajectories:
             return None
         row = torch.arange(self.samples, device=self.t.device) if row is None else row
         part = torch.full_like(row, 0.5, dtype=self.t.dtype) if part is None else part
-        return held(self.hold, self.t, self.u, self.lengths, row, part)
+        return interpolated_input(self.hold, self.t, self.u, self.lengths, row, part)
 
     @property
     def arrival(self) -> Arrival:
