@@ -14,7 +14,7 @@ MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")
 
 
 class Unusable(InputError):
-    """A recording that is too short or out of order: others of the same set can be used without it."""
+    """A recording that is too short or out of order: the other recordings of the set can be used without it."""
 
 
 def quote(text: str) -> str:
@@ -22,11 +22,12 @@ def quote(text: str) -> str:
     return repr(text if len(text) <= MAX_QUOTED else text[:MAX_QUOTED] + "…")
 
 
-def number(
-    text: str,  # a cell
-    where: str,  # file, row and column: begins the message
-) -> float:
-    """Parse a finite number; raise InputError if the cell is blank, not a number, NaN or infinite."""
+def number(text: str, where: str) -> float:
+    """The finite number in a cell.
+
+    Raise InputError, which begins with `where` (file, row and column), if the cell is blank, not a number, NaN,
+    infinite, or an integer that float64 rounds.
+    """
     try:
         value = float(text)
     except ValueError:

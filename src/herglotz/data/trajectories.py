@@ -20,10 +20,13 @@ from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time
 from herglotz.data.windows import Steps, Triples, triples, unwrap
 from herglotz.errors import InputError, check_coordinates, refuse
 
-TAKEN_FOR_DEGREES = "taken for deg"  # in the place of a unit that the header had not, or had wrong
+# Stands in place of a unit that is missing in the header, or wrong.
+TAKEN_FOR_DEGREES = "taken for deg"
 DEGREES = ("deg", "°", "degree", "degrees", TAKEN_FOR_DEGREES)
-GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
-IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of loggers stay below 0.02
+# A step longer than this many typical (median) steps is a gap.
+GAP = 1.5
+# Standard deviation of the steps over their median: the clocks of loggers stay below 0.02.
+IRREGULAR = 0.05
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,16 +38,20 @@ class Trajectories:
     Parameters
     ----------
     t, q, lengths, names, units, angles
-        (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
+        (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units ("rad", "m", "1", ...),
+        and which are angles, 2π-periodic and in "rad".
     s, p, u, v
         (N,) action and (N, n) momentum, as in `herglotz.State`, (N, m) control input and (N, n) velocity of a model, in
         units of the recording, where they are known.
     observed
-        (N, n) dimensionless weight of each position in a fit: 0 where none was read and q interpolates; None: 1.
+        (N, n) dimensionless weight of each position in a fit: 0 for a missing position, which q interpolates, else 1;
+        None: no position is missing.
     time_unit, source, columns, notes
-        Of t; origin, for messages; name, role and unit of each column that was read; notes on the reading.
+        Unit of t; file or scene of origin, for messages; name, role and unit of each column of a table, as read; notes
+        on the reading.
     hold, delay, lag
-        The input between samples; the delay and the time constant of the actuator, in the unit of t; 0: u itself acts.
+        The input between samples (`herglotz.data.holds`), "" if unspecified; the delay and the time constant of the
+        actuator (`herglotz.data.actuator`), in the unit of t: None if unspecified, 0: u itself acts.
 
     Raises
     ------
@@ -52,24 +59,24 @@ class Trajectories:
         Naming the field, the trajectory, the sample and the remedy.
     """
 
-    t: Tensor  # (N,) time
-    q: Tensor  # (N, n) position
-    lengths: tuple[int, ...]  # samples of each trajectory, adding up to N
-    names: tuple[str, ...]  # of the coordinates
-    units: tuple[str, ...]  # "rad", "m", "pixel", "1", ...
-    angles: tuple[bool, ...]  # a coordinate that is 2π-periodic, in "rad"
-    s: Tensor | None = None  # (N,) action variable, where known
-    p: Tensor | None = None  # (N, n) momentum, where known
-    u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
+    t: Tensor  # (N,)
+    q: Tensor  # (N, n)
+    lengths: tuple[int, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    angles: tuple[bool, ...]
+    s: Tensor | None = None  # (N,)
+    p: Tensor | None = None  # (N, n)
+    u: Tensor | None = None  # (N, m)
     time_unit: str = "s"
-    source: str = ""  # file or scene of origin, for messages
-    hold: str = ""  # the input between samples (`herglotz.data.holds`); "": not said
-    delay: float | None = None  # with which u acts (`herglotz.data.actuator`); None: not said
-    lag: float | None = None  # time constant of the actuator; None: not said
-    columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as read
-    notes: tuple[str, ...] = ()  # on reading the table: separators, rows left out
-    v: Tensor | None = None  # (N, n) velocity, of a model: recorded ones are not read
-    observed: Tensor | None = None  # (N, n) 0 where a position is missing, else 1; None: none is
+    source: str = ""
+    hold: str = ""
+    delay: float | None = None
+    lag: float | None = None
+    columns: tuple[tuple[str, str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    v: Tensor | None = None  # (N, n)
+    observed: Tensor | None = None  # (N, n)
 
     def __post_init__(self) -> None:
         check_arrival(self.source or "trajectories", self.arrival)
@@ -159,7 +166,7 @@ class Trajectories:
 
     @property
     def degrees(self) -> tuple[str, ...]:
-        """Coordinates that the table had in degrees: in rad here, and reported in degrees too."""
+        """Coordinates that the table had in degrees: they are in rad here, and reported in degrees, too."""
         return tuple(name for name, _, unit in self.columns if unit in DEGREES and name in self.names)
 
     @property
@@ -221,7 +228,7 @@ class Trajectories:
 
     @property
     def irregular(self) -> bool:
-        """Whether the steps differ by more than clocks do, also where no sample is missing."""
+        """Whether the steps differ by more than the clocks of loggers do, gaps aside."""
         h = self.steps().h
         return float(h[h <= GAP * h.median()].std(correction=0)) > IRREGULAR * self.typical_step
 
@@ -237,14 +244,14 @@ class Trajectories:
         return self.rows(train.to(device), train_lengths), self.rows(test.to(device), test_lengths)
 
     def liveliest(self, most: int) -> Trajectories:
-        """Return at most about `most` samples: of trajectories evenly chosen the run of samples that moves most."""
+        """Return at most about `most` samples: from evenly chosen trajectories the run of samples that moves most."""
         rows, lengths = liveliest_rows(self.q, self.lengths, most)
         return self if len(rows) == self.samples else self.rows(rows.to(self.t.device), lengths)
 
     def thinned(self, every: int) -> Trajectories:
         """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the longer steps.
 
-        If positions are missing, only complete samples and the first of each trajectory are counted.
+        If positions are missing, only complete samples and the first sample of each trajectory are counted.
 
         Raises
         ------
@@ -321,7 +328,7 @@ class Trajectories:
         return replace(self, angles=flags, units=units)
 
     def digest(self) -> str:
-        """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
+        """Return the sha256 (hex) of values, dtype and labels, without source and device."""
         arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
         labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
         labels += [x if name == "hold" else {name: x} for name, x in self.arrival._asdict().items() if x]

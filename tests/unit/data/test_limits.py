@@ -57,7 +57,7 @@ def test_an_archive_says_its_size_before_it_is_inflated(tmp_path, monkeypatch):
     # fails if memory is spent on what a small archive inflates to, or an array that nobody uses is inflated at all
     path, t = tmp_path / "bomb.npz", np.arange(5.0)
     np.savez_compressed(path, t=t, q=t, junk=np.zeros(200_000))
-    monkeypatch.setattr(npz, "LARGEST", 100_000)
+    monkeypatch.setattr(npz, "MAX_BYTES", 100_000)
     monkeypatch.setattr(zipfile.ZipExtFile, "MAX_N", 1 << 20)
     assert read_npz(path).samples == 5
     np.savez_compressed(path, t=t, q=np.zeros(200_000))
