@@ -23,7 +23,7 @@ NUMBERED = r"(_?\d+|_.*)?"
 # Names that have a role whatever their words, unless the unit is of another kind.
 ROLES = {
     "time": re.compile(
-        r"t|times?|timestamps?|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
+        r"t|times?|timestamps?|date|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
         r"|czas|čas|aika"
     ),
     "trajectory": re.compile(r"trajectory|trial|run"),

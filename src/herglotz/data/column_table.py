@@ -11,20 +11,11 @@ from herglotz.data.column_roles import is_angular
 INPUT_TERM = "input term"
 # Begins a note that is printed outside of the table, too.
 WARNING = "warning: "
-# Columns that are printed: recordings have fewer, and 100 000 lines fill a terminal for minutes.
-MAX_PRINTED_COLUMNS = 200
 
 
 def column_table(data: Any) -> str:
-    """Return a line for each column of `Trajectories`: role, unit, and the conversion of the unit.
-
-    Notes and warnings follow. Of more than `MAX_PRINTED_COLUMNS` columns the table shows the first, the last, and the
-    number of the others.
-    """
+    """Return a line for each column of `Trajectories`: role, unit, and the conversion of the unit; then the notes."""
     rows = [("column", "is taken for", "unit"), *column_rows(data)]
-    left = len(rows) - 1 - MAX_PRINTED_COLUMNS
-    if left > 0:
-        rows[1 + MAX_PRINTED_COLUMNS // 2 : 1 + MAX_PRINTED_COLUMNS // 2 + left] = [("…", f"{left} more", "")]
     widths = [max(len(row[k]) for row in rows) for k in range(2)]
     lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
     source = data.source or "table"

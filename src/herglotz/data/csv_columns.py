@@ -30,6 +30,8 @@ HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*"
 TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
 # A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
 SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
+# Fields of `Wanted` that give columns a role, and the role.
+ROLE_OF_FIELD = {"time": "time", "group": "trajectory", "drop": "dropped", "coordinates": "q", "inputs": "input"}
 # Roles by their names in the table of columns.
 AS_SHOWN = {
     "time": "time", "trajectory": "trajectory", "coordinate": "q", "input": "input", "left aside": "dropped",
@@ -70,9 +72,8 @@ class Wanted:
 
     def role(self, name: str) -> str | None:
         """The role that the user gives to this column; None where the user says nothing."""
-        given = (("time", self.time), ("trajectory", self.group), ("dropped", self.drop), ("q", self.coordinates))
-        for role, wanted in (*given, ("input", self.inputs)):
-            if name in as_names(wanted or ()):
+        for field, role in ROLE_OF_FIELD.items():
+            if name in as_names(getattr(self, field) or ()):
                 return role
         return "q" if name in self.positions and self.coordinates is None else None
 
@@ -82,8 +83,7 @@ class Wanted:
     @property
     def names(self) -> tuple[str, ...]:
         """All columns that the user names."""
-        fields = (self.time, self.group, self.drop, self.coordinates, self.inputs, self.positions)
-        return tuple(name for wanted in fields if wanted for name in as_names(wanted))
+        return tuple(name for field in (*ROLE_OF_FIELD, "positions") for name in as_names(getattr(self, field) or ()))
 
     def by_name(self, cells: Sequence[str], names: Sequence[str]) -> Wanted:
         """The same roles, with the name of each column that the user gives as its whole cell, `x (m)`."""
@@ -93,8 +93,7 @@ class Wanted:
             found = [name_of.get(name, name) for name in as_names(wanted or ())]
             return wanted if not wanted else found[0] if isinstance(wanted, str) else tuple(found)
 
-        fields = ("time", "group", "drop", "coordinates", "inputs", "positions")
-        return replace(self, **{field: named(getattr(self, field)) for field in fields})
+        return replace(self, **{field: named(getattr(self, field)) for field in (*ROLE_OF_FIELD, "positions")})
 
     def before(self, name: str) -> str | None:
         """The role of the column of this name in the other table; None if the other table has no such column."""
@@ -151,7 +150,7 @@ def assign(cells: Sequence[str], where: str, wanted: Wanted = HEADER_DECIDES) ->
     """
     names, units = _parse(cells, where)
     place = {name: i for i, name in enumerate(names)}
-    wanted = _dated(wanted.by_name(cells, names), names)
+    wanted = wanted.by_name(cells, names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     guesses = _guesses(names, units, wanted)
@@ -205,8 +204,8 @@ def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Gue
         return Guess(own)
     known = wanted.before(name)
     guess = Guess(known) if known else role_of(name, unit, others)
-    taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
-    return Guess("dropped") if taken.get(guess.role) is not None else guess
+    taken = [role for field, role in ROLE_OF_FIELD.items() if field != "drop" and getattr(wanted, field) is not None]
+    return Guess("dropped") if guess.role in taken else guess
 
 
 def _other_clocks(names: Sequence[str], units: Sequence[str], roles: dict[str, list[int]]) -> list[int]:
@@ -287,14 +286,6 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
         ways = ["--inputs or --drop with the names of those that are none"]
     verb = ("is" if one else "are") + (f" taken for {role}" if role else " left aside")
     return f"warning: {few} {verb}, but {doubt}; else give {' or '.join(ways)}"
-
-
-def _dated(wanted: Wanted, names: Sequence[str]) -> Wanted:
-    """The same roles, with a column `date` as the time if no other column is a time, such as a time of day."""
-    dates = [name for name in names if name.casefold() == "date"]
-    if wanted.time is not None or len(dates) != 1 or any(ROLES["time"].fullmatch(name.casefold()) for name in names):
-        return wanted
-    return replace(wanted, time=dates[0])
 
 
 def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:

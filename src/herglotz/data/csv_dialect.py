@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -71,12 +70,6 @@ def in_commas(
     return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes)
 
 
-def is_row_of_numbers(line: str) -> bool:
-    """Whether a line has two numbers or more, and nothing else, between separators of any kind."""
-    rows = (cells_of(line.rstrip(f" {separator}"), separator) for separator in SEPARATORS)
-    return any(len(cells) > 1 and _all_numbers(cells) for cells in rows)
-
-
 def _all_numbers(cells: Sequence[str]) -> bool:
     """Whether all cells are numbers, with decimal points or commas."""
     return all(is_number(cell.replace(",", ".")) for cell in cells)
@@ -106,13 +99,8 @@ def _without_titles(rows: Rows) -> tuple[Rows, list[str]]:
     at = next((k for k, (_, line) in first if any(_has_time(line, mark) for mark in SEPARATORS)), 0)
     if at == 0 or not _is_header(rows[at : at + 3]):
         return rows, []
-    number, header = rows[at]
-    separator = _separator(header, rows[at + 1][1]) or ","
-    titles, cells = (cells_of(line, separator) for line in (rows[at - 1][1].rstrip("\r"), header))
-    if len(set(cells)) < len(cells) == len(titles):
-        header = separator.join(_with_titles(cells, titles))
     plural = "s" if at > 1 else ""
-    return [(number, header), *rows[at + 1 :]], [f"{at} line{plural} above the header, which is row {number}, left out"]
+    return rows[at:], [f"{at} line{plural} above the header, which is row {rows[at][0]}, left out"]
 
 
 def _has_time(line: str, separator: str) -> bool:
@@ -129,20 +117,6 @@ def _is_header(rows: Rows) -> bool:
     units = any(kind_of(cell.strip("[]()<> ")) == "time" for cell in below[0])
     numbers = [cell for cell in below[-1 if units else 0] if cell.casefold() not in MISSING]
     return bool(numbers) and _all_numbers(numbers)
-
-
-def _with_titles(cells: Sequence[str], titles: Sequence[str]) -> list[str]:
-    """Repeated names, as of several bodies, extended by the title above the name; the first time column serves all."""
-    found: list[str] = []
-    title, count = "", Counter(cells)
-    for cell, above in zip(cells, titles, strict=True):
-        title, (name, unit) = above or title, name_and_unit(cell) or (cell, "")
-        clock = is_time(name, unit)
-        if count[cell] == 1 or not title or (clock and cell not in found):
-            found.append(cell)
-        else:
-            found.append("_".join(["time" if clock else name, *title.split()]) + (f"[{unit}]" if unit else ""))
-    return found
 
 
 def _separator(header: str, row: str) -> str | None:

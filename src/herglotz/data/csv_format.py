@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -16,11 +17,11 @@ from herglotz.data.checks import EXACT
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.csv_dialect import Rows, cells_of, in_commas
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.rows import MISSING, number, number_or_none, quote
+from herglotz.data.rows import MISSING, number, quote
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import from_table, in_dates, moment
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import refuse_unknown, with_units
+from herglotz.data.unit_row import with_units
 from herglotz.errors import InputError, refuse
 
 # Comments about inputs (hold, delay, lag) and about sensors (zero, scale).
@@ -73,9 +74,8 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     _check_kinds(path, columns, rows)
     comments = [line for line in lines if line.lstrip().startswith("#")]
     values = _plain_numbers(columns, rows)
-    labels, values = _parse_rows(path, columns, rows) if values is None else (_labels(columns, rows), values)
-    at = [i for i, _ in rows]
-    _check_labels(path, at, labels)
+    values = _parse_rows(path, columns, rows) if values is None else values
+    labels, at = _labels(path, columns, rows), [i for i, _ in rows]
     found = from_table(path, columns, at, labels, values, lambda found: _with_settings(found, comments))
     if rows and not is_number(cells_of(rows[0][1])[columns.time]):
         found = in_dates(found)
@@ -121,26 +121,22 @@ def _with_nan(line: str) -> str:
     return line
 
 
-def _labels(columns: Columns, rows: Rows) -> list[str]:
-    """The label of the trajectory of each row; blank where the table has no such column."""
+def _labels(path: Path, columns: Columns, rows: Rows) -> list[str]:
+    """The label of the trajectory of each row; raise if some rows have a label and others have not."""
     if columns.trajectory is None:
         return [""] * len(rows)
-    return [cells_of(line)[columns.trajectory] for _, line in rows]
-
-
-def _check_labels(path: Path, at: Sequence[int], labels: list[str]) -> None:
-    """Raise if some rows name a trajectory and others do not."""
+    labels = [cells_of(line)[columns.trajectory] for _, line in rows]
     if any(labels) and not all(labels):
-        where = f"{path}, row {at[labels.index('')]}, column 'trajectory'"
+        where = f"{path}, row {rows[labels.index('')][0]}, column 'trajectory'"
         raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
+    return labels
 
 
-def _parse_rows(path: Path, columns: Columns, rows: Rows) -> tuple[list[str], list[list[float]]]:
-    """Label and numbers of every row, cell by cell: dates become seconds, and an error names row and column."""
-    width, labels, values = len(columns.names), [], []
+def _parse_rows(path: Path, columns: Columns, rows: Rows) -> list[list[float]]:
+    """The numbers of every row, cell by cell: dates become seconds, and an error names row and column."""
+    width, values = len(columns.names), []
     # The date of the first row, where times are dates.
     first = None
-    parse = {i: number if i == columns.time else number_or_none for i in columns.numeric}
     for at, line in rows:
         cells = cells_of(line)
         if len(cells) != width:
@@ -151,25 +147,23 @@ def _parse_rows(path: Path, columns: Columns, rows: Rows) -> tuple[list[str], li
         if date is not None and not is_number(cells[columns.time]):
             first = first or date
             cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
-        values.append([parse[i](cells[i], f"{path}, row {at}, column '{columns.names[i]}'") for i in columns.numeric])
-        labels.append("" if columns.trajectory is None else cells[columns.trajectory])
-    return labels, values
+        missing = {i for i in columns.numeric if i != columns.time and cells[i].casefold() in MISSING}
+        where = {i: f"{path}, row {at}, column '{columns.names[i]}'" for i in columns.numeric}
+        values.append([math.nan if i in missing else number(cells[i], where[i]) for i in columns.numeric])
+    return values
 
 
 def _check_kinds(path: Path, columns: Columns, rows: Rows) -> None:
     """Raise if a column of text would be read as numbers: neither of its first two cells is a number."""
     two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
     for i in columns.numeric if len(two) == 2 else ():
-        if any(is_number(x) or x.casefold() in MISSING for x in (cells[i] for cells in two)):
-            continue
-        if i == columns.time and any(moment(cells[i]) for cells in two):
-            continue
-        name, remedy = columns.names[i], "write numbers, or dates such as 2026-03-01 12:00:00.25"
-        if i != columns.time:
-            remedy = f"leave the column out with --drop {name} (drop= in Python), or write numbers"
-        raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(two[0][i])} is not a number; {remedy}")
-    if len(two) == 2:
-        refuse_unknown(columns, two[0], f"{path}, row {rows[0][0]}")
+        name, pair = columns.names[i], [cells[i] for cells in two]
+        remedy = f"leave the column out with --drop {name} (drop= in Python), or write numbers"
+        is_date = i == columns.time and any(map(moment, pair))
+        if i == columns.time:
+            remedy = "write numbers, or dates such as 2026-03-01 12:00:00.25"
+        if not is_date and not any(is_number(x) or x.casefold() in MISSING for x in pair):
+            raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(pair[0])} is not a number; {remedy}")
 
 
 def _since(first: datetime, date: datetime, where: str) -> float:

@@ -281,10 +281,9 @@ def _variance(arm: Tensor) -> float:
 
 
 def with_hints(data: Trajectories) -> Trajectories:
-    """The set with a warning of each pair of positions x, y that stays on a circle: the pair may be a body on an arm."""
-    notes = [
-        f"warning: {one.description}; one body on an arm? {one.remedy} makes one angle of it" for one in circles(data)
-    ]
+    """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
+    found = circles(data)
+    notes = [f"warning: {one.description}; one body on an arm? {one.remedy} makes one angle of it" for one in found]
     return replace(data, notes=(*data.notes, *notes)) if notes else data
 
 

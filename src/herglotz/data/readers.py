@@ -11,7 +11,6 @@ from typing import Any
 from herglotz.data.checks import check_alike
 from herglotz.data.column_table import of_file
 from herglotz.data.csv_columns import Names, Wanted, as_names
-from herglotz.data.csv_dialect import is_row_of_numbers
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.degrees import with_angles_in_degrees
 from herglotz.data.extra_formats import read_packed
@@ -50,8 +49,6 @@ FORMATS = (
 )
 WRITERS = {".csv": write_csv, ".npz": write_npz}
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods", ".numbers")
-# Bytes of a text file in which a recording has a row of numbers, below any titles.
-MAX_HEAD_BYTES = 65536
 # Characters of the note that names the files of a folder: a line of a terminal.
 MAX_NOTE_LENGTH = 76
 
@@ -206,7 +203,7 @@ def _files(path: Path) -> list[Path]:
         raise InputError(f"{path}: is the folder of a run, not data; name a recording, or a folder of them")
     known = {one.suffix for one in FORMATS}
     every = (file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
-    found = sorted(file for file in every if not _is_prose(file))
+    found = sorted(file for file in every if file.stem.casefold() != "readme")
     if not found:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
     return found
@@ -230,14 +227,6 @@ def _usable(
                 raise
             raise InputError(f"{error}; or take {file.name} out of the folder") from None
     return kept, sets, left_out(path, wrong, len(files))
-
-
-def _is_prose(file: Path) -> bool:
-    """Whether a text file beside recordings is no recording: a README, or a text without a row of numbers."""
-    if file.suffix.lower() != ".txt" or not file.is_file():
-        return False
-    lines = read_bytes(file, MAX_HEAD_BYTES).decode("utf-8", "replace").splitlines() if file.stat().st_size else []
-    return file.stem.casefold() == "readme" or not any(map(is_row_of_numbers, lines))
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:

@@ -41,8 +41,3 @@ def number(text: str, where: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{where}: {quote(text)} is not finite; correct or delete the row")
     return value
-
-
-def number_or_none(text: str, where: str) -> float:
-    """As `number`, but NaN for a cell without a value: the sample is missing."""
-    return math.nan if text.casefold() in MISSING else number(text, where)

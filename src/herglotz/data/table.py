@@ -19,7 +19,7 @@ from herglotz.data.gaps import with_missing
 from herglotz.data.rates import Recording, completed, in_order
 from herglotz.data.rows import Unusable, quote
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import refuse_unknown, with_units
+from herglotz.data.unit_row import with_units
 from herglotz.data.units import in_seconds
 from herglotz.errors import InputError, refuse
 
@@ -128,7 +128,7 @@ def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.nd
     """The rows of each trajectory, in order of first appearance; raise InputError if there is no row."""
     refuse({f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows": not len(at)})
     groups: dict[str, list[int]] = {}
-    for i, label in enumerate(_one_spelling(labels)):
+    for i, label in enumerate(labels):
         groups.setdefault(label, []).append(i)
     return [Recording(label, at[rows], values[rows]) for label, rows in groups.items()]
 
@@ -164,21 +164,6 @@ def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
             f"least {MIN_SAMPLES} are needed; column '{name}' has the most gaps: leave it out with --drop {name} "
             "(drop= in Python), or fill it in"
         )
-
-
-def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
-    """Labels in the first spelling of their number, if all are whole numbers: 1 and 01 are then one trajectory."""
-    # Python reads 1_000 as a number; in a label the underscore is a letter.
-    if any("_" in label for label in set(labels)):
-        return labels
-    try:
-        value = {label: float(label) for label in set(labels)}
-    except ValueError:
-        return labels
-    if not all(abs(x) < EXACT and x.is_integer() for x in value.values()):
-        return labels
-    first: dict[float, str] = {}
-    return [first.setdefault(value[label], label) for label in labels]
 
 
 def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
@@ -221,8 +206,6 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
     heads, first = _heads(frame, raw, where, wanted)
     columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
-    if all(column.ndim == 1 and len(column) for column in raw):
-        refuse_unknown(columns, [_text(column[0]) for column in raw], f"{where}, row {first}")
     times = raw[columns.time]
     raw[columns.time] = clock = seconds(times)
     every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from herglotz.data.csv_columns import Columns, Wanted, assign, is_number, name_and_unit
-from herglotz.data.rows import MISSING, quote
+from herglotz.data.csv_columns import Wanted, assign, is_number, name_and_unit
 from herglotz.data.units import PER_SECOND
 from herglotz.errors import refuse
 
@@ -27,15 +26,6 @@ def with_units(cells: Sequence[str], below: Sequence[str], where: str, wanted: W
     found = [f"{cell}[{unit}]" if unit and not head else cell for cell, unit, head in named]
     clock = assign(found, where, wanted).time
     return found if units[clock] in ("s", *PER_SECOND) else None
-
-
-def refuse_unknown(columns: Columns, below: Sequence[str], where: str) -> None:
-    """Raise if the first row looks like a row of units with an unknown unit of time: no cell is a number."""
-    cell, name = below[columns.time], columns.names[columns.time]
-    text = _bare(cell).isalpha() and cell.casefold() not in MISSING and not any(map(_is_sample, below))
-    known = ", ".join(["s", *filter(str.isascii, PER_SECOND)])
-    what = f"{where}, column {quote(name)}: {quote(cell)} is not a number; in a row of units write one of {known}"
-    refuse({f"{what}; or delete the row": text})
 
 
 def _bare(cell: str) -> str:

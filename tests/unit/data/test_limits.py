@@ -106,7 +106,6 @@ TABLES = {
     "a text that nobody needs": "t,q,status\n0,1,ok\n1,2,\n2,3,late\n",
     "a short recording": "trajectory,t,q\n0,0,1\n0,1,1\n0,2,1\n1,0,1\n",
     "stamps that repeat": "t,q\n0,1\n0,2\n1,3\n1,4\n2,5\n2,6\n3,7\n3,8\n",
-    "two names of one label": "run,t,q\n1,0,1\n01,1,1\n1.0,2,1\n2,0,1\n2,1,5\n2,2,1\n",
 }
 
 
@@ -123,22 +122,3 @@ def test_numbers_are_parsed_as_cell_by_cell(tmp_path, monkeypatch, name):
     assert fast.digest() == careful.digest()
     assert (fast.columns, fast.hold, fast.lengths) == (careful.columns, careful.hold, careful.lengths)
     assert fast.notes == careful.notes
-
-
-@pytest.mark.parametrize(
-    ("labels", "lengths"),
-    [
-        (("1", "01", "2"), (6, 3)),
-        (("1", "1.0", "1e0"), (9,)),
-        (("-0", "0", "+0"), (9,)),
-        (("1", "01", "a"), (3, 3, 3)),
-        (("1", "01", "0.5"), (3, 3, 3)),
-        (("10", "1_0", "2"), (3, 3, 3)),
-    ],
-    ids=str,
-)
-def test_numbers_as_labels(tmp_path, labels, lengths):
-    # fails if 1 and 01 are two trajectories, or names that look alike become one
-    rows = [f"{label},{3 * i + k},0.5" for i, label in enumerate(labels) for k in range(3)]
-    (tmp_path / "plain.csv").write_text("\n".join(["trajectory,t,q", *rows]))
-    assert read_csv(tmp_path / "plain.csv").lengths == lengths

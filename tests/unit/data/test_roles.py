@@ -230,14 +230,10 @@ def test_names_of_inputs_survive_writing(tmp_path):  # fails if a coordinate tha
 
 
 def test_a_readme_beside_recordings(tmp_path, capsys):
-    # fails if a folder is refused for a text in it, a recording in .txt is taken for one, or a warning of one file is
-    # said of all
+    # fails if a folder is refused for its README, a recording in .txt is left out, or a warning of one file has no name
     for name, header in (("a.csv", "t[s],x[m]"), ("b.txt", "t[s],x[m]"), ("c.csv", "t[s],x[m]")):
         (tmp_path / name).write_text(table(header))
     (tmp_path / "README.txt").write_text("Two columns:\nt,x\n0,1\n1,2\n")
-    (tmp_path / "names.txt").write_text("x[m]   the cart\nt[s]   time\n")
-    (tmp_path / "empty.txt").write_text("")
-    (tmp_path / "readme.md").write_text("# Recordings\n")
     assert len(load(tmp_path)) == 3
     (tmp_path / "c.csv").write_text(table("t[s],x[m],road[m]"))
     for name in ("a.csv", "b.txt"):
@@ -246,10 +242,8 @@ def test_a_readme_beside_recordings(tmp_path, capsys):
     load(tmp_path)
     err = capsys.readouterr().err
     assert f"warning: {tmp_path.name}: c.csv: road is taken for an input" in err
-    for name in ("a.csv", "c.csv"):
-        (tmp_path / name).unlink()
-    (tmp_path / "b.txt").write_text("no numbers")
-    with pytest.raises(InputError, match="is a folder without recordings"):
+    (tmp_path / "notes.txt").write_text("no numbers")
+    with pytest.raises(InputError, match=r"notes.txt, row 1: .*; or take notes.txt out of the folder"):
         load(tmp_path)
 
 
