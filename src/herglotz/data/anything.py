@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
-from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
+from herglotz.data.column_roles import name_and_unit
+from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.extra_formats import Table
-from herglotz.data.gaps import parted, with_missing
+from herglotz.data.gaps import with_missing
 from herglotz.data.polar import named_by
-from herglotz.data.readers import angles_like, as_meant, load, with_angles
+from herglotz.data.readers import angles_like, as_meant, finished, load
 from herglotz.data.sensors import calibrated
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame, plain, seconds
@@ -98,12 +99,12 @@ def as_trajectories(
     """
     names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
     meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms, "like": like}
-    sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
+    sensors = (sensor_zeros, sensor_scales)
     data = _by_field(data)
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
     if isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
-        return _shown(load(data, show=False, **meant, **sensors, **columns))
+        return load(data, **meant, sensor_zeros=sensor_zeros, sensor_scales=sensor_scales, **columns)
     if isinstance(data, Trajectories):
         refuse({COLUMNS_ARE_FIXED: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         changed = any(x is not None for x in (degrees, polar, input_terms))
@@ -111,8 +112,9 @@ def as_trajectories(
     elif _is_table(data, h):
         wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
         found = as_meant(_table(data, wanted), wanted, **meant)
-        found = found if like is None else angles_like(found, like)
-        return _shown(_marked(calibrated(found, sensor_zeros, sensor_scales), angles))
+        found = finished(found if like is None else angles_like(found, like), angles, *sensors)
+        tell(found.table())
+        return found.unwrapped()
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         # The angles of the list are unwrapped when its zeros are subtracted; a scale would have to act before.
@@ -120,7 +122,10 @@ def as_trajectories(
         return calibrated(_of_each(data, {"h": h, "time": time, **names, **meant}), sensor_zeros)
     else:
         found = as_meant(_array(data, h, time, names), NO_HEADER, **meant)
-    return _noted(_marked(calibrated(found, sensor_zeros, sensor_scales), angles), data)
+    found = finished(found, angles, *sensors)
+    for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
+        tell(f"{found.source or 'trajectories'}: {note}")
+    return found.unwrapped()
 
 
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -226,22 +231,3 @@ def _floats(name: str, x: Any) -> np.ndarray:
         return np.array(plain(x.detach().cpu() if isinstance(x, Tensor) else x), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: not numbers in rows of one length ({error})") from None
-
-
-def _marked(data: Trajectories, angles: Any) -> Trajectories:
-    """The set with these angles, or its own if None, cut at long gaps, with continuous angles."""
-    return parted(data if angles is None else with_angles(data, angles)).unwrapped()
-
-
-def _noted(found: Trajectories, data: Any) -> Trajectories:
-    """Print the notes that the data did not have; return `found`."""
-    for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
-        tell(f"{found.source or 'trajectories'}: {note}")
-    return found
-
-
-def _shown(data: Trajectories) -> Trajectories:
-    """Print the role of each column of the table, after all notes on the columns; return `data`."""
-    if data.columns:
-        tell(data.table())
-    return data

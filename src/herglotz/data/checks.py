@@ -61,23 +61,22 @@ def locate(offsets: tuple[int, ...], row: int) -> tuple[int, int]:
 
 
 def _check_tensors(where: str, arrays: Mapping[str, Tensor]) -> None:
+    t = arrays["t"]
     for name, x in arrays.items():
         if not isinstance(x, Tensor):
             kind = type(x).__name__
             raise InputError(f"{where}: {name} must be a torch.Tensor, got {kind}; use Trajectories.of(...)")
-        if x.dtype not in DTYPES:
-            raise InputError(f"{where}: {name} has dtype {x.dtype}; convert it to torch.float64 (or torch.float32)")
-        first = arrays["t"]
-        if x.dtype != first.dtype or x.device != first.device:
-            raise InputError(
-                f"{where}: {name} is {x.dtype} on {x.device} but t is {first.dtype} on {first.device}; use the same"
-            )
+        both = f"{name} is {x.dtype} on {x.device} but t is {t.dtype} on {t.device}; use the same"
+        refuse({
+            f"{where}: {name} has dtype {x.dtype}; convert it to torch.float64 (or torch.float32)":
+                x.dtype not in DTYPES,
+            f"{where}: {both}": (x.dtype, x.device) != (t.dtype, t.device),
+        })  # fmt: skip
 
 
 def _check_shapes(where: str, arrays: Mapping[str, Tensor]) -> None:
     t, q = arrays["t"], arrays["q"]
-    if t.ndim != 1:
-        raise InputError(f"{where}: t must have shape (N,), got {tuple(t.shape)}; flatten it")
+    refuse({f"{where}: t must have shape (N,), got {tuple(t.shape)}; flatten it": t.ndim != 1})
     if q.ndim != 2 or q.shape[0] != len(t) or q.shape[1] < 1:
         raise InputError(f"{where}: q must have shape ({len(t)}, n), one row a sample of t, got {tuple(q.shape)}")
     for name, x in arrays.items():
@@ -119,25 +118,20 @@ def _check_labels(where: str, labels: Any, n: int) -> None:
 
 
 def _check_finite(where: str, offsets: tuple[int, ...], name: str, x: Tensor) -> None:
-    bad = ~torch.isfinite(x.detach())
-    if not bad.any():
+    if bool(torch.isfinite(x.detach()).all()):
         return
-    place = bad.nonzero()[0].tolist()
+    place = (~torch.isfinite(x.detach())).nonzero()[0].tolist()
     b, k = locate(offsets, place[0])
-    value = float(x[tuple(place)])
     column = f"{name}[{place[1]}]" if len(place) > 1 else name
-    raise InputError(f"{where}: {column} of trajectory {b}, sample {k}, is {value}; delete that sample")
+    what = f"{column} of trajectory {b}, sample {k}, is {float(x[tuple(place)])}"
+    raise InputError(f"{where}: {what}; delete that sample")
 
 
 def _check_observed(where: str, offsets: tuple[int, ...], observed: Tensor) -> None:
-    bad = ((observed != 0) & (observed != 1)).nonzero()
-    if len(bad):
-        row, i = bad[0].tolist()
+    for row, i in ((observed != 0) & (observed != 1)).nonzero().tolist():
         b, k = locate(offsets, row)
-        value = float(observed[row, i])
-        raise InputError(
-            f"{where}: observed[{i}] of trajectory {b}, sample {k}, is {value}; write 1 where it was read, else 0"
-        )
+        what = f"observed[{i}] of trajectory {b}, sample {k}, is {float(observed[row, i])}"
+        raise InputError(f"{where}: {what}; write 1 where it was read, else 0")
 
 
 def check_sizes(where: str, q: Tensor, names: Sequence[str]) -> None:

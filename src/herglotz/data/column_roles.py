@@ -19,6 +19,11 @@ KINDS = {
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi"),
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
 }
+HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
+# A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
+TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
+# A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
+SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
 NUMBERED = r"(_?\d+|_.*)?"
 # Names that have a role whatever their words, unless the unit is of another kind.
 ROLES = {
@@ -103,6 +108,20 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     if not kind:
         return _by_words(key, words, others)
     return _in_place(key, unit, words, others) if kind == "position" else _by_unit(key, kind, words)
+
+
+def name_and_unit(cell: str) -> tuple[str, str] | None:
+    """Name and unit of a header's cell, `x[m]`, `x (m)` or `x_deg`; None for any other text."""
+    match = HEADER_CELL.fullmatch(cell)
+    if not match or not cell.isprintable():
+        return None
+    if match[2] is not None or match[3] is not None:
+        return match[1], (match[2] or match[3]).strip()
+    if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
+        return tight[1], tight[2]
+    if ends := SUFFIX.fullmatch(match[1]):
+        return ends[1] or ends[3], (ends[2] or ends[4]).lower().replace("_", "/")
+    return match[1], ""
 
 
 def kind_of(unit: str) -> str:

@@ -19,17 +19,13 @@ from herglotz.data.column_roles import (
     is_timed,
     is_usual,
     kind_of,
+    name_and_unit,
     role_of,
     words_of,
 )
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
-HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
-# A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
-TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
-# A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
-SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
 # Fields of `Wanted` that give columns a role, and the role.
 ROLE_OF_FIELD = {"time": "time", "group": "trajectory", "drop": "dropped", "coordinates": "q", "inputs": "input"}
 # Roles by their names in the table of columns.
@@ -321,20 +317,6 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
 def _whole(cell: str, unit: str) -> tuple[str, str]:
     """Name and unit of a cell whose name repeats: the brackets of `x (raw)` hold no unit, and `x_deg` is a name."""
     return (cell.strip(), "" if cell.endswith(")") else unit) if not cell.endswith("]") else (cell.split("[")[0], unit)
-
-
-def name_and_unit(cell: str) -> tuple[str, str] | None:
-    """Name and unit of a header's cell, `x[m]`, `x (m)` or `x_deg`; None for any other text."""
-    match = HEADER_CELL.fullmatch(cell)
-    if not match or not cell.isprintable():
-        return None
-    if match[2] is not None or match[3] is not None:
-        return match[1], (match[2] or match[3]).strip()
-    if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
-        return tight[1], tight[2]
-    if ends := SUFFIX.fullmatch(match[1]):
-        return ends[1] or ends[3], (ends[2] or ends[4]).lower().replace("_", "/")
-    return match[1], ""
 
 
 def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:

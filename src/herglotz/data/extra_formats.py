@@ -23,11 +23,11 @@ COUNTER = re.compile(r"__index_level_\d+__")
 HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-class Table:
+class Table(dict[str, np.ndarray]):
     """Named columns of one length, as `herglotz.data.table.from_frame` takes them; a matrix gives a column a column."""
 
     def __init__(self, path: Path, arrays: dict[str, np.ndarray]):
-        self.columns: dict[str, np.ndarray] = {}
+        super().__init__()
         for name, array in arrays.items():
             matrix = array.reshape(-1, 1) if 1 in array.shape or array.ndim == 1 else array
             if matrix.ndim != 2:
@@ -35,14 +35,12 @@ class Table:
             # q[rad] of shape (N, 2) becomes q1[rad] and q2[rad].
             head, bracket, unit = name.partition("[")
             for i, column in enumerate(matrix.T, 1):
-                self.columns[name if matrix.shape[1] == 1 else f"{head}{i}{bracket}{unit}"] = column
-        lengths = {name: len(column) for name, column in self.columns.items()}
+                self[name if matrix.shape[1] == 1 else f"{head}{i}{bracket}{unit}"] = column
+        self.columns = list(self)
+        lengths = {name: len(column) for name, column in self.items()}
         if len(set(lengths.values())) > 1:
             each = ", ".join(f"{name} {n}" for name, n in lengths.items())
             raise InputError(f"{path}: columns of different lengths ({each}); save one sample a row in all of them")
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.columns[name]
 
 
 def read_packed(path: PathLike, wanted: Wanted) -> Trajectories:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.data.column_roles import kind_of
-from herglotz.data.csv_columns import is_number, name_and_unit
+from herglotz.data.column_roles import kind_of, name_and_unit
+from herglotz.data.csv_columns import is_number
 from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import check_coordinates, refuse
@@ -108,8 +108,11 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
     if not pairs:
         return data
     _check(data, pairs)
+    weight = torch.ones_like(data.q) if data.observed is None else data.observed
+    old = {x: (x, data.q[:, k], data.units[k], data.angles[k], weight[:, k]) for k, x in enumerate(data.names)}
+    new: dict[str, tuple[str, Tensor, str, bool, Tensor]] = {}
     bodies: list[tuple[Pair, Tensor]] = []
-    angles, rows, notes, whole = [], [], [], data.complete
+    rows, notes = [], []
     for pair, name in zip(pairs, _names(data, pairs), strict=True):
         body = _positions(data, pair, (pair.x, pair.y))
         centre, spec, where = _centre(data, pair, body, bodies)
@@ -117,11 +120,23 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
         r = _radii(arm)
         at = f"{pair.x}, {pair.y} is at its centre at t = {float(data.t[int(r.argmin())]):g}, and has no angle there"
         refuse({f"{data.source or 'data'}: {at}; give another centre": bool((r == 0).any())})
-        angles.append(torch.atan2(arm[:, 0], -arm[:, 1]))
+        angle = torch.atan2(arm[:, 0], -arm[:, 1])
+        # An angle was read if all its positions were read.
+        read = torch.stack([old[column][-1] for column in _pair(spec).columns]).prod(0)
+        new[pair.x] = (name, angle, "rad", True, read)
         rows.append((name, POLAR, spec))
-        notes.append(_note(data, pair, name, where, r[whole], angles[-1]))
+        notes.append(_note(data, pair, name, where, r[data.complete], angle))
         bodies.append((pair, body))
-    return _with_angles(data, pairs, angles, rows, notes)
+    # A column that is both a position and a centre belongs to the pair of the position.
+    angle_of = {column: new[pair.x][0] for pair in pairs for column in pair.columns}
+    angle_of |= {column: new[pair.x][0] for pair in pairs for column in (pair.x, pair.y)}
+    kept = [new.get(x, old[x]) for x in data.names if x in new or x not in angle_of]
+    names, q, units, angles, observed = zip(*kept, strict=True)
+    columns = tuple((x, f"of {angle_of[x]}" if x in angle_of else role, unit) for x, role, unit in data.columns)
+    return replace(
+        data, q=torch.stack(q, 1), observed=None if data.observed is None else torch.stack(observed, 1), v=None,
+        names=names, units=units, angles=angles, columns=(*columns, *rows), notes=(*data.notes, *notes),
+    )  # fmt: skip
 
 
 def _check(data: Trajectories, pairs: Sequence[Pair]) -> None:
@@ -198,47 +213,6 @@ def _names(data: Trajectories, pairs: Sequence[Pair]) -> list[str]:
     others = set(data.names) - {name for pair in pairs for name in pair.columns}
     usual = ["theta"] if len(pairs) == 1 else [f"theta{k + 1}" for k in range(len(pairs))]
     return [name if name not in others else f"{name}_{pair.x}" for name, pair in zip(usual, pairs, strict=True)]
-
-
-def _with_angles(
-    data: Trajectories,
-    pairs: Sequence[Pair],
-    angles: Sequence[Tensor],
-    rows: Sequence[tuple[str, str, str]],
-    notes: Sequence[str],
-) -> Trajectories:
-    """The set with these angles in the place of the first column of each pair, without its other columns."""
-    made = {pair.x: (row[0], angle) for pair, row, angle in zip(pairs, rows, angles, strict=True)}
-    # A column that is both a position and a centre belongs to the pair of the position.
-    of = {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in pair.columns}
-    of |= {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in (pair.x, pair.y)}
-    kept = [k for k, name in enumerate(data.names) if name in made or name not in of]
-    old = {name: (name, data.q[:, k], data.units[k], data.angles[k]) for k, name in enumerate(data.names)}
-    new = {x: (name, angle, "rad", True) for x, (name, angle) in made.items()}
-    names, q, units, turning = zip(*((old | new)[data.names[k]] for k in kept), strict=True)
-    columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
-    return replace(
-        data,
-        q=torch.stack(q, 1),
-        observed=_observed(data, kept, names, rows),
-        v=None,
-        names=names,
-        units=units,
-        angles=turning,
-        columns=(*columns, *rows),
-        notes=(*data.notes, *notes),
-    )
-
-
-def _observed(
-    data: Trajectories, kept: Sequence[int], names: Sequence[str], rows: Sequence[tuple[str, str, str]]
-) -> Tensor | None:
-    """Weight of each coordinate, (N, n), 1 if it was read: an angle was read if all its positions were read."""
-    if data.observed is None:
-        return None
-    parts = {name: [data.names.index(x) for x in _pair(spec).columns] for name, _, spec in rows}
-    places = [parts.get(name, [k]) for k, name in zip(kept, names, strict=True)]
-    return torch.stack([data.observed[:, own].prod(1) for own in places], 1)
 
 
 def circle(x: Tensor) -> Tensor:

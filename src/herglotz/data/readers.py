@@ -124,18 +124,16 @@ def load(
             found, source=path.resolve().name, notes=(textwrap.shorten(names, MAX_NOTE_LENGTH), *found.notes)
         )
     found = as_meant(found, wanted, polar, degrees, angles, like, input_terms)
-    found = parted(calibrated(found, sensor_zeros, sensor_scales))
-    if angles is not None:
-        found = with_angles(found, angles)
-    elif like is not None:
+    if angles is None and like is not None:
         found = angles_like(found, like)
+    found = finished(found, angles, sensor_zeros, sensor_scales)
     if show and found.columns:
         tell(found.table())
     return found.unwrapped() if unwrap else found
 
 
 def as_meant(
-    found: Trajectories,  # as recorded, in rad and s where the header says so
+    found: Trajectories,
     wanted: Wanted,
     polar: Names | None,
     degrees: Names | None,
@@ -143,7 +141,7 @@ def as_meant(
     like: Trajectories | None,
     input_terms: Names | None,
 ) -> Trajectories:
-    """The set with angles of pairs of positions, angles in degrees converted to rad, and terms of inputs.
+    """The recorded set with angles of pairs of positions, angles in degrees converted to rad, and terms of inputs.
 
     Raise InputError if a coordinate that the user did not name moves in jumps alone.
     """
@@ -156,9 +154,17 @@ def as_meant(
     return with_input_terms(with_angles_in_degrees(found, degrees, angles, like), as_names(input_terms or ()))
 
 
-def with_angles(found: Trajectories, angles: Names | bool) -> Trajectories:
-    """The set with these coordinates as angles; True for all."""
-    return found.with_angles((found.names if angles else ()) if isinstance(angles, bool) else angles)
+def finished(
+    found: Trajectories,
+    angles: Names | bool | None,
+    zeros: Sequence[float] | None,
+    scales: Sequence[float] | None,
+) -> Trajectories:
+    """The set with a user's zeros and scales of sensors, cut at long gaps, and with these angles; True for all."""
+    found = parted(calibrated(found, zeros, scales))
+    if isinstance(angles, bool):
+        angles = found.names if angles else ()
+    return found if angles is None else found.with_angles(angles)
 
 
 def angles_like(found: Trajectories, other: Trajectories) -> Trajectories:

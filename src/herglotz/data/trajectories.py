@@ -18,7 +18,7 @@ from herglotz.data.holds import Arrival, check_arrival, interpolated_input
 from herglotz.data.missing import interpolated, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
-from herglotz.errors import InputError, check_coordinates, refuse
+from herglotz.errors import check_coordinates, refuse
 
 # Stands in place of a unit that is missing in the header, or wrong.
 TAKEN_FOR_DEGREES = "taken for deg"
@@ -109,18 +109,15 @@ class Trajectories:
         Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v`, `u` and `observed` (N,) become (N, 1).
         Defaults: a single trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
-        columns_of = (("p", p), ("u", u), ("v", v), ("observed", observed))
-        own_p, own_u, own_v, own = (as_columns(name, x) for name, x in columns_of)
-        t, q = as_tensor("t", t), as_tensor("q", q)
-        q = q[:, None] if q.ndim == 1 else q
+        t, q = as_tensor("t", t), as_columns("q", q)
         counts = lengths.tolist() if isinstance(lengths, (Tensor, np.ndarray)) else lengths
         n = q.shape[-1]
         angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
         return cls(
             t, q, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
             tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
-            None if s is None else as_tensor("s", s), own_p, own_u, time_unit, source, hold, delay, lag, columns,
-            v=own_v, observed=own,
+            None if s is None else as_tensor("s", s), as_columns("p", p), as_columns("u", u), time_unit, source,
+            hold, delay, lag, columns, v=as_columns("v", v), observed=as_columns("observed", observed),
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -132,9 +129,7 @@ class Trajectories:
 
     def __getitem__(self, i: int) -> Trajectories:
         """Return trajectory i alone (negative i counts from the end)."""
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"trajectory {i} of {len(self)}")
-        return self.select([i % len(self)])
+        return self.select([range(len(self))[i]])
 
     def __iter__(self) -> Iterator[Trajectories]:
         return (self[i] for i in range(len(self)))
@@ -281,9 +276,8 @@ class Trajectories:
         """Return these trajectories, in this order; an index may come twice."""
         chosen = [int(i) for i in indices]
         for i in chosen:
-            if not 0 <= i < len(self):
-                where = self.source or "trajectories"
-                raise InputError(f"{where}: there is no trajectory {i}; select from 0 to {len(self) - 1}")
+            missing = f"{self.source or 'trajectories'}: there is no trajectory {i}; select from 0 to {len(self) - 1}"
+            refuse({missing: not 0 <= i < len(self)})
         spans = [torch.arange(self.offsets[i], self.offsets[i] + self.lengths[i]) for i in chosen]
         rows = torch.cat(spans) if spans else torch.arange(0)
         return self.rows(rows.to(self.t.device), tuple(self.lengths[i] for i in chosen))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from herglotz.data.csv_columns import Wanted, assign, is_number, name_and_unit
+from herglotz.data.column_roles import name_and_unit
+from herglotz.data.csv_columns import Wanted, assign, is_number
 from herglotz.data.units import PER_SECOND
 from herglotz.errors import refuse
 
