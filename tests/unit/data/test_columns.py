@@ -31,42 +31,6 @@ def rows(*columns):
     return "\n".join(",".join(map(str, row)) for row in zip(*columns, strict=True)) + "\n"
 
 
-@pytest.mark.parametrize(
-    "head",
-    ["force[N]", "F[N]", "F", "torque[Nm]", "Torque", "tau", "tau_1", "tau2", "motor_left", "u1", "u2", "u_0",
-     "push[N]", "M[N*m]", "voltage[V]", "current", "cmd", "command_1", "control", "input", "effort_1", "pwm2"],
-)  # fmt: skip
-def test_forces_are_inputs(tmp_path, head):  # fails if a force becomes a second coordinate
-    data = read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7]))
-    assert data.names == ("x",)
-    assert data.u is not None
-    assert data.u[:, 0].tolist() == [8, 9, 7]
-
-
-@pytest.mark.parametrize("head", ["f", "N", "taut", "motion", "uplift", "forceful", "x[m]", "up", "unit[Nms]", "cmds"])
-def test_other_names_stay_coordinates(tmp_path, head):  # fails if a pattern swallows names that only begin like a force
-    assert read(tmp_path, f"t,{head}\n0,1\n1,2\n2,3\n").u is None
-
-
-@pytest.mark.parametrize(
-    "head",
-    ["v", "vx", "velocity_x", "x_dot", "x_ddot", "ax", "acc", "gyro[rad/s]", "a[m/s^2]", "b (mm/s²)", "index", "frame",
-     "Unnamed: 0", "xdot", "theta2ddot", "omega", "omega_1"],
-)  # fmt: skip
-def test_rates_and_counters_are_left_aside(tmp_path, head):
-    # fails if a logged velocity, an acceleration or a number of the row becomes a second coordinate
-    data = read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7]))
-    assert (data.names, data.u) == (("x",), None)
-    assert data.columns[2][1] == "left aside"
-    assert read(tmp_path, "v,t\n1,0\n2,1\n4,2\n", coordinates="v").names == ("v",)
-
-
-@pytest.mark.parametrize("head", ["v[m]", "vy (mm)", "ax[rad]", "az[deg]"])
-def test_letters_of_rates_with_the_unit_of_a_position_are_coordinates(tmp_path, head):
-    # fails if a coordinate is lost because its letters mean a velocity elsewhere
-    assert len(read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7])).names) == 2
-
-
 @pytest.mark.parametrize(("head", "kind"), [("speed", "rate"), ("voltage", "input")])
 def test_rates_or_inputs_alone_are_refused_with_a_remedy(tmp_path, head, kind):
     # fails if the message asks for a coordinate and does not say what became of the column that the user has

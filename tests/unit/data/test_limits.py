@@ -95,17 +95,9 @@ def test_integers_that_double_precision_has_not(tmp_path):
 TABLES = {
     "plain": "t[s],q[rad],u\n0,1.25,3\n0.1,-2e-3,4\n 0.30000000000000004 ,7,5\n",
     "grouped": "# hold: zero\ntrial,t,x,y\n2,0,1,2\n1,0,3,4\n2,1,5,6\n1,1,7,8\n\n2,2,9,1\n1,2,2,3\n# hold: first\n",
-    "byte order mark, returns": "\ufefft,q,v\r\n0,1,5\r\n1,2,5\r\n2,3,5\r\n",
     "blanks": "t,x,u\n0,1,\n1,,2\n2,3,\n,,\n3,4,5\n4,5,\n",
     "blanks at the start of rows": "x,t\n1,0\n,1\n2,2\n3,3\n",
-    "a comment among the rows": "t,q,u\n0,1,1\n# hold: first\n1,2,1\n2,3,1\n",
-    "semicolons": "t;x;y\n0;1,5;2\n1;2,5;\n2;3;4\n3;4,25;4\n4;4;4\n",
-    "tabs": "t\tx\n0\t1.5\n1\t2.5\n2\t3\n",
-    "spaces": "# t  x\n 0  1.5\n1 2.5\n2 3\n",
-    "title and units": "Device 7\n2026\nt,x\nms,mm\n# scale: 2\n0,1\n1,2\n2,3\n",
     "a text that nobody needs": "t,q,status\n0,1,ok\n1,2,\n2,3,late\n",
-    "a short recording": "trajectory,t,q\n0,0,1\n0,1,1\n0,2,1\n1,0,1\n",
-    "stamps that repeat": "t,q\n0,1\n0,2\n1,3\n1,4\n2,5\n2,6\n3,7\n3,8\n",
 }
 
 

@@ -36,8 +36,20 @@ ROLES = {
     "commande": "input", "voltaje": "input", "referencia": "input", "erreur": "left aside", "Leistung": "left aside",
     "GRF_z": "input", "ctrl": "input", "action": "input", "reward": "left aside", "imu_ax": "left aside",
     "Sub Frame": "left aside", "Frame#": "left aside", "Winkelabweichung[deg]": "coordinate",
+    # The usual letters, words and counters.
+    "force[N]": "input", "F[N]": "input", "F": "input", "torque[Nm]": "input", "Torque": "input", "tau_1": "input",
+    "tau2": "input", "u1": "input", "u_0": "input", "M[N*m]": "input", "voltage[V]": "input", "current": "input",
+    "cmd": "input", "command_1": "input", "control": "input", "input": "input", "effort_1": "input", "pwm2": "input",
+    "v": "left aside", "vx": "left aside", "velocity_x": "left aside", "x_dot": "left aside", "x_ddot": "left aside",
+    "acc": "left aside", "gyro[rad/s]": "left aside", "a[m/s^2]": "left aside", "b (mm/s²)": "left aside",
+    "index": "left aside", "frame": "left aside", "Unnamed: 0": "left aside", "theta2ddot": "left aside",
+    "omega_1": "left aside",
+    # Names that only begin like a force.
+    "f": "coordinate", "N": "coordinate", "taut": "coordinate", "motion": "coordinate", "uplift": "coordinate",
+    "forceful": "coordinate", "up": "coordinate", "unit[Nms]": "coordinate", "cmds": "coordinate",
     # No rates: there is no column ist or x, or the unit is that of a position.
-    "dist": "coordinate", "dz[mm]": "coordinate", "v1[m]": "coordinate", "depth": "coordinate",
+    "dist": "coordinate", "dz[mm]": "coordinate", "v1[m]": "coordinate", "depth": "coordinate", "vy (mm)": "coordinate",
+    "az[deg]": "coordinate",
     "base_angle[rad]": "coordinate", "elbow_x": "coordinate",
 }  # fmt: skip
 
@@ -176,19 +188,7 @@ def test_many_columns_without_a_usual_name_are_one_warning(tmp_path, capsys):  #
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "Zeit",
-        "Zeit[s]",
-        "temps",
-        "tiempo",
-        "Zeitstempel",
-        "elapsed_time",
-        "simTime[s]",
-        "seconds",
-        "clock[s]",
-        "Messzeit",
-        "heure",
-    ],
+    ["Zeit", "Zeit[s]", "temps", "tiempo", "elapsed_time", "simTime[s]", "seconds", "clock[s]", "Messzeit"],
 )
 def test_times_in_other_words(tmp_path, name):  # fails if a time is a coordinate, and the user is told there is none
     data = read(tmp_path, table(f"x[m],{name},u_t[N]"))
