@@ -78,14 +78,8 @@ def as_trajectories(
         Of a table the columns that are left aside; the column that numbers the trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
-    degrees, polar, input_terms
-        Coordinates in degrees whose header does not say so; pairs of positions that become an angle each; terms of
-        inputs that act beside the inputs: as in `load`.
-    sensor_zeros, sensor_scales
-        q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
-        for none.
-    like
-        Another recording: columns with the same names have the same roles.
+    degrees, polar, input_terms, sensor_zeros, sensor_scales, like
+        As in `load`.
 
     Returns
     -------

@@ -22,7 +22,7 @@ from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
 from herglotz.data.rows import Unusable
 from herglotz.data.sensors import calibrated
-from herglotz.data.table import left_out
+from herglotz.data.table import usable
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse
@@ -115,14 +115,7 @@ def load(
     columns.setdefault("known", () if like is None else like.columns)
     wanted = Wanted(**columns, positions=named_by(polar))
     path = Path(path)
-    files, sets, warnings = _usable(path, _files(path), wanted)
-    found = _joined(files, sets)
-    found = replace(found, notes=(*found.notes, *warnings))
-    if path.is_dir():
-        names = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
-        found = replace(
-            found, source=path.resolve().name, notes=(textwrap.shorten(names, MAX_NOTE_LENGTH), *found.notes)
-        )
+    found = _read_folder(path, wanted) if path.is_dir() else _read(path, wanted)
     found = as_meant(found, wanted, polar, degrees, angles, like, input_terms)
     if angles is None and like is not None:
         found = angles_like(found, like)
@@ -201,38 +194,29 @@ def save(path: PathLike, trajectories: Trajectories) -> None:
     WRITERS[suffix](path, trajectories)
 
 
-def _files(path: Path) -> list[Path]:
-    """The file itself, or the files of a folder that can be read."""
-    if not path.is_dir():
-        return [path]
+def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
+    """The recordings of a folder, file by file, with a note of their names, and a warning of unusable recordings."""
     if (path / "model.pt").exists():
         raise InputError(f"{path}: is the folder of a run, not data; name a recording, or a folder of them")
     known = {one.suffix for one in FORMATS}
     every = (file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
-    found = sorted(file for file in every if file.stem.casefold() != "readme")
-    if not found:
+    files = sorted(file for file in every if file.stem.casefold() != "readme")
+    if not files:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
-    return found
 
-
-def _usable(
-    path: Path, files: Sequence[Path], wanted: Wanted
-) -> tuple[list[Path], list[Trajectories], tuple[str, ...]]:
-    """The files that hold a recording, their recordings, and a warning of files whose recording is too short."""
-    kept: list[Path] = []
-    sets: list[Trajectories] = []
-    wrong: list[Unusable] = []
-    for file in files:
+    def read(file: Path) -> tuple[Path, Trajectories]:
         try:
-            sets.append(in_radians_and_seconds(_read(file, wanted)))
-            kept.append(file)
-        except Unusable as error:
-            wrong.append(error)
+            return file, _read(file, wanted)
+        except Unusable:
+            raise
         except InputError as error:
-            if not path.is_dir():
-                raise
             raise InputError(f"{error}; or take {file.name} out of the folder") from None
-    return kept, sets, left_out(path, wrong, len(files))
+
+    pairs, warnings = usable(path, files, read)
+    names = f"{len(pairs)} recordings: {', '.join(file.name for file, _ in pairs)}"
+    found = _joined(*zip(*pairs, strict=True))
+    notes = (textwrap.shorten(names, MAX_NOTE_LENGTH), *found.notes, *warnings)
+    return replace(found, source=path.resolve().name, notes=notes)
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
@@ -251,7 +235,7 @@ def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories
 
 
 def _read(path: Path, wanted: Wanted) -> Trajectories:
-    """The recording of a file, by the format of its ending."""
+    """The recording of a file, by the format of its ending, in rad and s."""
     suffix = path.suffix.lower()
     one = next((one for one in FORMATS if one.suffix == suffix), None)
     if one is None:
@@ -265,7 +249,7 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
     # An absent or empty file, a folder or a pipe is refused here for all readers.
     read_bytes(path, 1)
     if one.is_table:
-        return one.read(path, wanted)
+        return in_radians_and_seconds(one.read(path, wanted))
     refuse({f"{path}: columns are chosen in a table, such as a csv file; this is {one.name}": wanted})
-    found = one.read(path)
+    found = in_radians_and_seconds(one.read(path))
     return replace(found, hold=wanted.hold) if wanted.hold else found

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, time
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from herglotz.errors import InputError, refuse
 
 # 3000 years: a time of so many counts milliseconds, or smaller units, since 1970.
 MAX_SECONDS = 1e11
+Item = TypeVar("Item")
+Read = TypeVar("Read")
 
 
 def from_table(
@@ -47,12 +49,12 @@ def from_table(
     recordings = _recordings(path, labels, np.asarray(at), values)
     blank = bool(np.isnan(values).any())
     recordings, repairs = _with_clocks(recordings, blank, columns.units[columns.time] or "s")
-    recordings, unordered = _usable(path, recordings, lambda one: _check_times(path, columns, one))
+    recordings, unordered = usable(path, recordings, lambda one: _in_time(path, columns, one))
     found = with_settings(_trajectories(path, columns, recordings))
     if not blank:
         return replace(found, notes=(*found.notes, *repairs, *unordered))
     recordings, filled, hold = completed(recordings, columns, found.hold)
-    recordings, too_few = _usable(path, recordings, lambda one: _check_enough(path, columns, one))
+    recordings, too_few = usable(path, recordings, lambda one: _with_enough(path, columns, one))
     found = with_settings(_trajectories(path, columns, recordings))
     found = replace(found, hold=hold, notes=(*found.notes, *repairs, *unordered, *filled, *too_few))
     return _with_missing(found, columns, recordings)
@@ -98,30 +100,25 @@ def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[l
     return [one for one, _ in made], [f"{note}{more}" for note in notes[:1]]
 
 
-def _usable(
-    path: Path, recordings: list[Recording], check: Callable[[Recording], None]
-) -> tuple[list[Recording], tuple[str, ...]]:
-    """The recordings that pass a check, and a warning of the others; raise the check's error if most do not pass."""
-    kept: list[Recording] = []
+def usable(path: Path, items: Sequence[Item], read: Callable[[Item], Read]) -> tuple[list[Read], tuple[str, ...]]:
+    """The results of `read`, without those of unusable recordings, and a warning that counts these recordings.
+
+    Raise the first error if most recordings are unusable.
+    """
+    kept: list[Read] = []
     wrong: list[Unusable] = []
-    for one in recordings:
+    for item in items:
         try:
-            check(one)
-            kept.append(one)
+            kept.append(read(item))
         except Unusable as error:
             wrong.append(error)
-    return kept, left_out(path, wrong, len(recordings))
-
-
-def left_out(path: Path, wrong: Sequence[Unusable], count: int) -> tuple[str, ...]:
-    """A warning of the unusable recordings among `count`; raise the first error if most are unusable."""
     if not wrong:
-        return ()
-    if 2 * len(wrong) > count:
+        return kept, ()
+    if 2 * len(wrong) > len(items):
         raise wrong[0]
     why = str(wrong[0]).removeprefix(f"{path}, ").removeprefix(f"{path}: ").partition(";")[0]
-    plural = ("is", "") if len(wrong) == 1 else ("are", "the first: ")
-    return (f"warning: {len(wrong)} of {count} recordings {plural[0]} left out: {plural[1]}{why}",)
+    are = "is left out: " if len(wrong) == 1 else "are left out: the first: "
+    return kept, (f"warning: {len(wrong)} of {len(items)} recordings {are}{why}",)
 
 
 def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.ndarray) -> list[Recording]:
@@ -133,8 +130,8 @@ def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.nd
     return [Recording(label, at[rows], values[rows]) for label, rows in groups.items()]
 
 
-def _check_times(path: Path, columns: Columns, one: Recording) -> None:
-    """Raise unless this trajectory has three rows, in order of time."""
+def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
+    """The recording; raise Unusable unless it has three rows, in order of time."""
     t, label, clock = one.values[:, 0], "", columns.names[columns.time]
     if columns.trajectory is not None:
         label = columns.names[columns.trajectory]
@@ -152,10 +149,11 @@ def _check_times(path: Path, columns: Columns, one: Recording) -> None:
             f"in row {one.at[k]}; sort the rows, delete one, or number the trajectories in a column 'trajectory' "
             "(another name: --group NAME, group= in Python)"
         )
+    return one
 
 
-def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
-    """Raise unless three rows of this trajectory have all their values."""
+def _with_enough(path: Path, columns: Columns, one: Recording) -> Recording:
+    """The recording; raise Unusable unless three rows have all their values."""
     gone = np.isnan(one.values)
     if (known := int((~gone.any(1)).sum())) < MIN_SAMPLES:
         name = columns.names[columns.numeric[int(gone.sum(0).argmax())]]
@@ -164,6 +162,7 @@ def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
             f"least {MIN_SAMPLES} are needed; column '{name}' has the most gaps: leave it out with --drop {name} "
             "(drop= in Python), or fill it in"
         )
+    return one
 
 
 def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:

@@ -109,13 +109,13 @@ class Trajectories:
         Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v`, `u` and `observed` (N,) become (N, 1).
         Defaults: a single trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
-        t, q = as_tensor("t", t), as_columns("q", q)
+        t, points = as_tensor("t", t), as_columns("q", q)
         counts = lengths.tolist() if isinstance(lengths, (Tensor, np.ndarray)) else lengths
-        n = q.shape[-1]
-        angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
+        n = points.shape[-1]
+        flags = (False,) * n if angles is None else tuple(bool(a) for a in angles)
         return cls(
-            t, q, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
-            tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
+            t, points, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
+            tuple("rad" if a else "1" for a in flags) if units is None else tuple(units), flags,
             None if s is None else as_tensor("s", s), as_columns("p", p), as_columns("u", u), time_unit, source,
             hold, delay, lag, columns, v=as_columns("v", v), observed=as_columns("observed", observed),
         )  # fmt: skip
