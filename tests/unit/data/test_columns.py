@@ -110,11 +110,6 @@ def test_the_users_word_counts(tmp_path):  # fails if a column keeps the role of
         read(tmp_path, text, drop="c")
 
 
-def test_an_unknown_clock_lists_the_columns(tmp_path):  # fails if the user is not told what there is to choose from
-    with pytest.raises(InputError, match=r"no time column; the columns are clock, x: choose one with --time NAME"):
-        read(tmp_path, "clock,x[m]\n0,1\n1,2\n2,3\n")
-
-
 def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
     # fails if a column is left out of the table, a conversion is not said, or the table soils stdout
     read(tmp_path, "t[ms],theta[deg],theta_dot,tau[Nm]\n" + rows([0, 1, 2], [1, 2, 3], [0, 0, 0], [4, 5, 6]))

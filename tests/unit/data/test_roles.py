@@ -1,10 +1,9 @@
 """Roles of columns by their units and words: what a logger calls its columns, and what is said of guesses."""
 
-import numpy as np
 import pytest
 
-from herglotz.data import load, save
-from herglotz.data.csv_columns import Wanted, assign
+from herglotz.data import load
+from herglotz.data.csv_columns import assign
 from herglotz.errors import InputError
 
 ROLES = {
@@ -79,12 +78,6 @@ def test_a_unit_without_a_space_before_it():
     assert found.names == ("t", "x", "v", "F", "x(1)")
     assert found.units == ("s", "m", "m/s", "N", "")
     assert [role for _, role, _ in found.roles()] == ["time", "coordinate", "left aside", "input", "coordinate"]
-
-
-def test_a_position_and_its_goal(tmp_path):  # fails if both are coordinates, or the position is left to be an input
-    data = read(tmp_path, table("t[s],goal_angle[rad],current_angle[rad]"))
-    assert data.names == ("current_angle",)
-    assert data.input_labels == (("goal_angle", "rad"),)
 
 
 @pytest.mark.parametrize(
@@ -202,13 +195,6 @@ def test_two_times_are_asked_for(tmp_path):  # fails if one of two is chosen uns
     assert read(tmp_path, table("t,loop_time,x[m]")).names == ("x",)
 
 
-def test_no_coordinate_says_what_the_columns_look_like():
-    # fails if a table without a position is refused without the way to take one of its columns
-    with pytest.raises(InputError, match=r"valve look like no positions: choose with --coordinates NAMES"):
-        assign(["t", "valve[bar]"], "header")
-    assert assign(["t", "valve[bar]"], "header", Wanted(coordinates="valve")).q == (1,)
-
-
 @pytest.mark.parametrize("head", ["y[V]", "pot[mV]", "x1[%]", "theta[V]"])
 def test_volts_of_a_sensor_are_a_coordinate_where_nothing_else_is(head):
     # fails if a circuit that is a mechanism's analogue is refused, or volts are a second coordinate beside metres
@@ -219,14 +205,6 @@ def test_volts_of_a_sensor_are_a_coordinate_where_nothing_else_is(head):
     assert (beside.q, beside.u) == ((2,), (3,))
     assert "left aside, but it may be the reading of a position" in beside.notes[0]
     assert assign(["t[s]", "x[N]", "z[m]"], "header").u == (1,)
-
-
-def test_names_of_inputs_survive_writing(tmp_path):  # fails if a coordinate that is written comes back as an input
-    data = read(tmp_path, table("t[s],motor_angle[rad],target[rad]"), unwrap=False)
-    save(tmp_path / "again.csv", data)
-    again = load(tmp_path / "again.csv", unwrap=False)
-    assert again.u is not None and data.u is not None  # noqa: PT018
-    assert (again.names, again.u.tolist()) == (data.names, data.u.tolist())
 
 
 def test_a_readme_beside_recordings(tmp_path, capsys):
@@ -245,10 +223,3 @@ def test_a_readme_beside_recordings(tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("no numbers")
     with pytest.raises(InputError, match=r"notes.txt, row 1: .*; or take notes.txt out of the folder"):
         load(tmp_path)
-
-
-def test_a_frame_is_warned_of_too(capsys):  # fails if only files are
-    from herglotz.data import as_trajectories
-
-    as_trajectories({"t": np.arange(5.0), "x[m]": np.arange(5.0) ** 2, "road[m]": np.arange(5.0)})
-    assert "warning: dict: road is taken for an input" in capsys.readouterr().err

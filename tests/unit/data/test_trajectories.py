@@ -86,10 +86,6 @@ def test_constructor_wants_tensors():  # fails if an array slips through to torc
         replace(ragged(), q=np.zeros((13, 2)), source="s")  # pyright: ignore[reportArgumentType]
 
 
-def test_times_of_different_trajectories_may_overlap():  # fails if increase is asked across a border
-    assert len(build(t=[5.0, 6.0, 7.0, 0.0, 1.0, 2.0])) == 2
-
-
 def test_defaults():  # fails if lists become float32 or an angle keeps the unit 1
     one = Trajectories.of([0, 1, 2], [0, 1, 2])
     assert (one.names, one.units, one.angles, one.lengths) == (("q",), ("1",), (False,), (3,))
@@ -150,11 +146,6 @@ def test_triples_leave_out_long_steps():  # fails if only h0 or only h1 is looke
     for bad in (0.0, -1.0, NAN):
         with pytest.raises(InputError, match="max_step must be finite and > 0"):
             data.triples(bad)
-
-
-def test_typical_step_and_gaps():  # fails if the mean is taken for the median
-    assert ragged().typical_step == pytest.approx(0.1)
-    assert ragged().gaps == 2
 
 
 def test_split_time():  # fails if the cut is not per trajectory, or a sample is lost or seen twice
