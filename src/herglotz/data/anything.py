@@ -78,8 +78,11 @@ def as_trajectories(
         Of a table the columns that are left aside; the column that numbers the trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
-    degrees, polar, input_terms, sensor_zeros, sensor_scales, like
+    degrees, polar, input_terms, like
         As in `load`.
+    sensor_zeros, sensor_scales
+        q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
+        for none.
 
     Returns
     -------

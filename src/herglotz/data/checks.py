@@ -165,7 +165,7 @@ def check_positive(name: str, value: float) -> None:
 
 
 def check_alike(sets: Sequence[Any]) -> None:
-    """Raise unless the sets have the same coordinates, units and arrays, so that they can be joined."""
+    """Raise unless the sets can be joined: they have the same coordinates, units and arrays."""
     if not sets:
         raise InputError("cat needs at least one set of trajectories, got none")
     for other in sets[1:]:

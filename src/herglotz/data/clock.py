@@ -39,5 +39,5 @@ def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
 
 
 def _written_twice(rows: np.ndarray, before: np.ndarray) -> bool:
-    """Whether all of these rows are those before them."""
+    """Whether each of these rows equals the row before."""
     return bool(((rows == before) | (np.isnan(rows) & np.isnan(before))).all())

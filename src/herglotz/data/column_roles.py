@@ -84,7 +84,7 @@ READING = "it may be the reading of a position"
 
 
 class Guess(NamedTuple):
-    """The role of a column, a key of `ROLES`, "rate", "dropped" or "q", and a doubt about the role, "" for none."""
+    """The role of a column, a key of `ROLES`, "rate", "dropped" or "q", and the doubt about the role, or ""."""
 
     role: str
     doubt: str = ""

@@ -67,7 +67,7 @@ class Wanted:
     motion: bool = True
 
     def role(self, name: str) -> str | None:
-        """The role that the user gives to this column; None where the user says nothing."""
+        """The role that the user gives to this column, or None."""
         for field, role in ROLE_OF_FIELD.items():
             if name in as_names(getattr(self, field) or ()):
                 return role
@@ -285,7 +285,7 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
 
 
 def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:
-    """The only column of the time; raise InputError for none or several."""
+    """The only column of the time; raise InputError if there is no such column, or several."""
     choose = "choose one with --time NAME (time= in Python)"
     columns, two = ", ".join(names), " and ".join(names[i] for i in found)
     refuse({

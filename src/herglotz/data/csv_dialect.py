@@ -17,7 +17,7 @@ from herglotz.errors import InputError
 SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
 # A header is looked for in this many lines: titles of measuring programs are shorter.
 MAX_TITLE_LINES = 50
-# A line above the header by which Excel is told the separator.
+# A line above the header that gives Excel the separator.
 EXCEL = "sep=(.|tab)?"
 # 1,234.5 and 1,234,567
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
@@ -38,11 +38,8 @@ def cells_of(line: str, separator: str = ",") -> list[str]:
     return [cell.strip().strip('"').strip() for cell in parts]
 
 
-def in_commas(
-    path: Path,  # begins messages
-    lines: Sequence[str],  # of the file
-) -> tuple[Rows, tuple[str, ...]]:
-    """Rows of a table, header first, with commas between columns and decimal points; notes on what was changed.
+def in_commas(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
+    """Rows of a file's table, header first, with commas between columns and decimal points; notes on the changes.
 
     Lines without a value and comments are left out. A comment may be the header: the last comment before rows of
     numbers alone, with as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points
@@ -133,8 +130,8 @@ def _separator(header: str, row: str) -> str | None:
 def _check_decimals(path: Path, table: Callable[[], Cells], separator: str) -> None:
     """Raise if a comma may separate thousands, or 1,5 and 2.5 stand in the same table.
 
-    Whoever writes commas between columns often writes commas between thousands: there one comma at least must be a
-    decimal sign for certain.
+    Programs that write commas between columns often write commas between thousands, too: in their tables at least one
+    comma has to be a decimal sign for certain.
     """
     numbers = [(i, cell) for i, cells in table() for cell in cells if "," in cell and is_number(cell.replace(",", "."))]
     if separator == "," and numbers and all(THOUSANDS_OR_DECIMALS.fullmatch(cell) for _, cell in numbers):

@@ -32,7 +32,7 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
     try:
         mode = path.stat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise InputError(f"{path}: is a pipe or a device, not a file; save what it says to a file first")
+            raise InputError(f"{path}: is a pipe or a device, not a file; save its output to a file first")
         with open(path, "rb") as file:
             content = file.read(most)
     except InputError:

@@ -119,7 +119,7 @@ def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
 
 
 def _floating(path: Path, name: str, x: np.ndarray) -> Tensor:
-    """Return float32 and float64 as they are, integers as float64."""
+    """An array of float32 or float64 unchanged, an array of integers in float64."""
     if x.dtype.kind in "iu":
         if x.size and max(abs(int(x.min())), abs(int(x.max()))) > EXACT:
             raise InputError(

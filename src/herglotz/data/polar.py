@@ -274,7 +274,7 @@ class Circle(NamedTuple):
 
 
 def circles(data: Trajectories) -> list[Circle]:
-    """The pairs of positions x, y that stay on a circle, about a fixed centre or about another such pair."""
+    """The pairs of positions x, y that stay on a circle, about a fixed centre or about an earlier pair."""
     found, earlier, read = [], [], complete(data)
     for x, y in _pairs_by_name(data):
         pair = Pair(x, y)

@@ -132,7 +132,7 @@ def _fill_note(names: Sequence[str], straight: bool, longest: float, unit: str) 
 
 
 def filled_inputs(data: Trajectories) -> list[str]:
-    """Names of inputs that a slower clock recorded, and the logger filled in: they change every k or k + 1 rows.
+    """Names of inputs that a slower clock recorded, and the logger filled in: these change every k or k + 1 rows.
 
     If both clocks run together, the input changes every k rows alone; a signal that steps by itself changes after any
     number of rows.

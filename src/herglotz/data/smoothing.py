@@ -69,7 +69,7 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
 
 
 def smoothed(data: Trajectories, local: LocalPolynomials | None = None) -> Trajectories:
-    """The recordings with positions on these local polynomials, or on their own; unchanged if there are none."""
+    """The recordings with positions on these local polynomials, or on their own; unchanged if too short for any."""
     local = local or local_polynomials(data)
     return data if local is None else replace(data, q=local.at(0.0).to(data.q))
 

@@ -30,19 +30,20 @@ Read = TypeVar("Read")
 
 
 def from_table(
-    path: Path,  # begins messages
+    path: Path,
     columns: Columns,
     at: Sequence[int],  # (N,) row number of each sample in the file, for messages
     labels: Sequence[str],  # (N,) trajectory of each sample
     values: Any,  # (N, columns.numeric) numbers; NaN where a coordinate, s, a momentum or an input is missing
-    with_settings: Callable[[Trajectories], Trajectories] = lambda found: found,  # adds the comments of a file
+    with_settings: Callable[[Trajectories], Trajectories] = lambda found: found,
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
     A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). Rows without any coordinate are
     left out, and a note gives their number: the step over these rows is longer, with the mean of the inputs
     (`herglotz.data.rates`). A trajectory that is too short, or whose time does not increase, is left out with a
-    warning. Raise InputError if most trajectories are unusable.
+    warning. `with_settings` adds the settings in the comments of a file. Raise InputError, which begins with `path`, if
+    most trajectories are unusable.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     columns, values = _without_blank(columns, values)
@@ -239,7 +240,7 @@ def _text(x: Any) -> str:
 
 
 def in_dates(found: Trajectories, unit: str = "date") -> Trajectories:
-    """The set with its times in s whatever the header says, as dates and durations are; `unit` is what was recorded."""
+    """The set with its times in s, as dates and durations are whatever the header says; `unit` joins the table."""
     roles = ((name, role, (unit or own) if role == "time" else own) for name, role, own in found.columns)
     return replace(in_seconds(found), t=found.t, time_unit="s", columns=tuple(roles))
 
@@ -296,7 +297,7 @@ def moment(text: str) -> datetime | None:
 
 
 def _numbers(where: Path, name: str, column: np.ndarray, complete: bool, first: int) -> np.ndarray:
-    """A column, whose rows count from `first`, as float64: finite numbers, and NaN unless it has to be `complete`."""
+    """A column as float64: finite numbers, and NaN unless the column has to be `complete`; rows count from `first`."""
     try:
         found = column.astype(np.float64)
     except (TypeError, ValueError):
