@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import replace
 
 import torch
@@ -35,26 +35,19 @@ def with_angles_in_degrees(
     known = {} if like is None else dict.fromkeys(like.names, "") | {name: unit for name, _, unit in like.columns}
     units = zip(data.names, data.units, strict=True)
     found = [name for name, unit in units if unit == "1" and known.get(name) == TAKEN_FOR_DEGREES]
+    radians = data.names if angles is True else as_names(angles or ())
     notes = []
-    for name, q, in_radians in _angles_beyond_a_turn(data, angles, {*known, *data.degrees}):
+    for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
+        in_radians = unit == "rad" or name in radians
+        angular = in_radians or (unit == "1" and angles is None and is_angular(name))
+        if not angular or name in {*known, *data.degrees} or float(q.abs().max()) <= TURN["rad"]:
+            continue
         in_degrees = is_in_degrees(data, q)
         if in_degrees and not in_radians:
             found.append(name)
         if in_degrees or not in_radians:
             notes.append(_note(name, float(q.abs().max()), in_radians, in_degrees))
     return _converted(data, found, notes)
-
-
-def _angles_beyond_a_turn(
-    data: Trajectories, angles: Names | bool | None, known: Collection[str]
-) -> Iterator[tuple[str, Tensor, bool]]:
-    """Names and values (N,) of coordinates that may be in degrees, and whether the user calls them angles in rad."""
-    radians = data.names if angles is True else as_names(angles or ())
-    for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
-        in_radians = unit == "rad" or name in radians
-        angular = in_radians or (unit == "1" and angles is None and is_angular(name))
-        if angular and name not in known and float(q.abs().max()) > TURN["rad"]:
-            yield name, q, in_radians
 
 
 def is_in_degrees(data: Trajectories, q: Tensor) -> bool:

@@ -13,6 +13,7 @@ from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.table import from_frame
 from herglotz.data.units import in_degrees, size
 from herglotz.errors import InputError
+from herglotz.training.run_folder import reading_in
 
 
 class Frame(dict):
@@ -129,7 +130,8 @@ def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the command line is dropped on the way
+def test_flags_reach_the_reader(tmp_path, capsys):
+    # fails if a flag of the command line is dropped on the way, or a run that had the flag cannot be opened
     path = tmp_path / "motion.csv"
     path.write_text("clock,a,b\n0,1,2\n1,2,3\n")
     flags = ["--time", "clock", "--coordinates", "a", "--inputs", "none", "--drop", "b", "--group", "lap"]
@@ -140,9 +142,11 @@ def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the com
     ):
         assert main([*command, *flags]) == 2
         assert "there is no column 'lap'; the columns are clock, a, b" in capsys.readouterr().err
-        taken = columns_of(build_parser().parse_args([*command, *flags, "--angles", "a"]))
-        names = {"coordinates": ["a"], "inputs": [], "drop": ["b"], "angles": ["a"]}
-        assert taken == {"time": "clock", "group": "lap", **names}
+        more = ["--angles", "a", "--degrees", "b,c", "--polar", "x1,y1", "--polar", "x2,-y2"]
+        taken = columns_of(build_parser().parse_args([*command, *flags, *more]))
+        names = {"coordinates": ["a"], "inputs": [], "drop": ["b"], "angles": ["a"], "degrees": ["b", "c"]}
+        assert taken == {"time": "clock", "group": "lap", **names, "polar": ["x1,y1", "x2,-y2"]}
+        assert reading_in({"reading": taken}, "config.json") == taken
 
 
 def test_columns_are_of_tables(tmp_path):  # fails if a flag is ignored where it has no meaning

@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from herglotz.cli.flags import columns_of
-from herglotz.cli.parser import build_parser
 from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.polar import circle
 from herglotz.errors import InputError
-from herglotz.training.run_folder import reading_in
 
 T = np.arange(200) / 30
 A, B = 1.1 * np.cos(3 * T) * np.exp(-0.02 * T), 0.9 * np.sin(2.3 * T)
@@ -197,10 +194,3 @@ def test_nothing_is_said_where_the_user_has_spoken(tmp_path, capsys):  # fails i
     load(path, like=load(path, polar=()))
     load(written(tmp_path, "x[m],z[m]", ONE))
     assert "circle" not in capsys.readouterr().err
-
-
-def test_the_flag_and_the_settings_of_a_run():
-    # fails if one of several pairs is lost on the way to the reader, or a run that had them cannot be opened
-    told = build_parser().parse_args(["fit", __file__, "--out", "x", "--polar", "x1,y1", "--polar", "x2,-y2"])
-    assert columns_of(told) == {"polar": ["x1,y1", "x2,-y2"]}
-    assert reading_in({"reading": columns_of(told)}, "config.json") == columns_of(told)
