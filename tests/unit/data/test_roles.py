@@ -211,7 +211,7 @@ def test_a_readme_beside_recordings(tmp_path, capsys):
     # fails if a folder is refused for its README, a recording in .txt is left out, or a warning of one file has no name
     for name, header in (("a.csv", "t[s],x[m]"), ("b.txt", "t[s],x[m]"), ("c.csv", "t[s],x[m]")):
         (tmp_path / name).write_text(table(header))
-    (tmp_path / "README.txt").write_text("Two columns:\nt,x\n0,1\n1,2\n")
+    (tmp_path / "README.txt").write_text("x[m]   the cart\nt[s]   time\n")
     assert len(load(tmp_path)) == 3
     (tmp_path / "c.csv").write_text(table("t[s],x[m],road[m]"))
     for name in ("a.csv", "b.txt"):
