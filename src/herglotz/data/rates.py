@@ -91,14 +91,10 @@ def _together(one: Recording, q: slice) -> Recording:
     for k in range(known.shape[1]):
         if k != base:
             own = known[:, k]
-            values[rows, q.start + k] = _between(values[own, 0], one.values[own, q.start + k], values[rows, 0])
+            t, at = values[own, 0], values[rows, 0]
+            cubic = between(*map(torch.from_numpy, (t, one.values[own, q.start + k], at))).numpy()
+            values[rows, q.start + k] = np.where((at >= t[0]) & (at <= t[-1]), cubic, np.nan)
     return Recording(one.label, one.at, values)
-
-
-def _between(t: np.ndarray, x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values of cubics through the nearest four samples (t, x) at other times; NaN outside of the samples."""
-    values = between(*map(torch.from_numpy, (t, x, at))).numpy()
-    return np.where((at >= t[0]) & (at <= t[-1]), values, np.nan)
 
 
 def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]:
@@ -126,9 +122,8 @@ def _fill_note(names: Sequence[str], straight: bool, longest: float, unit: str) 
     if straight:
         return f"{some}; straight lines go there from the row before to the row behind"
     size = f"{longest:.3g}" if unit == "1" else f"{longest:.3g} {unit}"
-    return (
-        f"warning: {some}: the last one is held, for up to {size}; --hold first (hold= in Python) draws straight lines"
-    )
+    lines = "--hold first (hold= in Python) draws straight lines"
+    return f"warning: {some}: the last one is held, for up to {size}; {lines}"
 
 
 def filled_inputs(data: Trajectories) -> list[str]:
