@@ -19,9 +19,8 @@ from herglotz.data.csv_dialect import Rows, cells_of, in_commas
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.rows import MISSING, number, quote
 from herglotz.data.sensors import calibrated
-from herglotz.data.table import from_table, in_dates, moment
+from herglotz.data.table import from_table, in_dates, moment, with_units
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import with_units
 from herglotz.errors import InputError, refuse
 
 # Comments about inputs (hold, delay, lag) and about sensors (zero, scale).

@@ -1,4 +1,6 @@
-"""Columns of a table that were sampled at different times: rows are joined, and inputs filled between samples.
+"""Times of the rows of a table: repeated stamps, and columns that were sampled at different times.
+
+A clock may count more slowly than samples come, and a row may be written twice: `without_repeats`.
 
 A sample of the motion is a row in which a coordinate is known. An input is needed between its own samples, too: the
 input is held from sample to sample, or interpolated linearly, and a step of the motion takes the mean of the input.
@@ -12,10 +14,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Columns
 from herglotz.data.missing import CUBIC_POINTS, between
 from herglotz.data.trajectories import Trajectories
 
+# Stamps within this part of a count are whole counts: decimal numbers are rounded in float64.
+COUNT_TOLERANCE = 1e-3
 # With fewer changes all distances between the changes of an input may be k or k + 1 rows by chance.
 MIN_CHANGES = 20
 # Each of the two distances has at least this share; a smaller share comes from missing rows, not from a second clock.
@@ -48,6 +53,38 @@ def in_order(one: Recording) -> Recording:
             values[first] = np.where(new, values[k], values[first])
             kept[k] = False
     return Recording(one.label, one.at[kept], values[kept])
+
+
+def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
+    """The recording with increasing stamps, and a note on the repair; unchanged if no stamp repeats or some decrease.
+
+    If all stamps are whole counts, and equal steps miss no stamp by more than a count, the samples were taken in equal
+    steps: the number of a sample gives its time. Otherwise the first row of each stamp is kept.
+    """
+    t = one.values[:, 0]
+    d = np.diff(t)
+    if not (d == 0).any() or (d < 0).any() or not (d > 0).any():
+        return one, ""
+    count, steps = float(d[d > 0].min()), np.arange(len(t)) - (len(t) - 1) / 2
+    h = float(steps @ (t - t.mean()) / (steps @ steps))
+    even, counts = t.mean() + h * steps, (t - t[0]) / count
+    whole = bool((np.abs(counts - counts.round()) <= COUNT_TOLERANCE).all()) and bool((np.abs(even - t) <= count).all())
+    twice = d == 0
+    same = _written_twice(one.values[1:][twice], one.values[:-1][twice])
+    if whole and int(twice.sum()) >= MIN_SAMPLES and not same:
+        values = np.column_stack([even, one.values[:, 1:]])
+        size, step = (f"{x:.4g}" + ("" if unit == "1" else f" {unit}") for x in (count, h))
+        note = f"warning: stamps repeat in counts of {size}; rows are taken to be {step} apart, as their number says"
+        return Recording(one.label, one.at, values), note
+    kept, rows = np.concatenate([[True], ~twice]), one.at[1:][twice]
+    some = "a row is" if len(rows) == 1 else f"{len(rows)} rows are"
+    note = f"warning: {some} left out, with the stamp of the row before: the first is row {rows[0]}"
+    return Recording(one.label, one.at[kept], one.values[kept]), note
+
+
+def _written_twice(rows: np.ndarray, before: np.ndarray) -> bool:
+    """Whether each of these rows equals the row before."""
+    return bool(((rows == before) | (np.isnan(rows) & np.isnan(before))).all())
 
 
 def completed(
