@@ -133,8 +133,9 @@ def _check_decimals(path: Path, table: Callable[[], Cells], separator: str) -> N
     Programs that write commas between columns often write commas between thousands, too: in their tables at least one
     comma has to be a decimal sign for certain.
     """
-    numbers = [(i, cell) for i, cells in table() for cell in cells if "," in cell and is_number(cell.replace(",", "."))]
-    if separator == "," and numbers and all(THOUSANDS_OR_DECIMALS.fullmatch(cell) for _, cell in numbers):
+    rows = table() if separator == "," else ()
+    numbers = [(i, cell) for i, cells in rows for cell in cells if "," in cell and is_number(cell.replace(",", "."))]
+    if numbers and all(THOUSANDS_OR_DECIMALS.fullmatch(cell) for _, cell in numbers):
         i, cell = numbers[0]
         both = f"{cell.replace(',', '')} or {cell.replace(',', '.')}"
         raise InputError(f"{path}, row {i}: {cell!r} may be {both}; write numbers without separators of thousands")
