@@ -16,7 +16,8 @@ from torch import Tensor
 
 from benchmarks.harness import DATA
 from benchmarks.ibm_double_pendulum import read_ibm_double_pendulum
-from herglotz.data import load, simulate
+from benchmarks.schmidt_lipson import read_schmidt_lipson
+from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit
@@ -220,7 +221,7 @@ def real_pendulum(history: int = 40) -> Problem:
     def parts() -> tuple[Tensor, Tensor, int]:
         if not path.is_file():
             raise InputError(f"{path}: not here; data/README.md says where to get it, or leave real_pendulum out")
-        data = load(path).unwrapped()
+        data = read_schmidt_lipson(path)
         index = ((data.t - data.t[0]) / h).round().long()
         return index, data.q, round(0.667 * len(index))
 
@@ -242,7 +243,7 @@ def real_pendulum(history: int = 40) -> Problem:
     title = "measured pendulum (Schmidt & Lipson), first 2/3 → last 1/3; one free run"
 
     def own(seed: int) -> tuple[Metrics, int]:
-        run = fit(load(path), FitConfig(seed=seed), progress=False)
+        run = fit(read_schmidt_lipson(path), FitConfig(seed=seed), progress=False)
         cut = run.train_lengths[0]
         return free_run(run.prediction[cut:], run.data.q[cut:]), run.metrics["parameters"]
 

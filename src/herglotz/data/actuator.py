@@ -1,15 +1,15 @@
 """How a recorded input reaches the machine: later by a delay, and through an actuator's lag.
 
-With the recorded u(t) as its hold has it between samples, the input that acts is u_f of
+With the recorded u(t), between samples as its hold says, the input that acts is u_f of
 
     lag · u_f′(t) = u(t − delay) − u_f(t),
 
-constant before the first sample. Every hold makes u of straight pieces (polynomials are cut into `PARTS` of them a
-step), and on a piece a + b x that starts at x = 0
+constant before the first sample. Every hold makes u of straight pieces (a polynomial is cut into `PIECES_PER_STEP` of
+them), and on a piece a + b x that starts at x = 0
 
     u_f = a + b (x − lag) + (u_f(0) − a + b lag) e^(−x/lag),     ∫u_f = ∫u(t − delay) − lag (u_f − u_f(0)):
 
-values and means are exact. The stepper takes one input a step and sees nothing of this.
+values and means are exact. The stepper takes the acting input of each step; it knows neither delay nor lag.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from herglotz.data.holds import NOT_SAID, Arrival, held
+from herglotz.data.holds import UNSPECIFIED, Arrival, interpolated_input
 
 if TYPE_CHECKING:
     from herglotz.data.trajectories import Trajectories
 
-PARTS = 8  # straight pieces of a polynomial between samples: at nine samples a period they miss it by a thousandth
+# Straight pieces of a polynomial between samples. At nine samples a period they miss the polynomial by a thousandth.
+PIECES_PER_STEP = 8
 
 
-def acting(data: Trajectories, unsaid: Arrival = NOT_SAID) -> Trajectories:
-    """The recording with the inputs that act as its inputs; `unsaid` stands for what it does not say itself."""
+def acting(data: Trajectories, default: Arrival = UNSPECIFIED) -> Trajectories:
+    """The recording with its acting inputs; `default` has hold, delay and lag where the recording has none."""
     if data.u is None:
         return data
-    said = [own if own is not None else other for own, other in zip(data.arrival[1:], unsaid[1:], strict=True)]
-    arrival, u = Arrival(data.hold or unsaid.hold, *said), data.u
+    late = [own if own is not None else other for own, other in zip(data.arrival[1:], default[1:], strict=True)]
+    arrival, u = Arrival(data.hold or default.hold, *late), data.u
     if any(arrival.late):
         u = InputPieces.of(arrival.hold, data.t, u, data.lengths).acting(*arrival.late).to(u)
     return replace(data, u=u, hold=arrival.hold, delay=0.0, lag=0.0)
@@ -42,7 +43,10 @@ def acting(data: Trajectories, unsaid: Arrival = NOT_SAID) -> Trajectories:
 
 @dataclass(frozen=True)
 class InputPieces:
-    """Recorded inputs as straight pieces, trajectory after trajectory on one axis of time."""
+    """Recorded inputs as P straight pieces, trajectory after trajectory on one axis of time.
+
+    `leads` marks the first piece of a trajectory, and `constant` the hold "zero".
+    """
 
     times: Tensor  # (N,) of the samples
     begins: Tensor  # (N,) of their trajectories
@@ -51,43 +55,46 @@ class InputPieces:
     width: Tensor  # (P, 1)
     value: Tensor  # (P, m) at the start
     slope: Tensor  # (P, m)
-    leads: Tensor  # (P, 1) bool: the first piece of a trajectory
-    constant: bool  # whether the hold is "zero"
+    leads: Tensor  # (P, 1) bool
+    constant: bool
 
     @classmethod
     def of(
         cls,
-        hold: str,  # of the inputs; "" (not said) is "zero"
+        hold: str,
         t: Tensor,  # (N,)
-        u: Tensor,  # (N, m) as recorded
+        u: Tensor,  # (N, m)
         lengths: Sequence[int],
     ) -> InputPieces:
-        """The pieces of all trajectories, in float64."""
+        """The pieces of recorded inputs u, in float64; a hold that is not specified ("") is "zero"."""
         t, u, counts, constant = t.double().cpu(), u.double().cpu(), torch.tensor(lengths), hold in ("", "zero")
         last = counts.cumsum(0) - 1
         first = last + 1 - counts
-        spans = t[last] - t[first] + t.diff().abs().max()  # a gap keeps trajectories apart
+        # The longest step keeps trajectories apart on the axis of time.
+        spans = t[last] - t[first] + t.diff().abs().max()
         owner = torch.repeat_interleave(torch.arange(len(counts)), counts)
         begins = (spans.cumsum(0) - spans)[owner]
         times = t - t[first][owner] + begins
         steps = torch.ones_like(t, dtype=torch.bool)
         steps[last] = False
-        parts = PARTS if hold == "smooth" else 1
+        parts = PIECES_PER_STEP if hold == "smooth" else 1
         row = steps.nonzero()[:, 0].repeat_interleave(parts)
         part = torch.arange(parts, dtype=t.dtype).repeat(len(row) // parts) / parts
         width = (times[row + 1] - times[row])[:, None] / parts
-        value = held(hold, t, u, lengths, row, part)
-        slope = torch.zeros_like(value) if constant else (held(hold, t, u, lengths, row, part + 1 / parts) - value)
+        value = interpolated_input(hold, t, u, lengths, row, part)
+        slope = torch.zeros_like(value)
+        if not constant:
+            slope = interpolated_input(hold, t, u, lengths, row, part + 1 / parts) - value
         leads = (torch.isin(row, first) & (part == 0))[:, None]
         left = times[row] + part * parts * width[:, 0]
         return cls(times, begins, last, left, width, value, slope / width, leads, constant)
 
     def acting(self, delay: float, lag: float) -> Tensor:
-        """The inputs that act, (N, m): means over the steps where the hold is "zero", else values at the samples."""
+        """The acting inputs, (N, m): means over the steps if the hold is "zero", else values at the samples."""
         lag = max(lag, torch.finfo(self.left.dtype).tiny)
         a, b, decay = self.value, self.slope, torch.exp(-self.width / lag)
         forced = a + b * (self.width - lag)
-        end = _scanned(
+        end = _linear_recurrence(
             torch.where(self.leads, 0.0, decay), forced - torch.where(self.leads, -b * lag, a - b * lag) * decay
         )
         start = torch.where(self.leads, a, torch.cat([a[:1], end[:-1]]))
@@ -97,16 +104,18 @@ class InputPieces:
         value = a[at] + b[at] * (x - lag) + (start[at] - a[at] + b[at] * lag) * torch.exp(-x / lag)
         if not self.constant:
             return value
-        area = (self.width * a).cumsum(0) - self.width * a  # before each piece
-        early = (self.times - delay - asked)[:, None]  # before the first sample
-        total = area[at] + a[at] * (x + early) - lag * value
+        # ∫u up to the start of each piece, and the part of the delayed time that lies before the first sample.
+        before = (self.width * a).cumsum(0) - self.width * a
+        early = (self.times - delay - asked)[:, None]
+        total = before[at] + a[at] * (x + early) - lag * value
         mean = torch.cat([total.diff(dim=0) / self.times.diff()[:, None], value[-1:]])
-        mean[self.last] = value[self.last]  # no step starts there
+        # No step starts at the last sample of a trajectory.
+        mean[self.last] = value[self.last]
         return mean
 
 
-def _scanned(factor: Tensor, add: Tensor) -> Tensor:
-    """y_j = factor_j y_{j−1} + add_j of all j at once, by doubling."""
+def _linear_recurrence(factor: Tensor, add: Tensor) -> Tensor:
+    """y_j = factor_j y_{j−1} + add_j for all j at once, by doubling."""
     by, y, reach = factor, add, 1
     while reach < len(y) and bool((by > 0).any()):
         y = torch.cat([y[:reach], y[reach:] + by[reach:] * y[:-reach]])

@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
-from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
+from herglotz.data.column_roles import name_and_unit
+from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.extra_formats import Table
-from herglotz.data.gaps import parted, with_missing
+from herglotz.data.gaps import with_missing
 from herglotz.data.polar import named_by
-from herglotz.data.readers import angles_like, as_told, load, with_angles
+from herglotz.data.readers import angles_like, as_meant, finished, load
 from herglotz.data.sensors import calibrated
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame, plain, seconds
@@ -26,9 +27,11 @@ from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse
 from herglotz.telling import tell
 
-TRANSPOSED = 4  # times as many coordinates as samples: so short a recording of a chain determines no model
-AS_THEY_ARE = Wanted(coordinates=())  # coordinates of arrays, which no header names
-OF_TRAJECTORIES = (
+# With more coordinates a sample than this an array is taken for transposed: so few samples determine no model.
+MAX_COORDINATES_PER_SAMPLE = 4
+# The coordinates of arrays, which no header names.
+NO_HEADER = Wanted(coordinates=())
+COLUMNS_ARE_FIXED = (
     "trajectories have their columns already; angles, degrees, polar, input_terms and sensors alone change them"
 )
 OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "polar", "input_terms",
@@ -72,17 +75,14 @@ def as_trajectories(
     inputs
         Of a table the columns, () for none; of an array the inputs (N,) or (N, m).
     drop, group
-        Columns of a table that are left aside; the column that numbers the trajectories.
+        Of a table the columns that are left aside; the column that numbers the trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
-    degrees, polar, input_terms
-        Coordinates in degrees whose header does not say so; pairs of positions that become an angle each; terms of
-        inputs that act beside the inputs: as in `load`.
+    degrees, polar, input_terms, like
+        As in `load`.
     sensor_zeros, sensor_scales
         q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
         for none.
-    like
-        Another recording: columns with the same names have the same roles.
 
     Returns
     -------
@@ -96,28 +96,33 @@ def as_trajectories(
     """
     names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
     meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms, "like": like}
-    sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
+    sensors = (sensor_zeros, sensor_scales)
     data = _by_field(data)
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
     if isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
-        return _shown(load(data, show=False, **meant, **sensors, **columns))
+        return load(data, **meant, sensor_zeros=sensor_zeros, sensor_scales=sensor_scales, **columns)
     if isinstance(data, Trajectories):
-        refuse({OF_TRAJECTORIES: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
+        refuse({COLUMNS_ARE_FIXED: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         changed = any(x is not None for x in (degrees, polar, input_terms))
-        found = as_told(data, AS_THEY_ARE, **meant) if changed else data
+        found = as_meant(data, NO_HEADER, **meant) if changed else data
     elif _is_table(data, h):
         wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
-        found = as_told(_table(data, wanted), wanted, **meant)
-        found = found if like is None else angles_like(found, like)
-        return _shown(_marked(calibrated(found, sensor_zeros, sensor_scales), angles))
+        found = as_meant(_table(data, wanted), wanted, **meant)
+        found = finished(found if like is None else angles_like(found, like), angles, *sensors)
+        tell(found.table())
+        return found.unwrapped()
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
-        refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
+        # The angles of the list are unwrapped when its zeros are subtracted; a scale would have to act before.
+        refuse({several: sensor_scales is not None and len(sensor_scales) > 0})
         return calibrated(_of_each(data, {"h": h, "time": time, **names, **meant}), sensor_zeros)
     else:
-        found = as_told(_array(data, h, time, names), AS_THEY_ARE, **meant)
-    return _noted(_marked(calibrated(found, sensor_zeros, sensor_scales), angles), data)
+        found = as_meant(_array(data, h, time, names), NO_HEADER, **meant)
+    found = finished(found, angles, *sensors)
+    for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
+        tell(f"{found.source or 'trajectories'}: {note}")
+    return found.unwrapped()
 
 
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -125,14 +130,14 @@ def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     return {k: v for k, v in settings.items() if k in OPTIONS}, {k: v for k, v in settings.items() if k not in OPTIONS}
 
 
-def _lists(told: dict[str, Any]) -> dict[str, Any]:
-    """The settings of the columns, with a list for each array or index of names, as a DataFrame's columns are."""
-    hold = {role: hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU" for role, x in told.items()}
-    return {role: x.tolist() if hold[role] else x for role, x in told.items()}
+def _lists(roles: dict[str, Any]) -> dict[str, Any]:
+    """The settings of the columns, with a list for each array or index of names, such as a DataFrame's columns."""
+    are_names = {role: hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU" for role, x in roles.items()}
+    return {role: x.tolist() if are_names[role] else x for role, x in roles.items()}
 
 
 def _by_field(data: Any) -> Any:
-    """The columns of a structured array, as numpy.genfromtxt makes; all other data as they are."""
+    """A structured array, as numpy.genfromtxt makes, as a dict of its columns; all other data unchanged."""
     fields = getattr(getattr(data, "dtype", None), "names", None)
     return {name: data[name] for name in fields} if fields else data
 
@@ -143,6 +148,7 @@ def _is_table(data: Any, h: float | None) -> bool:
 
 
 def _is_list_of_recordings(data: Any) -> bool:
+    """Whether data are a list of anything but numbers, or an array (B, N, n)."""
     if isinstance(data, (np.ndarray, Tensor)):
         return data.ndim == 3
     if _is_series(data) or hasattr(data, "columns"):
@@ -151,12 +157,8 @@ def _is_list_of_recordings(data: Any) -> bool:
 
 
 def _is_series(data: Any) -> bool:
+    """Whether data have an index, as a pandas Series; the `index` of a list is a method."""
     return hasattr(data, "index") and not callable(data.index)
-
-
-def _name_of(series: Any) -> str | None:
-    name = getattr(series, "name", None)
-    return None if name is None else str(name)
 
 
 def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
@@ -177,17 +179,25 @@ def _table(data: Any, wanted: Wanted) -> Trajectories:
 
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:
+    """One recording of an array (N,) or (N, n), of a Series, or of a DataFrame without its own time."""
     called = names["coordinates"]
     if hasattr(data, "columns"):
         data, called = np.asarray(data), called or [*map(str, data.columns)]
     elif _is_series(data):
-        called = called or _name_of(data)
+        own = getattr(data, "name", None)
+        called = called or (None if own is None else str(own))
         if h is None and time is None and type(data.index).__name__ != "RangeIndex":
             time = data.index
     q = torch.from_numpy(_floats("positions", data))
-    _check_array(
-        q, called, timeless=(h is None) == (time is None), of_tables=names["group"] is not None or names["drop"]
-    )
+    refuse({
+        "positions without times: give h, the time between two samples, or time, an array of times":
+            (h is None) == (time is None),
+        f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, give a list "
+        "of recordings, or name every coordinate with coordinates=":
+            q.ndim == 2 and MAX_COORDINATES_PER_SAMPLE * len(q) < q.shape[1] != len(as_names(called or ())),
+        "group and drop are of tables; give a list of arrays, and leave columns out by slicing":
+            names["group"] is not None or names["drop"],
+    })  # fmt: skip
     n = len(q)
     clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time))
     t = np.arange(n) * float(h) if h is not None else _floats("time", clock)
@@ -198,17 +208,6 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     found = Trajectories.of(t, q.where(~q.isnan(), 0.0), u=u, source="array", **_labels(called))
     found = with_missing(found, ~missing, lambda k: f"sample {k}") if known < n else found
     return in_radians_and_seconds(found)
-
-
-def _check_array(q: Tensor, called: Names | None, *, timeless: bool, of_tables: bool) -> None:
-    refuse({
-        "positions without times: give h, the time between two samples, or time, an array of times": timeless,
-        f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, give a list "
-        "of recordings, or name every coordinate with coordinates=": (
-            q.ndim == 2 and TRANSPOSED * len(q) < q.shape[1] != len(as_names(called or ()))
-        ),
-        "group and drop are of tables; give a list of arrays, and leave columns out by slicing": of_tables,
-    })  # fmt: skip
 
 
 def _labels(called: Names | None) -> dict[str, Any]:
@@ -224,25 +223,8 @@ def _labels(called: Names | None) -> dict[str, Any]:
 
 
 def _floats(name: str, x: Any) -> np.ndarray:
+    """Numbers in float64; raise InputError for other objects, and for rows of different lengths."""
     try:
         return np.array(plain(x.detach().cpu() if isinstance(x, Tensor) else x), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: not numbers in rows of one length ({error})") from None
-
-
-def _marked(data: Trajectories, angles: Any) -> Trajectories:
-    return parted(data if angles is None else with_angles(data, angles)).unwrapped()
-
-
-def _noted(found: Trajectories, data: Any) -> Trajectories:
-    """Print the notes that the data did not have; return `found`."""
-    for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
-        tell(f"{found.source or 'trajectories'}: {note}")
-    return found
-
-
-def _shown(data: Trajectories) -> Trajectories:
-    """Print the role of each column of the table, after all notes on the columns; return `data`."""
-    if data.columns:
-        tell(data.table())
-    return data

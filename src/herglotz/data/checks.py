@@ -13,12 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 
 ARRAYS = ("t", "q", "s", "p", "u", "v", "observed")
-MIN_SAMPLES = 3  # one discrete Herglotz residual joins q_{k−1}, q_k, q_{k+1}
-EXACT = 2**53  # integers up to here are floats of double precision
-SMALLEST, LARGEST = 1e-50, 1e50  # of numbers that are fitted: cubes and sums of a million squares are numbers
+# One discrete Herglotz residual joins q_{k−1}, q_k, q_{k+1}.
+MIN_SAMPLES = 3
+# Integers up to here are floats of double precision.
+EXACT = 2**53
+# Between these sizes the cubes and the sums of a million squares neither vanish nor overflow.
+SMALLEST, LARGEST = 1e-50, 1e50
 DTYPES = (torch.float32, torch.float64)
 
 
@@ -58,52 +61,40 @@ def locate(offsets: tuple[int, ...], row: int) -> tuple[int, int]:
 
 
 def _check_tensors(where: str, arrays: Mapping[str, Tensor]) -> None:
+    t = arrays["t"]
     for name, x in arrays.items():
         if not isinstance(x, Tensor):
             kind = type(x).__name__
             raise InputError(f"{where}: {name} must be a torch.Tensor, got {kind}; use Trajectories.of(...)")
-        if x.dtype not in DTYPES:
-            raise InputError(f"{where}: {name} has dtype {x.dtype}; convert it to torch.float64 (or torch.float32)")
-        first = arrays["t"]
-        if x.dtype != first.dtype or x.device != first.device:
-            raise InputError(
-                f"{where}: {name} is {x.dtype} on {x.device} but t is {first.dtype} on {first.device}; use the same"
-            )
+        both = f"{name} is {x.dtype} on {x.device} but t is {t.dtype} on {t.device}; use the same"
+        refuse({
+            f"{where}: {name} has dtype {x.dtype}; convert it to torch.float64 (or torch.float32)":
+                x.dtype not in DTYPES,
+            f"{where}: {both}": (x.dtype, x.device) != (t.dtype, t.device),
+        })  # fmt: skip
 
 
 def _check_shapes(where: str, arrays: Mapping[str, Tensor]) -> None:
     t, q = arrays["t"], arrays["q"]
-    if t.ndim != 1:
-        raise InputError(f"{where}: t must have shape (N,), got {tuple(t.shape)}; flatten it")
+    refuse({f"{where}: t must have shape (N,), got {tuple(t.shape)}; flatten it": t.ndim != 1})
     if q.ndim != 2 or q.shape[0] != len(t) or q.shape[1] < 1:
         raise InputError(f"{where}: q must have shape ({len(t)}, n), one row a sample of t, got {tuple(q.shape)}")
-    wanted = {"s": f"({len(t)},)", "p": f"({len(t)}, {q.shape[1]})", "u": f"({len(t)}, m)"}
-    wanted["v"] = wanted["observed"] = wanted["p"]
-    fits = {
-        "s": lambda x: x.shape == t.shape,
-        "p": lambda x: x.shape == q.shape,
-        "v": lambda x: x.shape == q.shape,
-        "observed": lambda x: x.shape == q.shape,
-        "u": lambda x: x.ndim == 2 and x.shape[0] == len(t) and x.shape[1] >= 1,
-    }
-    for name in wanted:
-        if name in arrays and not fits[name](arrays[name]):
-            raise InputError(f"{where}: {name} must have shape {wanted[name]}, got {tuple(arrays[name].shape)}")
+    for name, x in arrays.items():
+        shape = {"t": t.shape, "s": t.shape, "u": (len(t), max(1, x.shape[-1]) if x.ndim else 1)}.get(name, q.shape)
+        if x.shape != shape:
+            wanted = f"({len(t)}, m)" if name == "u" else tuple(shape)
+            raise InputError(f"{where}: {name} must have shape {wanted}, got {tuple(x.shape)}")
 
 
 def _check_lengths(where: str, lengths: tuple[int, ...], samples: int) -> None:
-    if not lengths:
-        raise InputError(f"{where}: there is no trajectory; give at least one of {MIN_SAMPLES} samples")
+    refuse({f"{where}: there is no trajectory; give at least one of {MIN_SAMPLES} samples": not lengths})
     for b, length in enumerate(lengths):
         if isinstance(length, bool) or not isinstance(length, int):
             raise InputError(f"{where}: lengths[{b}] is {length!r}, not an int; count the samples of each trajectory")
-        if length < MIN_SAMPLES:
-            plural = "" if length == 1 else "s"
-            raise InputError(
-                f"{where}: trajectory {b} has {length} sample{plural}, at least {MIN_SAMPLES} are needed; leave it out"
-            )
-    if sum(lengths) != samples:
-        raise InputError(f"{where}: lengths add up to {sum(lengths)} but t has {samples} samples; correct the lengths")
+        has = f"{length} sample{'' if length == 1 else 's'}, at least {MIN_SAMPLES} are needed"
+        refuse({f"{where}: trajectory {b} has {has}; leave it out": length < MIN_SAMPLES})
+    total = sum(lengths)
+    refuse({f"{where}: lengths add up to {total} but t has {samples} samples; correct the lengths": total != samples})
 
 
 def _check_labels(where: str, labels: Any, n: int) -> None:
@@ -111,40 +102,36 @@ def _check_labels(where: str, labels: Any, n: int) -> None:
         entries = getattr(labels, field)
         if len(entries) != n:
             raise InputError(f"{where}: {field} has {len(entries)} entries for {n} coordinates; give one a coordinate")
-    if len(set(labels.names)) != n or not all(labels.names):
-        raise InputError(f"{where}: names {labels.names} must differ and not be empty; rename a coordinate")
-    if not all(labels.units) or not labels.time_unit:
-        raise InputError(f"{where}: a unit is empty ({labels.units}, {labels.time_unit!r}); write '1' for none")
+    unclear = len(set(labels.names)) != n or not all(labels.names)
+    empty = not all(labels.units) or not labels.time_unit
+    refuse({
+        f"{where}: names {labels.names} must differ and not be empty; rename a coordinate": unclear,
+        f"{where}: a unit is empty ({labels.units}, {labels.time_unit!r}); write '1' for none": empty,
+    })  # fmt: skip
     for text in (*labels.names, *labels.units, labels.time_unit):
-        if any(unicodedata.category(x) in ("Cc", "Cs") for x in text):  # can be neither drawn nor written
+        # Control characters and halves of surrogate pairs can be neither drawn nor written.
+        if any(unicodedata.category(x) in ("Cc", "Cs") for x in text):
             raise InputError(f"{where}: {text!r} has control characters or half a character; rename it")
     for name, unit, angle in zip(labels.names, labels.units, labels.angles, strict=True):
-        if angle and unit != "rad":
-            raise InputError(
-                f"{where}: the angle {name!r} is in {unit!r}; convert it to radians and give it the unit 'rad'"
-            )
+        convert = f"the angle {name!r} is in {unit!r}; convert it to radians and give it the unit 'rad'"
+        refuse({f"{where}: {convert}": angle and unit != "rad"})
 
 
 def _check_finite(where: str, offsets: tuple[int, ...], name: str, x: Tensor) -> None:
-    bad = ~torch.isfinite(x.detach())
-    if not bad.any():
+    if bool(torch.isfinite(x.detach()).all()):
         return
-    place = bad.nonzero()[0].tolist()
+    place = (~torch.isfinite(x.detach())).nonzero()[0].tolist()
     b, k = locate(offsets, place[0])
-    value = float(x[tuple(place)])
     column = f"{name}[{place[1]}]" if len(place) > 1 else name
-    raise InputError(f"{where}: {column} of trajectory {b}, sample {k}, is {value}; delete that sample")
+    what = f"{column} of trajectory {b}, sample {k}, is {float(x[tuple(place)])}"
+    raise InputError(f"{where}: {what}; delete that sample")
 
 
 def _check_observed(where: str, offsets: tuple[int, ...], observed: Tensor) -> None:
-    bad = ((observed != 0) & (observed != 1)).nonzero()
-    if len(bad):
-        row, i = bad[0].tolist()
+    for row, i in ((observed != 0) & (observed != 1)).nonzero().tolist():
         b, k = locate(offsets, row)
-        value = float(observed[row, i])
-        raise InputError(
-            f"{where}: observed[{i}] of trajectory {b}, sample {k}, is {value}; write 1 where it was read, else 0"
-        )
+        what = f"observed[{i}] of trajectory {b}, sample {k}, is {float(observed[row, i])}"
+        raise InputError(f"{where}: {what}; write 1 where it was read, else 0")
 
 
 def check_sizes(where: str, q: Tensor, names: Sequence[str]) -> None:
@@ -158,7 +145,8 @@ def check_sizes(where: str, q: Tensor, names: Sequence[str]) -> None:
 
 def _check_time(where: str, offsets: tuple[int, ...], t: Tensor) -> None:
     bad = ~(t.diff() > 0)
-    bad[torch.tensor(offsets[1:], dtype=torch.long, device=t.device) - 1] = False  # from one trajectory to the next
+    # Time may fall from one trajectory to the next.
+    bad[torch.tensor(offsets[1:], dtype=torch.long, device=t.device) - 1] = False
     if not bad.any():
         return
     row = int(bad.nonzero()[0, 0])
@@ -177,7 +165,7 @@ def check_positive(name: str, value: float) -> None:
 
 
 def check_alike(sets: Sequence[Any]) -> None:
-    """Raise unless the sets have the same coordinates, units and arrays, so that they can be joined."""
+    """Raise unless the sets can be joined: they have the same coordinates, units and arrays."""
     if not sets:
         raise InputError("cat needs at least one set of trajectories, got none")
     for other in sets[1:]:

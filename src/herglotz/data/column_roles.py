@@ -19,11 +19,16 @@ KINDS = {
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi"),
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
 }
+HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
+# A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
+TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
+# A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
+SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
 NUMBERED = r"(_?\d+|_.*)?"
 # Names that have a role whatever their words, unless the unit is of another kind.
 ROLES = {
     "time": re.compile(
-        r"t|times?|timestamps?|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
+        r"t|times?|timestamps?|date|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
         r"|czas|čas|aika"
     ),
     "trajectory": re.compile(r"trajectory|trial|run"),
@@ -38,19 +43,24 @@ RATE = re.compile(
     rf"v\d*|[va]_[xyz]|(.+_)?[vaw][xyz]|d?d?{SYMBOL}_?\d*_?(d?dot|vel|velocity|speed|rate|acc)(_?\d+)?|{SYMBOL}_?d?d_?\d+|{SYMBOL}dd"
     rf"|dd?_?{SYMBOL}{NUMBERED}|d\d?.+?_?/?dt(\^?2)?|(vel|acc|gyro)[xyz]\d*"
 )
-LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")  # of a velocity or an acceleration, unless the unit is that of a position
-DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")  # a desired value, or a derivative: q_d
-KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")  # usual names of coordinates
+# Letters of velocities and accelerations, unless the unit is that of a position.
+LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")
+# A desired value, or a derivative: q_d.
+DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")
+# Usual names of coordinates.
+KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")
 # The last part of a German compound decides: Motorstrom, Winkelgeschwindigkeit.
 COMPOUND = re.compile(
     ".+(winkel|kraft|moment|strom|spannung|drehzahl|geschwindigkeit|beschleunigung|fehler|temperatur|zeit)"
 )
-# Without accents: ángulo is here as angulo.
+# Words without accents: ángulo is here as angulo. Kinds of words that need a reason:
+# side: quantities that are measured beside a motion. attribute: of a position (motor_angle), or else of an input.
+# reading: sensors of positions, even in volts. excitation: places that move the mechanism from outside; support:
+# places that may do so.
 _WORDS = {
     "goal": "goal target setpoint setpoints sp desired des reference ref command commands commanded cmd demand "
             "demanded wanted vorgabe fuhrungsgrosse fuehrungsgroesse consigne commande consigna referencia riferimento "
             "comando",
-    # Of what is measured beside a motion.
     "side": "error err std sd stderr variance var covariance cov uncertainty residual quality confidence likelihood "
             "temperature temp temperatur temperatura battery batt supply humidity status statusword statuswort valid "
             "checksum crc leistung puissance potencia potenza fehler regelabweichung erreur errore reward done",
@@ -62,11 +72,10 @@ _WORDS = {
     "angle": "theta phi psi angle alpha beta gamma roll pitch yaw winkel angulo angolo θ φ ϕ ψ α β",
     "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle kraft drehmoment moment "
               "strom spannung couple courant tension fuerza corriente voltaje coppia corrente forza tensione grf",
-    # Of a position: motor_angle; else of an input.
     "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse",
-    "reading": "pot potentiometer lvdt encoder laser",  # of a position, even in volts
-    "excitation": "road ground floor shaker excitation disturbance seismic",  # where a motion comes from
-    "support": "base pivot support platform",  # places that may be moved from outside
+    "reading": "pot potentiometer lvdt encoder laser",
+    "excitation": "road ground floor shaker excitation disturbance seismic",
+    "support": "base pivot support platform",
 }  # fmt: skip
 WORDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 GIVEN = frozenset(("input", "inputs", "control", "controls"))
@@ -75,16 +84,17 @@ READING = "it may be the reading of a position"
 
 
 class Guess(NamedTuple):
-    """The role of a column, and a doubt about the role; "" if name and unit leave no doubt."""
+    """The role of a column, a key of `ROLES`, "rate", "dropped" or "q", and the doubt about the role, or ""."""
 
-    role: str  # a key of `ROLES`, "rate", "dropped" or "q"
+    role: str
     doubt: str = ""
 
 
 def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
-    """The role that a column has by itself; `others` are the names of all columns, which `dx` is understood from."""
+    """The role of a column by its own name and unit; `others` are the names of all columns: dx is the rate of x."""
     kind = kind_of(unit)
-    key = name.casefold() if len(name) > 1 else name  # "Time" means time, but a single "V" may be a volume
+    # "Time" means time, but a single "V" may be a volume.
+    key = name.casefold() if len(name) > 1 else name
     words = words_of(name)
     if whole := _whole(key, kind):
         return Guess(whole, _letter(key) if kind == "position" else "")
@@ -100,6 +110,20 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     return _in_place(key, unit, words, others) if kind == "position" else _by_unit(key, kind, words)
 
 
+def name_and_unit(cell: str) -> tuple[str, str] | None:
+    """Name and unit of a header's cell, `x[m]`, `x (m)` or `x_deg`; None for any other text."""
+    match = HEADER_CELL.fullmatch(cell)
+    if not match or not cell.isprintable():
+        return None
+    if match[2] is not None or match[3] is not None:
+        return match[1], (match[2] or match[3]).strip()
+    if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
+        return tight[1], tight[2]
+    if ends := SUFFIX.fullmatch(match[1]):
+        return ends[1] or ends[3], (ends[2] or ends[4]).lower().replace("_", "/")
+    return match[1], ""
+
+
 def kind_of(unit: str) -> str:
     """The kind of a unit, a key of `KINDS`; "" for no unit, or a unit that many quantities have."""
     return next((kind for kind, pattern in KINDS.items() if pattern.fullmatch(unit)), "")
@@ -111,23 +135,23 @@ def is_angular(name: str) -> bool:
 
 
 def is_time(name: str, unit: str) -> bool:
-    """Whether a column is called as times are, or is in a unit of time."""
+    """Whether a column has a usual name or a unit of a time."""
     return kind_of(unit) == "time" or bool(ROLES["time"].fullmatch(name.casefold() if len(name) > 1 else name))
 
 
 def is_goal(words: frozenset[str]) -> bool:
-    """Whether words of a name say what a controller wants of a motion."""
+    """Whether the words of a name are those of a set point."""
     several = "set" in words and len(words) > 1
     return several or bool(words & WORDS["goal"]) or any(word.startswith("soll") for word in words)
 
 
 def is_effort(words: frozenset[str], unit: str) -> bool:
-    """Whether an input of these words is a force, or what makes one."""
+    """Whether an input with these words in its name is a force, a voltage or a current."""
     return kind_of(unit) in ("effort", "electric") or bool(words & WORDS["effort"])
 
 
 def is_timed(words: frozenset[str]) -> bool:
-    """Whether a word of a name is that of a time, `elapsed_time`; a letter is none."""
+    """Whether a word of a name, longer than a letter, is that of a time: `elapsed_time`."""
     return any(len(word) > 1 and ROLES["time"].fullmatch(word) for word in words)
 
 
@@ -140,7 +164,7 @@ def is_usual(name: str, unit: str) -> bool:
 def words_of(name: str) -> frozenset[str]:
     """The words of a name, in lower case and without accents: `ActCurrent`, `goal_position` and `x vel` have two each.
 
-    Of a German compound the last part is one more.
+    The last part of a German compound is a further word.
     """
     parts = re.findall(r"[^\W\d_]+", name)
     found = [word for part in parts for word in re.findall(r"[A-ZÄÖÜ]?[^A-ZÄÖÜ]+|[A-ZÄÖÜ]+(?![^A-ZÄÖÜ])", part)]
@@ -150,7 +174,7 @@ def words_of(name: str) -> frozenset[str]:
 
 
 def _whole(key: str, kind: str) -> str:
-    """The role of a name as a whole, where its unit is not of another kind; "" for none."""
+    """The role of a name as a whole, unless its unit is of another kind; "" for no role."""
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "")
     if role in ("action", "momentum"):
         return "" if kind in ("position", "pressure", "other") else role
@@ -159,7 +183,7 @@ def _whole(key: str, kind: str) -> str:
 
 
 def _letter(key: str) -> str:
-    """The doubt about an input that only its letter names, and that has the unit of a position."""
+    """The doubt about an input in the unit of a position that only its letter u names."""
     return "it has the unit of a position" if re.fullmatch(r"u_?([xyz]|\d*)", key) else ""
 
 

@@ -1,4 +1,4 @@
-"""A recording in words: a line for people; a table with a line for each column, then notes, then warnings."""
+"""A recording in words: a summary of one line, and the table of its columns with notes and warnings."""
 
 from __future__ import annotations
 
@@ -7,21 +7,15 @@ from typing import Any
 
 from herglotz.data.column_roles import is_angular
 
-INPUT_TERM = "input term"  # role of a column of u that was computed from a recorded input
-WARNING = "warning: "  # begins a note that a user should see outside of the table, too
-LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
+# Role of a column of u that was computed from a recorded input.
+INPUT_TERM = "input term"
+# Begins a note that is printed outside of the table, too.
+WARNING = "warning: "
 
 
 def column_table(data: Any) -> str:
-    """Return a line for each column of `Trajectories`: role, unit, and the conversion of the unit.
-
-    Notes and warnings follow. Of more than `LISTED` columns the table shows the first, the last, and the number of the
-    others.
-    """
+    """Return a line for each column of `Trajectories`: role, unit, and the conversion of the unit; then the notes."""
     rows = [("column", "is taken for", "unit"), *column_rows(data)]
-    left = len(rows) - 1 - LISTED
-    if left > 0:
-        rows[1 + LISTED // 2 : 1 + LISTED // 2 + left] = [("…", f"{left} more", "")]
     widths = [max(len(row[k]) for row in rows) for k in range(2)]
     lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
     source = data.source or "table"

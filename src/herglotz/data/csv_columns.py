@@ -19,43 +19,57 @@ from herglotz.data.column_roles import (
     is_timed,
     is_usual,
     kind_of,
+    name_and_unit,
     role_of,
     words_of,
 )
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
-HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
-# A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
-TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
-# A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
-SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
-AS_SHOWN = {  # roles by their names in the table of columns
+# Fields of `Wanted` that give columns a role, and the role.
+ROLE_OF_FIELD = {"time": "time", "group": "trajectory", "drop": "dropped", "coordinates": "q", "inputs": "input"}
+# Roles by their names in the table of columns.
+AS_SHOWN = {
     "time": "time", "trajectory": "trajectory", "coordinate": "q", "input": "input", "left aside": "dropped",
 }  # fmt: skip
-FEW = 5  # names that a warning lists
+# Names that a warning lists.
+MAX_LISTED = 5
 Names = str | Sequence[str]
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """The roles that the user gives to columns, by name; None if the header decides."""
+    """The roles that the user gives to columns, by name; None if the header decides.
+
+    Parameters
+    ----------
+    time, coordinates, inputs, drop, group
+        The column of the time; exactly these coordinates; exactly these inputs, () for none; columns that are left
+        aside; the column that numbers the trajectories.
+    known
+        Name, role and unit of each column of another table: columns of the same name keep their role.
+    positions
+        Further coordinates, unless `coordinates` names all.
+    hold
+        Hold of the inputs between samples, which overrules the file's; "": the file decides.
+    motion
+        False if times and inputs suffice: an input then replaces a missing coordinate.
+    """
 
     time: str | None = None
-    coordinates: Names | None = None  # exactly these
-    inputs: Names | None = None  # exactly these; () for none
-    drop: Names = ()  # left aside
-    group: str | None = None  # numbers the trajectories
-    known: tuple[tuple[str, str, str], ...] = ()  # name, role, unit in another table: names keep their roles
-    positions: tuple[str, ...] = ()  # coordinates as well, unless `coordinates` says exactly which
-    hold: str = ""  # hold of the inputs between samples, which overrules the file's; "": the file decides
-    motion: bool = True  # False: times and inputs suffice; an input replaces a missing coordinate
+    coordinates: Names | None = None
+    inputs: Names | None = None
+    drop: Names = ()
+    group: str | None = None
+    known: tuple[tuple[str, str, str], ...] = ()
+    positions: tuple[str, ...] = ()
+    hold: str = ""
+    motion: bool = True
 
     def role(self, name: str) -> str | None:
-        """The role that the user gives to this column; None where the user says nothing."""
-        given = (("time", self.time), ("trajectory", self.group), ("dropped", self.drop), ("q", self.coordinates))
-        for role, wanted in (*given, ("input", self.inputs)):
-            if name in as_names(wanted or ()):
+        """The role that the user gives to this column, or None."""
+        for field, role in ROLE_OF_FIELD.items():
+            if name in as_names(getattr(self, field) or ()):
                 return role
         return "q" if name in self.positions and self.coordinates is None else None
 
@@ -65,27 +79,24 @@ class Wanted:
     @property
     def names(self) -> tuple[str, ...]:
         """All columns that the user names."""
-        every = (self.time, self.group, self.drop, self.coordinates, self.inputs, self.positions)
-        return tuple(name for wanted in every if wanted for name in as_names(wanted))
+        return tuple(name for field in (*ROLE_OF_FIELD, "positions") for name in as_names(getattr(self, field) or ()))
 
     def by_name(self, cells: Sequence[str], names: Sequence[str]) -> Wanted:
-        """The same with the name of each column that is given as its whole cell, `x (m)`."""
-        every = set(names)
-        called = {cell: name for cell, name in zip(cells, names, strict=True) if cell not in every}
+        """The same roles, with the name of each column that the user gives as its whole cell, `x (m)`."""
+        name_of = dict(zip(cells, names, strict=True)) | {name: name for name in names}
 
         def named(wanted: Names | None) -> Any:
-            of = [called.get(name, name) for name in as_names(wanted or ())]
-            return wanted if not wanted else of[0] if isinstance(wanted, str) else tuple(of)
+            found = [name_of.get(name, name) for name in as_names(wanted or ())]
+            return wanted if not wanted else found[0] if isinstance(wanted, str) else tuple(found)
 
-        who = ("time", "group", "drop", "coordinates", "inputs", "positions")
-        return replace(self, **{field: named(getattr(self, field)) for field in who})
+        return replace(self, **{field: named(getattr(self, field)) for field in (*ROLE_OF_FIELD, "positions")})
 
     def before(self, name: str) -> str | None:
         """The role of the column of this name in the other table; None if the other table has no such column."""
         return next((AS_SHOWN.get(role) for other, role, _ in self.known if other == name), None)
 
     def in_order(self, found: Sequence[int], names: Sequence[str]) -> tuple[int, ...]:
-        """Column numbers in the order that the other table has their names in, new names last."""
+        """Column numbers in the order of their names in the other table, new names last."""
         rank = {name: k for k, (name, _, _) in enumerate(self.known)}
         return tuple(sorted(found, key=lambda i: rank.get(names[i], len(rank))))
 
@@ -95,22 +106,26 @@ HEADER_DECIDES = Wanted()
 
 @dataclass(frozen=True)
 class Columns:
-    """Column numbers (from 0) by the role of the column."""
+    """Column numbers (from 0) by the role of the column.
 
-    names: tuple[str, ...]  # of all columns, as the header spells them
-    units: tuple[str, ...]  # of all columns, "" where the header gives none
+    `names` and `units` are of all columns, as the header spells them, "" for no unit. `hold` of the inputs is the
+    user's. `notes` are warnings of roles that are guesses.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
     time: int
     q: tuple[int, ...]
     trajectory: int | None = None
     s: int | None = None
     p: tuple[int, ...] = ()
     u: tuple[int, ...] = ()
-    hold: str = ""  # hold of the inputs between samples, as the user gives it
-    notes: tuple[str, ...] = ()  # warnings of roles that are guesses
+    hold: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def numeric(self) -> tuple[int, ...]:
-        """Columns whose cells are parsed as numbers, time first."""
+        """Columns whose cells are parsed as numbers: time, coordinates, s, momenta, inputs."""
         return (self.time, *self.q, *(() if self.s is None else (self.s,)), *self.p, *self.u)
 
     def roles(self) -> tuple[tuple[str, str, str], ...]:
@@ -123,26 +138,26 @@ class Columns:
         return tuple((name, named.get(i, "left aside"), unit) for i, (name, unit) in rows)
 
 
-def assign(
-    cells: Sequence[str],  # the header's cells, `name` or `name[unit]`
-    where: str,  # begins every message: file and row
-    wanted: Wanted = HEADER_DECIDES,
-) -> Columns:
-    """Give every column of a header its role.
+def assign(cells: Sequence[str], where: str, wanted: Wanted = HEADER_DECIDES) -> Columns:
+    """Give every column of a header its role; the cells are `name` or `name[unit]`.
 
-    Raise InputError if a cell cannot be read, a name comes twice, time or all coordinates are missing, or a named
-    column is absent.
+    Raise InputError, which begins with `where` (file and row), if a cell cannot be read, a name comes twice, time or
+    all coordinates are missing, or a named column is absent.
     """
     names, units = _parse(cells, where)
     place = {name: i for i, name in enumerate(names)}
-    wanted = _dated(wanted.by_name(cells, names), names)
+    wanted = wanted.by_name(cells, names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     guesses = _guesses(names, units, wanted)
     roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
     clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))
     u = wanted.in_order(roles["input"], names)
-    q = _coordinates(wanted, names, roles["q"]) or (() if wanted.motion else u[:1])
+    if wanted.coordinates is None:
+        q = wanted.in_order(roles["q"], names)
+    else:
+        q = tuple(place[x] for x in as_names(wanted.coordinates))
+    q = q or (() if wanted.motion else u[:1])
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
@@ -155,19 +170,12 @@ def assign(
     return replace(found, notes=_warnings(found, guesses, wanted))
 
 
-def _coordinates(wanted: Wanted, names: Sequence[str], found: Sequence[int]) -> tuple[int, ...]:
-    """The columns of coordinates: the columns that the user names, in the user's order, or else the found columns."""
-    if wanted.coordinates is None:
-        return wanted.in_order(found, names)
-    return tuple(names.index(x) for x in as_names(wanted.coordinates))
-
-
 def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
-    """The remedy for a table without a coordinate, whose table of roles is never printed."""
+    """The remedy for a table without a coordinate: what its columns look like, and the flag that chooses."""
     looks = {"rate": "look like rates", "input": "look like inputs", "dropped": "look like no positions"}
-    alike = [f"{', '.join(names[i] for i in roles[role])} {look}" for role, look in looks.items() if roles[role]]
-    choose = f"{', '.join(alike)}: choose with --coordinates NAMES (coordinates= in Python)"
-    return choose if alike else "add a column such as q[rad]"
+    found = [f"{', '.join(names[i] for i in roles[role])} {look}" for role, look in looks.items() if roles[role]]
+    choose = f"{', '.join(found)}: choose with --coordinates NAMES (coordinates= in Python)"
+    return choose if found else "add a column such as q[rad]"
 
 
 def as_names(names: Names) -> Sequence[str]:
@@ -176,7 +184,7 @@ def as_names(names: Names) -> Sequence[str]:
 
 
 def _guesses(names: Sequence[str], units: Sequence[str], wanted: Wanted) -> list[Guess]:
-    """The role of every column; volts of a sensor are the motion if no other column is."""
+    """The role of every column; if no column is a coordinate, voltages of sensors are the coordinates."""
     guesses = [_guess(name, unit, wanted, names) for name, unit in zip(names, units, strict=True)]
     if wanted.motion and wanted.coordinates is None and all(guess.role != "q" for guess in guesses):
         return [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
@@ -184,20 +192,23 @@ def _guesses(names: Sequence[str], units: Sequence[str], wanted: Wanted) -> list
 
 
 def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Guess:
-    """The role of a column by the user's word, by another table, or by its name and unit; and the doubt about the role.
+    """The role that the user gives to a column, or else its role in another table, or else by its name and unit.
 
     The role is `dropped` if the user gives the found role to other columns.
     """
-    if said := wanted.role(name):
-        return Guess(said)
+    if own := wanted.role(name):
+        return Guess(own)
     known = wanted.before(name)
     guess = Guess(known) if known else role_of(name, unit, others)
-    taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
-    return Guess("dropped") if taken.get(guess.role) is not None else guess
+    taken = [role for field, role in ROLE_OF_FIELD.items() if field != "drop" and getattr(wanted, field) is not None]
+    return Guess("dropped") if guess.role in taken else guess
 
 
 def _other_clocks(names: Sequence[str], units: Sequence[str], roles: dict[str, list[int]]) -> list[int]:
-    """Columns that may be the time where none is called so: by a word of their names, or else by their unit."""
+    """The time, in a table without a usual name of a time: by a word of a name, or else by a unit.
+
+    These columns leave the other roles.
+    """
     free = [i for role in ("q", "dropped") for i in roles[role]]
     timed = [i for i in free if is_timed(words_of(names[i]))]
     found = [i for i in timed if kind_of(units[i]) in ("", "time")] or [i for i in free if kind_of(units[i]) == "time"]
@@ -215,15 +226,19 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
     if others := _accelerations_of_others(found, guesses, wanted):
         doubts["no coordinate has its kind of unit, and it may be an input"] = others
     own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
-    plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
-    if plain and len(own) > 1:  # a single column without a role can only be the coordinate
-        doubts["no unit and no usual name says so"] = plain
+    unusual = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
+    # A single column without another role can only be the coordinate.
+    if unusual and len(own) > 1:
+        doubts["no unit and no usual name says so"] = unusual
     guessed = [] if wanted.inputs is not None else [i for i in found.u if wanted.before(found.names[i]) is None]
-    return (*(_warning(found, columns, doubt) for doubt, columns in doubts.items()), *_of_control(found, guessed))
+    return (*(_warning(found, columns, doubt) for doubt, columns in doubts.items()), *_of_controllers(found, guessed))
 
 
 def _accelerations_of_others(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> list[int]:
-    """Accelerations that are left aside, and are none of a coordinate: of lengths beside angles alone, or of angles."""
+    """Accelerations that are left aside and belong to no coordinate: all coordinates are of the other kind of unit.
+
+    The two kinds are angles and lengths.
+    """
     units = [found.units[i] for i in found.q]
     turning = {bool(ANGLES.fullmatch(unit)) for unit in units}
     others = []
@@ -235,15 +250,15 @@ def _accelerations_of_others(found: Columns, guesses: Sequence[Guess], wanted: W
     return others
 
 
-def _of_control(found: Columns, inputs: Sequence[int]) -> list[str]:
-    """What is said where both what a controller wants, in the unit of a position, and what it does are inputs."""
+def _of_controllers(found: Columns, inputs: Sequence[int]) -> list[str]:
+    """A warning if both the set points of a controller, in the unit of a position, and its output are inputs."""
     words = {i: words_of(found.names[i]) for i in inputs}
-    wants = [i for i in inputs if is_goal(words[i]) and not is_effort(words[i], found.units[i])]
-    does = [i for i in inputs if not is_goal(words[i]) and is_effort(words[i], found.units[i])]
+    wants = [found.names[i] for i in inputs if is_goal(words[i]) and not is_effort(words[i], found.units[i])]
+    does = [found.names[i] for i in inputs if not is_goal(words[i]) and is_effort(words[i], found.units[i])]
     if not wants or not does:
         return []
-    goals, efforts = (", ".join(found.names[i] for i in of[:FEW]) for of in (wants, does))
-    drop = shlex.quote(",".join(found.names[i] for i in wants[:FEW]))
+    goals, efforts = (", ".join(names[:MAX_LISTED]) for names in (wants, does))
+    drop = shlex.quote(",".join(wants[:MAX_LISTED]))
     say, act = ("says" if len(wants) == 1 else "say"), ("does" if len(does) == 1 else "do")
     return [
         f"warning: {goals} {say} what a controller wants, and {efforts} {act} it: a model of both may have the "
@@ -255,48 +270,42 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
     """The warning of these columns: their role, the doubt about the role, and the flags that change the role."""
     is_q, is_u = columns[0] in found.q, columns[0] in found.u
     names = [found.names[i] for i in columns]
-    one, some = len(names) == 1, ",".join(names[:FEW])
-    few = ", ".join(names if len(names) <= FEW else [*names[:FEW], f"{len(names) - FEW} more"])
+    one, some = len(names) == 1, ",".join(names[:MAX_LISTED])
+    few = ", ".join(names if len(names) <= MAX_LISTED else [*names[:MAX_LISTED], f"{len(names) - MAX_LISTED} more"])
     role = ("a coordinate" if one else "coordinates") if is_q else ("an input" if one else "inputs") if is_u else ""
-    inputs, coordinates = (
-        shlex.quote(",".join([*(found.names[i] for i in other), some])) for other in (found.u, found.q)
-    )
-    ways = [] if is_u else [f"--inputs {inputs}"]
-    ways += [] if is_q else [f"--coordinates {coordinates}"]
-    ways += [f"--drop {shlex.quote(some)}"] if role else []
+    flags = {"inputs": (not is_u, found.u), "coordinates": (not is_q, found.q), "drop": (role, ())}
+    ways = [
+        f"--{flag} {shlex.quote(','.join([*(found.names[i] for i in others), some]))}"
+        for flag, (applies, others) in flags.items() if applies
+    ]  # fmt: skip
     if set(columns) == set(found.q):
         ways = ["--inputs or --drop with the names of those that are none"]
     verb = ("is" if one else "are") + (f" taken for {role}" if role else " left aside")
     return f"warning: {few} {verb}, but {doubt}; else give {' or '.join(ways)}"
 
 
-def _dated(wanted: Wanted, names: Sequence[str]) -> Wanted:
-    """The same, with a column `date` as the time if no other column is a time, such as a time of day."""
-    dates = [name for name in names if name.casefold() == "date"]
-    if wanted.time is not None or len(dates) != 1 or any(ROLES["time"].fullmatch(name.casefold()) for name in names):
-        return wanted
-    return replace(wanted, time=dates[0])
-
-
 def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:
-    if len(found) == 1:
-        return found[0]
-    columns = f"the columns are {', '.join(names)}"
-    if found:
-        what = f"two time columns, {' and '.join(names[i] for i in found)}"
-        raise InputError(f"{where}: {what}; choose one with --time NAME (time= in Python)")
-    raise InputError(f"{where}: no time column; {columns}: choose one with --time NAME (time= in Python), or call it t")
+    """The only column of the time; raise InputError if there is no such column, or several."""
+    choose = "choose one with --time NAME (time= in Python)"
+    columns, two = ", ".join(names), " and ".join(names[i] for i in found)
+    refuse({
+        f"{where}: no time column; the columns are {columns}: {choose}, or call it t": not found,
+        f"{where}: two time columns, {two}; {choose}": len(found) > 1,
+    })  # fmt: skip
+    return found[0]
 
 
 def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of all columns; raise InputError for a cell without a name, and for a name that comes twice."""
     found = []
     for i, cell in enumerate(cells):
-        of = name_and_unit(cell if cell or i else "index" if "index" not in cells else "unnamed: 0")  # as pandas writes
-        if of is None:
+        # pandas writes the numbers of the rows into a first column without a name.
+        head = name_and_unit(cell if cell or i else "index" if "index" not in cells else "unnamed: 0")
+        if head is None:
             raise InputError(f"{where}, column {i + 1}: {quote(cell)} is not a header cell; write name or name[unit]")
-        found.append(of)
-    often = Counter(name for name, _ in found)
-    found = [_whole(cell, of[1]) if often[of[0]] > 1 else of for cell, of in zip(cells, found, strict=True)]
+        found.append(head)
+    count = Counter(name for name, _ in found)
+    found = [_whole(cell, head[1]) if count[head[0]] > 1 else head for cell, head in zip(cells, found, strict=True)]
     names, units = tuple(name for name, _ in found), tuple(unit for _, unit in found)
     for name, count in Counter(names).items():
         refuse({f"{where}: the column {quote(name)} comes twice; rename or delete one": count > 1})
@@ -310,22 +319,8 @@ def _whole(cell: str, unit: str) -> tuple[str, str]:
     return (cell.strip(), "" if cell.endswith(")") else unit) if not cell.endswith("]") else (cell.split("[")[0], unit)
 
 
-def name_and_unit(cell: str) -> tuple[str, str] | None:
-    """Name and unit of a header's cell, `x[m]`, `x (m)` or `x_deg`; None for any other text."""
-    match = HEADER_CELL.fullmatch(cell)
-    if not match or not cell.isprintable():
-        return None
-    if match[2] is not None or match[3] is not None:
-        return match[1], (match[2] or match[3]).strip()
-    if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
-        return tight[1], tight[2]
-    if ends := SUFFIX.fullmatch(match[1]):
-        return ends[1] or ends[3], (ends[2] or ends[4]).lower().replace("_", "/")
-    return match[1], ""
-
-
 def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:
-    """Order the momentum columns as their coordinates: p_theta belongs to theta."""
+    """The columns of momenta in the order of their coordinates: p_theta belongs to theta."""
     if not p:
         return ()
     wanted = [f"p_{name}" for name in q]

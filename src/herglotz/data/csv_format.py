@@ -2,60 +2,59 @@
 
 from __future__ import annotations
 
+import math
 import re
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import datetime
-from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from herglotz.data.checks import EXACT
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.csv_dialect import Rows, cells_of, in_commas
-from herglotz.data.csv_numbers import NumberLines
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.rows import MISSING, number, number_or_none, quote
+from herglotz.data.rows import MISSING, number, quote
 from herglotz.data.sensors import calibrated
-from herglotz.data.table import from_table, in_dates, moment
+from herglotz.data.table import from_table, in_dates, moment, with_units
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.errors import InputError, refuse
 
-HEAD = 64  # lines that say how a table is written
 # Comments about inputs (hold, delay, lag) and about sensors (zero, scale).
-SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"
+SETTING = re.compile(r"#\s*(hold|delay|lag|zero|scale):\s*(.+)")
 
 
 def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
-    """Read trajectories from a csv file (UTF-8) whose columns have the wanted roles, and others by their names.
+    """Read trajectories from a csv file; `wanted` gives columns their roles, and names and units decide the others.
 
-    `herglotz.data.load` takes roles as keywords (`time=`, `coordinates=`, …), and angles; here the roles are a
+    `herglotz.data.load` takes the roles as keywords (`time=`, `coordinates=`, …), and angles; here the roles are a
     `herglotz.data.csv_columns.Wanted`.
 
-    Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma. A coordinate that
-    is empty or NaN has no weight in a fit (`Trajectories.observed`). A row without any coordinate, or without s or a
-    momentum, is left out; the step over that row has the mean of the inputs. An empty input is held from the row
-    before, or interpolated linearly if the hold is "first" or "smooth". Rows of stacked tables are sorted by time, and
-    rows of equal time joined.
-
+    **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
     The header's cells are `name`, `name[unit]`, `name (unit)`, `name(unit)` of a known unit, or for angles and times
     `name_deg`, `t_ms`. The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
-    of their own below the header. `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of
-    time is the time; `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta.
-    Of other columns an explicit unit decides before the name (`herglotz.data.column_roles`): rad, deg, m, mm, px are
-    positions, N, Nm, A, V, % inputs, m/s, rad/s, rpm rates, which are left aside, and so are °C, Pa, W. A set value of
-    a motion is an input in any unit: goal, target, set point, desired, reference, command, soll. Without a unit `u`,
-    `u1`, `u_*`, `F`, force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates;
-    errors, temperatures, batteries and counters (`index`, `frame`, a first column without a name) are left aside; every
-    other column is a coordinate. A warning names every role that is a guess. A column may be named with its unit. Times
-    may be dates in ISO 8601, which become seconds since the first row. Lines that start with # and blank lines are
-    skipped, but for `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which give the hold of
-    the inputs between samples, and their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and
-    `# scale: 1 0.5`, which make q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`). A
-    coordinate in rad is taken for an angle.
+    of their own below the header. Other lines that start with # and blank lines are skipped, except for these comments:
+    `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples, `# delay: 0.004` and `# lag: 0.02`
+    are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5` make
+    q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
+
+    **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time.
+    Times may be dates in ISO 8601, which become seconds since the first row. `trajectory`, `trial` or `run` groups the
+    rows; `s` is the action, `p`/`p_*` are momenta. Of other columns the unit decides before the name
+    (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions; N, Nm, A, V, % inputs; m/s, rad/s, rpm rates;
+    rates are left aside, and so are °C, Pa, W. A set value of a motion is an input in any unit: goal, target, set
+    point, desired, reference, command, soll. Without a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage, motor
+    are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors, temperatures, batteries and counters (`index`,
+    `frame`, a first column without a name) are left aside; every other column is a coordinate. A coordinate in rad is
+    taken for an angle. A warning names every role that is a guess.
+
+    **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row
+    without any coordinate, or without s or a momentum, is left out; the step over that row has the mean of the inputs.
+    An empty input is held from the row before, or interpolated linearly if the hold is "first" or "smooth". Rows of
+    stacked tables are sorted by time, and rows of equal time joined.
 
     Returns
     -------
@@ -68,76 +67,125 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     InputError
         Naming file, row (line of the file, from 1), column, value and remedy.
     """
-    return _read_numbers(Path(path), wanted) or _read_rows(Path(path), wanted)
-
-
-def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
-    """Row by row: dates, names of trajectories, and the place of every mistake."""
+    path = Path(path)
     lines = read_lines(path)
-    columns, rows, notes, _ = _header(path, lines, wanted)
+    columns, rows, notes = _header(path, lines, wanted)
     _check_kinds(path, columns, rows)
-    found = from_table(path, columns, *_parse_rows(path, columns, rows), lambda found: _held(found, lines))
-    if not is_number(cells_of(rows[0][1])[columns.time]):
+    comments = [line for line in lines if line.lstrip().startswith("#")]
+    values = _plain_numbers(columns, rows)
+    values = _parse_rows(path, columns, rows) if values is None else values
+    labels, at = _labels(path, columns, rows), [i for i, _ in rows]
+    found = from_table(path, columns, at, labels, values, lambda found: _with_settings(found, comments))
+    if rows and not is_number(cells_of(rows[0][1])[columns.time]):
         found = in_dates(found)
     return replace(found, notes=(*notes, *found.notes))
 
 
-def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[Columns, Rows, tuple[str, ...], str]:
-    """The columns of a table, its rows below the header and a row of units, notes on its text, and its separator."""
-    rows, notes, separator = in_commas(path, lines)
+def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[Columns, Rows, tuple[str, ...]]:
+    """The columns of a table, its rows below the header and a row of units, and notes on its text."""
+    rows, notes = in_commas(path, lines)
     if not rows:
-        raise InputError(f"{Path(path)}: there is no header; add a first line such as t[s],q[rad]")
+        raise InputError(f"{path}: there is no header; add a first line such as t[s],q[rad]")
     at, header = rows[0]
     cells, where = cells_of(header), f"{path}, row {at}"
-    text = len(cells) == 1 and any(mark in line for _, line in rows[1:] for mark in ",;\t")
-    refuse({f"{where}: {quote(header)} is no header; delete the lines above the table, or begin them with #": text})
+    is_title = len(cells) == 1 and any(mark in line for _, line in rows[1:] for mark in ",;\t")
+    refuse({f"{where}: {quote(header)} is no header; delete the lines above the table, or begin them with #": is_title})
     if len(rows) > 1 and (named := with_units(cells, cells_of(rows[1][1]), where, wanted)):
         cells, notes = named, (*notes, f"units stand in row {rows.pop(1)[0]}")
-    return assign(cells, where, wanted), rows[1:], notes, separator
+    return assign(cells, where, wanted), rows[1:], notes
 
 
-def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
-    """A table whose columns of time, trajectories and motion are plain numbers; None for any other file.
+def _plain_numbers(columns: Columns, rows: Rows) -> np.ndarray | None:
+    """The numeric columns of all rows, (N, k), NaN in empty cells; None for a table with any other cell.
 
-    The first lines of the file decide separator and columns. None also for a table with a mistake: `_read_rows` names
-    the row.
+    numpy's parser takes a fifth of the time of `_parse_rows`, which names the row of a mistake.
     """
-    if not path.is_file():
+    width = len(columns.names)
+    if not rows or any(line.count(",") + 1 != width for _, line in rows):
         return None
+    lines = (_with_nan(line) for _, line in rows)
     try:
-        with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
-            head = list(islice(file, HEAD))
-            columns, rows, notes, separator = _header(path, [line.rstrip("\n") for line in head], wanted)
-            first = rows[0][0]
-            body = NumberLines(separator, len(columns.names), first)
-            labelled = columns.trajectory is not None
-            chosen = (*columns.numeric, *((columns.trajectory,) if columns.trajectory is not None else ()))
-            table = body.parsed(chain(head[first - 1 :], file), chosen)
-        labels = table[:, -1] if labelled else None
-        if np.isnan(table[:, 0]).any() or (labels is not None and np.any(labels != np.round(labels))):
-            return None
-        said = [*(line for line in head[: first - 1] if line.startswith("#")), *body.comments]
-        values = table[:, : len(columns.numeric)]
-        found = from_table(path, columns, body.at, labels, values, lambda found: _held(found, said))
-    except (OSError, ValueError, IndexError):
+        table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2, usecols=columns.numeric)
+    except ValueError:
         return None
-    return replace(found, notes=(*notes, *found.notes))
+    # NaN compares as False, and so does a time that is missing.
+    exact = (np.abs(table) < EXACT) | np.isnan(table)
+    return table if exact.all() and not np.isnan(table[:, 0]).any() else None
 
 
-def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
-    """The set with hold, delay, lag, zeros and scales from the first comment of each kind among the lines."""
-    said: dict[str, str | float] = {}
+def _with_nan(line: str) -> str:
+    """The row with "nan" in its empty cells."""
+    if ",," in line or line[0] == "," or line[-1] == ",":
+        return ",".join(cell or "nan" for cell in line.split(","))
+    return line
+
+
+def _labels(path: Path, columns: Columns, rows: Rows) -> list[str]:
+    """The label of the trajectory of each row; raise if some rows have a label and others have not."""
+    if columns.trajectory is None:
+        return [""] * len(rows)
+    labels = [cells_of(line)[columns.trajectory] for _, line in rows]
+    if any(labels) and not all(labels):
+        where = f"{path}, row {rows[labels.index('')][0]}, column 'trajectory'"
+        raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
+    return labels
+
+
+def _parse_rows(path: Path, columns: Columns, rows: Rows) -> list[list[float]]:
+    """The numbers of every row, cell by cell: dates become seconds, and an error names row and column."""
+    width, values = len(columns.names), []
+    # The date of the first row, where times are dates.
+    first = None
+    for at, line in rows:
+        cells = cells_of(line)
+        if len(cells) != width:
+            raise InputError(
+                f"{path}, row {at}: {len(cells)} cells where the header has {width}; correct or delete the row"
+            )
+        date = moment(cells[columns.time]) if first is not None or not values else None
+        if date is not None and not is_number(cells[columns.time]):
+            first = first or date
+            cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
+        missing = {i for i in columns.numeric if i != columns.time and cells[i].casefold() in MISSING}
+        where = {i: f"{path}, row {at}, column '{columns.names[i]}'" for i in columns.numeric}
+        values.append([math.nan if i in missing else number(cells[i], where[i]) for i in columns.numeric])
+    return values
+
+
+def _check_kinds(path: Path, columns: Columns, rows: Rows) -> None:
+    """Raise if a column of text would be read as numbers: neither of its first two cells is a number."""
+    two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
+    for i in columns.numeric if len(two) == 2 else ():
+        name, pair = columns.names[i], [cells[i] for cells in two]
+        remedy = f"leave the column out with --drop {name} (drop= in Python), or write numbers"
+        is_date = i == columns.time and any(map(moment, pair))
+        if i == columns.time:
+            remedy = "write numbers, or dates such as 2026-03-01 12:00:00.25"
+        if not is_date and not any(is_number(x) or x.casefold() in MISSING for x in pair):
+            raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(pair[0])} is not a number; {remedy}")
+
+
+def _since(first: datetime, date: datetime, where: str) -> float:
+    """Seconds from the first date to this date."""
+    if (first.tzinfo is None) != (date.tzinfo is None):
+        raise InputError(f"{where}: {date} and the first date {first} differ in having a time zone; write it in all")
+    return (date - first).total_seconds()
+
+
+def _with_settings(found: Trajectories, comments: Iterable[str]) -> Trajectories:
+    """The set with hold, delay, lag, zeros and scales from the first comment of each kind."""
+    arrival: dict[str, Any] = {}
     sensors: dict[str, list[float]] = {}
-    for match in filter(None, (re.fullmatch(SAID, line.strip()) for line in lines)):
+    for match in filter(None, (SETTING.fullmatch(line.strip()) for line in comments)):
         name, text = match.groups()
         where = f"{found.source}, comment '# {name}: {text}'"
         if name in ("zero", "scale"):
             sensors.setdefault(name, [number(x, where) for x in text.replace(",", " ").split()])
         else:
-            said.setdefault(name, text if name == "hold" else number(text, where))
-    if found.hold:  # the user's hold overrules the file's
-        said.pop("hold", None)
-    return replace(calibrated(found, sensors.get("zero", ()), sensors.get("scale", ())), **said)  # type: ignore[arg-type]
+            arrival.setdefault(name, text if name == "hold" else number(text, where))
+    # The user's hold overrules the file's.
+    arrival |= {"hold": found.hold} if found.hold else {}
+    return replace(calibrated(found, sensors.get("zero", ()), sensors.get("scale", ())), **arrival)
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:
@@ -150,8 +198,8 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     header, table = _table(trajectories)
     _check_header(Path(path), header, trajectories)
     names = trajectories.trajectory.tolist()
-    said = trajectories.arrival._asdict().items()
-    comments = [*comments, *(f"{name}: {value}" for name, value in said if value not in ("", None))]
+    arrival = trajectories.arrival._asdict().items()
+    comments = [*comments, *(f"{name}: {value}" for name, value in arrival if value not in ("", None))]
     lines = [f"# {line}" for text in comments for line in text.splitlines()] + [",".join(header)]
     lines += [",".join([str(b), *map(repr, row)]) for b, row in zip(names, table.tolist(), strict=True)]
     write_atomically(path, ("\n".join(lines) + "\n").encode())
@@ -175,71 +223,16 @@ def _table(data: Trajectories) -> tuple[list[str], np.ndarray]:
     return header, torch.cat(parts, 1).numpy()
 
 
-def _parse_rows(
-    path: Path, columns: Columns, rows: Sequence[tuple[int, str]]
-) -> tuple[list[int], list[str] | None, list[list[float]]]:
-    """Return line number, trajectory label and numbers of every row; None for the labels of a single trajectory."""
-    width, labels, values = len(columns.names), [], []
-    first = None  # date of the first row, where times are dates
-    parse = {i: number if i == columns.time else number_or_none for i in columns.numeric}
-    for at, line in rows:
-        cells = cells_of(line)
-        if len(cells) != width:
-            raise InputError(
-                f"{path}, row {at}: {len(cells)} cells where the header has {width}; correct or delete the row"
-            )
-        date = moment(cells[columns.time]) if first is not None or not values else None
-        if date is not None and not is_number(cells[columns.time]):
-            first = first or date
-            cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
-        values.append([parse[i](cells[i], f"{path}, row {at}, column '{columns.names[i]}'") for i in columns.numeric])
-        labels.append("" if columns.trajectory is None else cells[columns.trajectory])
-    return [at for at, _ in rows], _labels(path, rows, labels), values
-
-
-def _labels(path: Path, rows: Sequence[tuple[int, str]], labels: list[str]) -> list[str] | None:
-    """The trajectory of each row; None where no row names one."""
-    if not any(labels):
-        return None
-    if not all(labels):
-        where = f"{path}, row {rows[labels.index('')][0]}, column 'trajectory'"
-        raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
-    return labels
-
-
-def _check_kinds(path: Path, columns: Columns, rows: Sequence[tuple[int, str]]) -> None:
-    """Raise if a column of text would be read as numbers: neither of its first two cells is a number."""
-    two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
-    for i in columns.numeric if len(two) == 2 else ():
-        if any(is_number(x) or x.casefold() in MISSING for x in (cells[i] for cells in two)):
-            continue
-        if i == columns.time and any(moment(cells[i]) for cells in two):
-            continue
-        name, remedy = columns.names[i], "write numbers, or dates such as 2026-03-01 12:00:00.25"
-        if i != columns.time:
-            remedy = f"leave the column out with --drop {name} (drop= in Python), or write numbers"
-        raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(two[0][i])} is not a number; {remedy}")
-    if len(two) == 2:
-        refuse_unknown(columns, two[0], f"{path}, row {rows[0][0]}")
-
-
-def _since(first: datetime, date: datetime, where: str) -> float:
-    if (first.tzinfo is None) != (date.tzinfo is None):
-        raise InputError(f"{where}: {date} and the first date {first} differ in having a time zone; write it in all")
-    return (date - first).total_seconds()
-
-
 def _check_header(path: Path, header: list[str], trajectories: Trajectories) -> None:
     """Raise unless `read_csv` would give every column of this header its present role."""
     line = ",".join(header)
     try:
         back = assign(cells_of(line), "header")
-        same = [back.names[i] for i in back.q] == list(trajectories.names) and len(back.names) == len(header)
-        units = tuple(back.units[i] for i in back.q) == trajectories.units
-        clock = back.time == 1 and back.units[1] == trajectories.time_unit
     except InputError as error:
         raise InputError(f"{path}: the header {quote(line)} could not be read back ({error}); rename") from error
-    if not (same and units and clock):
+    names, units = ([labels[i] for i in back.q] for labels in (back.names, back.units))
+    found = (tuple(names), tuple(units), len(back.names), back.time, back.units[back.time])
+    if found != (trajectories.names, trajectories.units, len(header), 1, trajectories.time_unit):
         raise InputError(
             f"{path}: coordinates {trajectories.names} in {trajectories.units} would not be read back from csv; "
             "rename those that mean another column (t, s, p, u, v, ...), or save as .npz"

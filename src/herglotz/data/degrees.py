@@ -1,9 +1,9 @@
-"""Conversion of angles in degrees whose header gives no unit: the user names them, or their motion shows the unit."""
+"""Angles in degrees whose header gives no unit: the user names these coordinates, or their motion shows the unit."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import replace
 
 import torch
@@ -19,16 +19,15 @@ from herglotz.errors import check_coordinates
 TURN = {"rad": 2 * math.pi, "deg": 360.0}
 
 
-def in_told_degrees(
-    data: Trajectories,  # as recorded, angles not yet unwrapped
-    degrees: Names | None,  # coordinates in degrees; () for none; None: as the motion shows
-    angles: Names | bool | None,  # coordinates that the user calls angles in rad
-    like: Trajectories | None = None,  # another recording: its columns mean the same here
+def with_angles_in_degrees(
+    data: Trajectories, degrees: Names | None, angles: Names | bool | None, like: Trajectories | None
 ) -> Trajectories:
-    """The set with these coordinates in rad; notes name each guess, and the remedy where the guess is not certain.
+    """The recorded set, angles not yet unwrapped, with the coordinates in degrees converted to rad.
 
-    A coordinate without a unit that has the name of an angle is in degrees if it reaches beyond 2π and moves too far
-    between samples for an angle in rad (`is_in_degrees`). Raise InputError if a name is none of a coordinate.
+    `degrees` are the user's names, () for none; None: a coordinate without a unit that has the name of an angle is in
+    degrees if it reaches beyond 2π and moves too far between samples for an angle in rad (`is_in_degrees`), and so is a
+    coordinate that was in degrees in the set `like`. `angles` are coordinates that the user calls angles in rad. Notes
+    name each guess, and the remedy for a wrong guess. Raise InputError if no coordinate has a name in `degrees`.
     """
     if degrees is not None:
         check_coordinates(data.source, "degrees", as_names(degrees), data.names)
@@ -36,26 +35,19 @@ def in_told_degrees(
     known = {} if like is None else dict.fromkeys(like.names, "") | {name: unit for name, _, unit in like.columns}
     units = zip(data.names, data.units, strict=True)
     found = [name for name, unit in units if unit == "1" and known.get(name) == TAKEN_FOR_DEGREES]
+    radians = data.names if angles is True else as_names(angles or ())
     notes = []
-    for name, q, in_radians in _angles_beyond_a_turn(data, angles, {*known, *data.degrees}):
+    for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
+        in_radians = unit == "rad" or name in radians
+        angular = in_radians or (unit == "1" and angles is None and is_angular(name))
+        if not angular or name in {*known, *data.degrees} or float(q.abs().max()) <= TURN["rad"]:
+            continue
         in_degrees = is_in_degrees(data, q)
         if in_degrees and not in_radians:
             found.append(name)
         if in_degrees or not in_radians:
             notes.append(_note(name, float(q.abs().max()), in_radians, in_degrees))
     return _converted(data, found, notes)
-
-
-def _angles_beyond_a_turn(
-    data: Trajectories, angles: Names | bool | None, known: Collection[str]
-) -> Iterator[tuple[str, Tensor, bool]]:
-    """Names and values (N,) of coordinates that may be in degrees, and whether the user says that they are in rad."""
-    radians = data.names if angles is True else as_names(angles or ())
-    for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
-        in_radians = unit == "rad" or name in radians
-        angular = in_radians or (unit == "1" and angles is None and is_angular(name))
-        if angular and name not in known and float(q.abs().max()) > TURN["rad"]:
-            yield name, q, in_radians
 
 
 def is_in_degrees(data: Trajectories, q: Tensor) -> bool:
@@ -70,7 +62,7 @@ def is_in_degrees(data: Trajectories, q: Tensor) -> bool:
 
 
 def _unsteady(data: Trajectories, q: Tensor, turn: float) -> float:
-    """Mean change from step to step over the mean step, where jumps lose their turns."""
+    """Mean change from step to step over the mean step, after removing whole turns from jumps."""
     steps = data.steps()
     d = q[steps.index + 1] - q[steps.index]
     d = d - turn * torch.round(d / turn)
@@ -78,7 +70,7 @@ def _unsteady(data: Trajectories, q: Tensor, turn: float) -> float:
 
 
 def _note(name: str, largest: float, in_radians: bool, in_degrees: bool) -> str:
-    """The warning of a coordinate that reaches beyond a turn: what it is taken for, and the remedy."""
+    """The warning of a coordinate that reaches beyond a turn: its assumed unit, and the remedy."""
     remedy, reaches = f"--degrees {name} (degrees= in Python)", f"reaches {largest:.4g}"
     if in_radians:
         why = f"{reaches} rad, and moves between samples as an angle in degrees"
@@ -91,9 +83,9 @@ def _note(name: str, largest: float, in_radians: bool, in_degrees: bool) -> str:
 
 
 def _converted(data: Trajectories, names: Collection[str], notes: Collection[str]) -> Trajectories:
-    """The set with these coordinates, which are in degrees, in rad; the table says what they were taken for."""
+    """The set with these coordinates converted from degrees to rad; the table of columns names the assumed unit."""
     units = tuple(DEGREES[0] if name in names else unit for name, unit in zip(data.names, data.units, strict=True))
     angles = tuple(angle and name not in names for name, angle in zip(data.names, data.angles, strict=True))
     columns = tuple((name, role, TAKEN_FOR_DEGREES if name in names else unit) for name, role, unit in data.columns)
-    told = replace(data, units=units, angles=angles, columns=columns, notes=(*data.notes, *notes))
-    return in_radians_and_seconds(told)
+    data = replace(data, units=units, angles=angles, columns=columns, notes=(*data.notes, *notes))
+    return in_radians_and_seconds(data)

@@ -17,29 +17,30 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 
 INSTALL = "pip install 'herglotz[tables]'"
-COUNTER = re.compile(r"__index_level_\d+__")  # a column that pandas adds: an index without a name
-HDF5 = b"\x89HDF\r\n\x1a\n"  # first bytes of an HDF5 file, also of MATLAB's version 7.3
+# A column that pandas adds: an index without a name.
+COUNTER = re.compile(r"__index_level_\d+__")
+# The first bytes of an HDF5 file. MATLAB's version 7.3 writes them below a text of 512 bytes.
+HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-class Table:
+class Table(dict[str, np.ndarray]):
     """Named columns of one length, as `herglotz.data.table.from_frame` takes them; a matrix gives a column a column."""
 
     def __init__(self, path: Path, arrays: dict[str, np.ndarray]):
-        self.columns: dict[str, np.ndarray] = {}
+        super().__init__()
         for name, array in arrays.items():
             matrix = array.reshape(-1, 1) if 1 in array.shape or array.ndim == 1 else array
             if matrix.ndim != 2:
                 raise InputError(f"{path}: {name} has {array.ndim} dimensions; save vectors, or matrices (N, n)")
-            head, bracket, unit = name.partition("[")  # q[rad] of shape (N, 2) becomes q1[rad] and q2[rad]
+            # q[rad] of shape (N, 2) becomes q1[rad] and q2[rad].
+            head, bracket, unit = name.partition("[")
             for i, column in enumerate(matrix.T, 1):
-                self.columns[name if matrix.shape[1] == 1 else f"{head}{i}{bracket}{unit}"] = column
-        lengths = {name: len(column) for name, column in self.columns.items()}
+                self[name if matrix.shape[1] == 1 else f"{head}{i}{bracket}{unit}"] = column
+        self.columns = list(self)
+        lengths = {name: len(column) for name, column in self.items()}
         if len(set(lengths.values())) > 1:
             each = ", ".join(f"{name} {n}" for name, n in lengths.items())
             raise InputError(f"{path}: columns of different lengths ({each}); save one sample a row in all of them")
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.columns[name]
 
 
 def read_packed(path: PathLike, wanted: Wanted) -> Trajectories:
@@ -48,11 +49,12 @@ def read_packed(path: PathLike, wanted: Wanted) -> Trajectories:
     Raise InputError if the package for the format is missing, the file is damaged, columns differ in length, or as
     `read_csv`.
     """
-    every = ARRAYS[Path(path).suffix.lower()](path)  # a mapping for each recording
-    return Trajectories.cat(from_frame(Table(Path(path), one), wanted, Path(path)) for one in every)
+    recordings = ARRAYS[Path(path).suffix.lower()](path)
+    return Trajectories.cat(from_frame(Table(Path(path), one), wanted, Path(path)) for one in recordings)
 
 
 def _parquet(path: PathLike) -> list[dict[str, np.ndarray]]:
+    """The columns of a Parquet file, without the index that pandas adds."""
     parquet = _package("pyarrow.parquet", path)
     table = _opened(path, lambda: parquet.read_table(str(path)))
     names = [name for name in table.column_names if not COUNTER.fullmatch(name)]
@@ -65,19 +67,23 @@ def _matlab(path: PathLike) -> list[dict[str, np.ndarray]]:
     Every element of a struct array is a recording. Text and single numbers are left aside.
     """
     with Path(path).open("rb") as file:
-        if HDF5 in file.read(520):  # version 7.3: matrices are stored transposed
+        # Version 7.3 stores matrices transposed.
+        if HDF5 in file.read(520):
             return [{name: array.T for name, array in one.items()} for one in _datasets(path)]
     scipy_io = _package("scipy.io", path)
     stored = _opened(path, lambda: scipy_io.loadmat(str(path), simplify_cells=True))
-    every = [_vectors(path, one) for one in _recordings(stored)]
+    recordings = [_vectors(path, one) for one in _recordings(stored)]
     what = "holds no vectors of numbers; save t and q, or a struct of them (a table: writetable to csv)"
-    refuse({f"{path}: {what}": not all(every)})
-    return every
+    refuse({f"{path}: {what}": not all(recordings)})
+    return recordings
 
 
 def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     """The elements of the only struct array in a file or in its only struct; without a struct array the file itself."""
-    inside = [x for name, x in stored.items() if not name.startswith("__") and _is_kept(x)]
+    inside = [
+        x for name, x in stored.items()
+        if not name.startswith("__") and (isinstance(x, Mapping) or _is_structs(x) or _is_array(x))
+    ]  # fmt: skip
     if len(inside) != 1:
         return [stored]
     if isinstance(inside[0], Mapping):
@@ -85,16 +91,13 @@ def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     return list(inside[0]) if _is_structs(inside[0]) else [stored]
 
 
-def _is_kept(x: Any) -> bool:
-    return isinstance(x, Mapping) or _is_structs(x) or _is_array(x)
-
-
 def _is_array(x: Any) -> bool:
-    """Whether a variable is more than a single number, and no text."""
+    """Whether a variable is an array of several numbers."""
     return isinstance(x, np.ndarray) and x.size > 1 and x.dtype.kind in "fiub"
 
 
 def _is_structs(x: Any) -> bool:
+    """Whether a variable is a struct array."""
     several = isinstance(x, list) or (isinstance(x, np.ndarray) and x.ndim == 1)
     return several and len(x) > 0 and all(isinstance(one, Mapping) for one in x)
 
@@ -142,6 +145,7 @@ ARRAYS: dict[str, Callable[[PathLike], list[dict[str, np.ndarray]]]] = {
 
 
 def _package(name: str, path: PathLike) -> Any:
+    """A package of the extra `tables`; raise InputError with the command that installs the package."""
     try:
         return import_module(name)
     except ImportError:
@@ -149,10 +153,12 @@ def _package(name: str, path: PathLike) -> Any:
 
 
 def _opened(path: PathLike, read: Callable[[], Any]) -> Any:
+    """The result of a package's reader; raise InputError for a damaged file."""
     try:
         return read()
     except InputError:
         raise
-    except Exception as error:  # the packages raise many kinds for a damaged file
+    # The packages raise exceptions of many kinds for a damaged file.
+    except Exception as error:
         line = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: cannot be read ({type(error).__name__}: {line}); write the file again") from None

@@ -14,10 +14,12 @@ from pathlib import Path
 from herglotz.errors import InputError, no_such_file
 
 PathLike = str | os.PathLike[str]
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk or the user's quota is full
-# Bytes of units and of Western European words in files of spreadsheets and drives that do not write UTF-8.
+# The disk or the user's quota is full.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+# Bytes of units and of Western European words in the files of spreadsheets and motor drives that do not write UTF-8.
 WINDOWS = "°µ²³·äöüÄÖÜßáàâçéèêëíìîïñóòôúùûÉÈÀÑ".encode("cp1252")
-TEMPORARY = ".{}.????????.tmp"  # pattern of the temporary names of a file (`tempfile.mkstemp`)
+# Pattern of the temporary names of a file (`tempfile.mkstemp`).
+TEMPORARY = ".{}.????????.tmp"
 
 
 def read_bytes(path: PathLike, most: int = -1) -> bytes:
@@ -30,7 +32,7 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
     try:
         mode = path.stat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise InputError(f"{path}: is a pipe or a device, not a file; save what it says to a file first")
+            raise InputError(f"{path}: is a pipe or a device, not a file; save its output to a file first")
         with open(path, "rb") as file:
             content = file.read(most)
     except InputError:
@@ -53,9 +55,10 @@ def read_lines(path: PathLike) -> list[str]:
     Raise InputError as `read_bytes`, and for any other encoding.
     """
     content = read_bytes(path)
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # "Unicode text" of spreadsheets
+    # Spreadsheets call UTF-16 "Unicode text".
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = content.decode("utf-16" if wide else "utf-8-sig")  # with a byte-order mark
+        text = content.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
         if wide or not all(byte < 128 or byte in WINDOWS for byte in set(content)):
             row = content.count(b"\n", 0, error.start) + 1
@@ -81,7 +84,8 @@ def write_atomically(path: PathLike, content: bytes) -> None:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            os.chmod(temporary, 0o666 & ~_umask())  # as `open` would have made it; mkstemp makes files private
+            # mkstemp makes a private file; `open` would have made a file with these permissions.
+            os.chmod(temporary, 0o666 & ~_umask())
             os.replace(temporary, path)
         except BaseException:
             Path(temporary).unlink(missing_ok=True)
@@ -105,7 +109,7 @@ def folder_at(path: PathLike) -> Path:
 
 
 def remove_leftovers(folder: PathLike, names: Iterable[str]) -> None:
-    """Remove the temporary files that a killed writer of these names left; no other writer may be at work."""
+    """Remove the temporary files that a killed writer of these files left; no other writer may be at work."""
     for name in names:
         for path in Path(folder).glob(TEMPORARY.format(name)):
             with suppress(OSError):
@@ -113,19 +117,20 @@ def remove_leftovers(folder: PathLike, names: Iterable[str]) -> None:
 
 
 def _umask() -> int:
-    """The process's mask of permissions, which can only be read by setting it."""
+    """The process's mask of permissions: the system returns the mask only when a new mask is set."""
     mask = os.umask(0o077)
     os.umask(mask)
     return mask
 
 
 def _sync(folder: Path) -> None:
-    """Have the rename itself on the disk, where the system can sync a folder."""
+    """Write the rename itself to the disk, where the system can sync a folder."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        with suppress(OSError):  # some network file systems refuse it, and the file is written all the same
+        # Some network file systems refuse to sync a folder; the file is written all the same.
+        with suppress(OSError):
             os.fsync(handle)
     finally:
         os.close(handle)

@@ -1,7 +1,8 @@
-"""Gaps in recordings: missing values, and gaps longer than all that was recorded, which begin another trajectory.
+"""Gaps in recordings: missing values, and gaps longer than the whole recording, which begin another trajectory.
 
-A sample with some positions keeps them: the others are interpolated, and have no weight in a fit. Errors are those of
-samples whose positions were all read. A sample without any, or without another value, is left out.
+A sample with some positions keeps these positions; the missing positions are interpolated, and have no weight in a fit.
+Errors of a fit are errors of samples whose positions were all read. A sample without any position, or without an input,
+action or momentum, is left out.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ from herglotz.data.missing import interpolated
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 
-Place = Callable[[int], str]  # of a sample in a file, in words
-CROSSED = 1000  # typical steps: a gap of so many is crossed in any recording, as that costs little
+# The place of a sample in a file, in words.
+Place = Callable[[int], str]
+# A gap of so many typical steps is crossed in any recording, because the model takes so many steps in little time.
+MAX_CROSSED_STEPS = 1000
 
 
 def with_missing(data: Trajectories, known: Tensor, place: Place, lacking: Tensor | None = None) -> Trajectories:
-    """Return the set with the positions that are `known`, (N, n) bool, alone; a note counts the others.
+    """Return the set with only the positions that are `known`, (N, n) bool; a note counts the missing positions.
 
-    Samples that are `lacking` another value, (N,) bool, or all positions are left out, and so are those before the
-    first and after the last sample of a trajectory that has all; the note says the `place` of the first of them.
+    Samples that are `lacking` another value, (N,) bool, or all positions are left out. So are the samples before the
+    first and after the last complete sample of a trajectory. A note gives the `place` of the first sample left out.
     """
     lacking = torch.zeros_like(known[:, 0]) if lacking is None else lacking
     missing = ~known.any(1) | lacking | ~_inside(known.all(1) & ~lacking, data.lengths)
@@ -44,9 +47,9 @@ def with_missing(data: Trajectories, known: Tensor, place: Place, lacking: Tenso
 
 
 def complete(data: Trajectories) -> Trajectories:
-    """Return the samples whose positions were all read; steps between them have the mean of their inputs.
+    """Return the samples whose positions were all read; a step over other samples has the mean of their inputs.
 
-    Trajectories that keep fewer than three are left out, unless all are.
+    Trajectories that keep fewer than three samples are left out, unless all trajectories do.
     """
     if data.observed is None:
         return data
@@ -56,9 +59,9 @@ def complete(data: Trajectories) -> Trajectories:
 
 
 def _trimmed(data: Trajectories, kept: Tensor) -> Trajectories:
-    """The set from the first to the last sample of each trajectory that is `kept`, (N,) bool, without the others.
+    """The set with only the samples that are `kept`, (N,) bool.
 
-    A step over these is longer, and has the mean of their inputs.
+    A step over other samples is longer, and has the mean of their inputs.
     """
     inside = _inside(kept, data.lengths)
     lengths = tuple(int(own.sum()) for own in inside.split(data.lengths))
@@ -66,20 +69,20 @@ def _trimmed(data: Trajectories, kept: Tensor) -> Trajectories:
 
 
 def _inside(kept: Tensor, lengths: tuple[int, ...]) -> Tensor:
-    """Whether a sample is neither before the first nor behind the last of its trajectory that is `kept`, (N,) bool."""
+    """Whether a sample is neither before the first nor after the last `kept` sample of its trajectory, (N,) bool."""
     return torch.cat([(x.cumsum(0) > 0) & (x.flip(0).cumsum(0).flip(0) > 0) for x in kept.split(lengths)])
 
 
 def parted(data: Trajectories) -> Trajectories:
-    """Return the set with each trajectory cut where a step is longer than its samples would take at the typical step.
+    """Return the set with each trajectory cut at steps longer than its number of samples times the typical step.
 
-    Shorter gaps are crossed in model steps, which tie both sides to one motion; to cross these takes more steps than
-    the recording has (a night at 0.05 s: hours of a fit), and no motion lasts. Parts of fewer than three samples are
-    left out. A note says so.
+    Shorter gaps are crossed in model steps, which tie both sides to one motion. Longer gaps would take more steps than
+    the recording has (a night at 0.05 s: hours of a fit), and no motion lasts so long. Parts of fewer than three
+    samples are left out. A note counts the parts.
     """
     steps, step = data.steps(), data.typical_step
     lengths = torch.tensor(data.lengths, device=data.t.device)
-    cut = steps.h > step * lengths[steps.trajectory].clamp_min(CROSSED)
+    cut = steps.h > step * lengths[steps.trajectory].clamp_min(MAX_CROSSED_STEPS)
     if not bool(cut.any()):
         return data
     starts = steps.index[cut] + 1

@@ -18,28 +18,29 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 
-HOLDS = ("zero", "first", "smooth")
-POINTS = {"zero": 1, "first": 2, "smooth": 8}  # samples that an input in between is made of
+# Samples through which each hold draws its polynomial.
+SAMPLES = {"zero": 1, "first": 2, "smooth": 8}
+HOLDS = tuple(SAMPLES)
 
 
 class Arrival(NamedTuple):
-    """Hold, delay and lag of recorded inputs; "" or None: not said."""
+    """Hold, delay and time constant of the actuator, in units of time, of recorded inputs; "" or None: unspecified."""
 
     hold: str = ""
-    delay: float | None = None  # in units of time
-    lag: float | None = None  # time constant of the actuator
+    delay: float | None = None
+    lag: float | None = None
 
     @property
     def late(self) -> tuple[float, float]:
-        """Delay and lag; 0 where nothing is said."""
+        """Delay and lag; 0 where unspecified."""
         return self.delay or 0.0, self.lag or 0.0
 
 
-NOT_SAID = Arrival()
+UNSPECIFIED = Arrival()
 
 
 def check_arrival(where: str, arrival: Arrival) -> None:
-    """Raise unless the hold is one of `HOLDS` or not said, and no input acts before it is given."""
+    """Raise unless the hold is one of `HOLDS` or unspecified, and delay and lag are times >= 0."""
     if arrival.hold not in ("", *HOLDS):
         raise InputError(f"{where}: unknown hold {arrival.hold!r} of the inputs; choose one of {', '.join(HOLDS)}")
     for name, value in zip(("delay", "lag"), arrival.late, strict=True):
@@ -47,23 +48,27 @@ def check_arrival(where: str, arrival: Arrival) -> None:
             raise InputError(f"{where}: the {name} of the inputs must be a time >= 0, got {value:g}")
 
 
-def held(
-    hold: str,  # one of `HOLDS`; "" (not said) is "zero"
+def interpolated_input(
+    hold: str,
     t: Tensor,  # (N,) time
     u: Tensor,  # (N, m)
-    lengths: Sequence[int],  # samples of each trajectory
+    lengths: Sequence[int],
     row: Tensor,  # (...) sample at which each recorded step starts
     part: Tensor,  # (...) where in the step, from 0 to 1
 ) -> Tensor:
-    """The input in these steps, (..., m): polynomials through the nearest samples of the same trajectory."""
+    """The input in these steps, (..., m): polynomials through the nearest samples of the same trajectory.
+
+    `lengths` are the samples of each trajectory; a hold that is not specified ("") is "zero".
+    """
     if hold in ("", "zero"):
         return u[row]
-    ends = torch.tensor(lengths, device=u.device).cumsum(0)
+    counts = torch.tensor(lengths, device=u.device)
+    ends = counts.cumsum(0)
     own = torch.bucketize(row, ends, right=True)
-    first, last = (ends - torch.tensor(lengths, device=u.device))[own], ends[own] - 1
+    first, last = (ends - counts)[own], ends[own] - 1
     after = torch.minimum(row + 1, last)
     time = t[row] + part * (t[after] - t[row])
-    count = min(POINTS[hold], min(lengths))
+    count = min(SAMPLES[hold], min(lengths))
     start = torch.minimum(torch.maximum(row - (count // 2 - 1), first), last - count + 1)
     near = start[..., None] + torch.arange(count, device=u.device)  # (..., count)
     x = t[near] - time[..., None]

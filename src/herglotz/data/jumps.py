@@ -1,4 +1,4 @@
-"""Columns that move in jumps alone: set points, which a table may hold under the name of a coordinate."""
+"""Coordinates that move in jumps alone: set points, which a table may hold under the name of a coordinate."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from herglotz.data.trajectories import GAP, Trajectories
 from herglotz.data.units import in_degrees
 from herglotz.errors import InputError
 
-SHOWN = 4  # levels that the message names
+# Levels that the message names.
+MAX_LEVELS = 4
 
 
 def jumping(data: Trajectories) -> list[str]:
-    """Names of the coordinates that stand still but for jumps.
+    """Names of the coordinates that stand still except for jumps.
 
-    A mechanism that moves in no two steps in a row is slow: it goes from one level of its sensor to the next. A jump
-    leaps over a level that was recorded at another time, or there are two levels in all. Steps over gaps say nothing.
+    A mechanism that never moves in two steps in a row is slow, and goes from one level of its sensor to the next level.
+    A set point leaps over a level that was recorded at another time, or has two levels in all. Steps over gaps do not
+    count.
     """
     steps = data.steps()
     close = steps.h <= GAP * steps.h.median()
@@ -30,9 +32,9 @@ def _jumps(
     q: Tensor,  # (N,) one coordinate
     row: Tensor,  # (K,) sample at which each step starts
     close: Tensor,  # (K,) bool: no gap
-    pair: Tensor,  # (K - 1,) bool: whether a step and the next are of one trajectory
+    pair: Tensor,  # (K - 1,) bool: a step and the next step belong to one trajectory
 ) -> bool:
-    """Whether a coordinate moves in jumps alone: no two steps in a row, and once at least between two still steps."""
+    """Whether a coordinate never moves in two steps in a row, and moves at least once between two steps at rest."""
     same = q[row + 1] == q[row]
     moves, still = close & ~same, close & same
     between = moves[1:-1] & still[:-2] & still[2:] & pair[:-1] & pair[1:]
@@ -44,7 +46,7 @@ def _jumps(
 
 
 def refuse_jumps(data: Trajectories, wanted: Wanted) -> None:
-    """Raise where a coordinate that the user has not named moves in jumps alone: a fit of it would only fail later."""
+    """Raise if a coordinate that the user has not named moves in jumps alone, because no model fits such a motion."""
     if wanted.coordinates is not None or not wanted.motion:
         return
     found = [name for name in jumping(complete(data)) if wanted.before(name) is None]
@@ -62,4 +64,4 @@ def _levels(data: Trajectories, name: str) -> str:
     """The first levels of a coordinate, in the unit of its column."""
     q = in_degrees(data, data.degrees).q[:, data.names.index(name)]
     seen = list(dict.fromkeys(f"{x:.4g}" for x in q.tolist()))
-    return ", ".join(seen if len(seen) <= SHOWN else [*seen[:SHOWN], "…"])
+    return ", ".join(seen if len(seen) <= MAX_LEVELS else [*seen[:MAX_LEVELS], "…"])

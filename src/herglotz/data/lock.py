@@ -1,4 +1,4 @@
-"""One writer a folder: a lock that names its owner, and that ends with its owner however that one ends."""
+"""One writer a folder: a lock that names its owner, and that the system removes when the owner's process ends."""
 
 from __future__ import annotations
 
@@ -12,32 +12,34 @@ from herglotz.errors import InputError
 
 try:
     import fcntl
-except ImportError:  # not a POSIX system: nothing is locked there
+except ImportError:
+    # Not a POSIX system: folders are not locked.
     fcntl = None
 
 NAME = "fit.lock"
-_held: set[str] = set()  # by this process, which may lock a folder inside its own lock
+# Folders that this process has locked; it may lock a folder inside its own lock.
+_locked: set[str] = set()
 
 
 @contextmanager
 def locked(folder: PathLike) -> Iterator[None]:
     """Hold a folder, which is made if missing, for this process alone.
 
-    The system itself holds the lock (`flock`) and lets it go when the process ends: a lock of a dead process is none,
-    and a number of a process that another one has by now cannot mislead. The file holds the owner's number to name it.
-    In a group of `torchrun` the first process locks for all. Raise InputError if another process holds the folder, or
-    it cannot be written to.
+    The system itself holds the lock (`flock`) and releases the lock when the process ends, so that neither a dead
+    process nor a reused process number locks a folder. The file holds the owner's number for the error message. In a
+    group of `torchrun` the first process locks for all. Raise InputError if another process holds the folder, or the
+    folder cannot be written to.
     """
     key = str(Path(folder).resolve())
-    if fcntl is None or key in _held or os.environ.get("RANK", "0") != "0":
+    if fcntl is None or key in _locked or os.environ.get("RANK", "0") != "0":
         yield
         return
     handle = _taken(Path(folder))
-    _held.add(key)
+    _locked.add(key)
     try:
         yield
     finally:
-        _held.discard(key)
+        _locked.discard(key)
         with suppress(OSError):
             (Path(folder) / NAME).unlink()
         os.close(handle)
@@ -59,7 +61,8 @@ def _taken(folder: Path) -> int:
                 os.ftruncate(handle, 0)
                 os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
                 return handle
-        except FileNotFoundError:  # its owner removed it between our opening and our locking
+        except FileNotFoundError:
+            # The owner removed the file between our opening and our locking.
             pass
         except OSError:
             owner = os.pread(handle, 20, 0).decode("ascii", "replace").strip() or "unknown"

@@ -1,4 +1,4 @@
-"""Positions that were not read: values for them from the readings of the same coordinate."""
+"""Interpolation of missing positions from the readings of the same coordinate."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from torch import Tensor
 
 from herglotz.data.holds import lagrange
 
-NEAR = 4  # readings that a value between them is made of: a cubic
+# Readings through which a cubic gives the value between them.
+CUBIC_POINTS = 4
 
 
 def interpolated(t: Tensor, q: Tensor, known: Tensor, lengths: tuple[int, ...]) -> Tensor:
-    """Positions (N, n) with cubics through the readings that are `known`, (N, n) bool, in the place of the others."""
+    """Positions (N, n); those that are not `known`, (N, n) bool, are on cubics through the known positions."""
     q = q.clone()
     for x, own in zip(q.T, known.T, strict=True):
         for time, part, read in zip(t.split(lengths), x.split(lengths), own.split(lengths), strict=True):
@@ -21,15 +22,15 @@ def interpolated(t: Tensor, q: Tensor, known: Tensor, lengths: tuple[int, ...]) 
 
 
 def between(t: Tensor, x: Tensor, at: Tensor) -> Tensor:
-    """Values (M,) of cubics through the nearest four readings (t, x), or all of fewer, at other times."""
-    count = min(NEAR, len(t))
+    """Values (M,) at other times of cubics through the nearest four readings (t, x), or through all if fewer."""
+    count = min(CUBIC_POINTS, len(t))
     first = (torch.searchsorted(t, at) - count // 2).clamp(0, len(t) - count)
     near = first[:, None] + torch.arange(count, device=t.device)
     return (lagrange(t[near] - at[:, None]) * x[near]).sum(1)
 
 
 def last_read(q: Tensor, known: Tensor, trajectory: Tensor) -> Tensor:
-    """Positions (N, n) with the reading before in the place of those that are not `known`, (N, n) bool."""
+    """Positions (N, n); in place of a position that is not `known`, (N, n) bool, stands the last known position."""
     row = torch.arange(len(q), device=q.device)[:, None]
     first = torch.searchsorted(trajectory, trajectory)[:, None]
     return q.gather(0, torch.where(known, row, first).cummax(0).values)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import tokenize
 import zipfile
-import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypedDict
@@ -19,20 +17,16 @@ from herglotz.data.checks import ARRAYS, EXACT
 from herglotz.data.files import PathLike, read_bytes, write_atomically
 from herglotz.data.rows import quote
 from herglotz.data.trajectories import Trajectories
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.schema import check_entries
 
 USED = (*ARRAYS, "lengths", "metadata")
-LARGEST = 2**31  # bytes that the arrays of an archive may take: 67 million samples of t and three coordinates
-# Exceptions that numpy and zipfile raise on a damaged archive.
-DAMAGE = (
-    *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError, MemoryError),
-    *(OverflowError, TypeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
-)
+# Bytes that the arrays of an archive may take: 67 million samples of t and three coordinates.
+MAX_BYTES = 2**31
 
 
 class Metadata(TypedDict, total=False):
-    """The metadata of an archive: fields of `Trajectories`."""
+    """The metadata of an archive: fields of `Trajectories`; each column is name, role and unit."""
 
     names: list[str]
     units: list[str]
@@ -42,7 +36,7 @@ class Metadata(TypedDict, total=False):
     hold: str
     delay: float | None
     lag: float | None
-    columns: list[tuple[str, str, str]]  # name, role, unit
+    columns: list[tuple[str, str, str]]
 
 
 LABELS = tuple(Metadata.__annotations__)
@@ -59,7 +53,7 @@ def read_npz(path: PathLike) -> Trajectories:
 
 
 def trajectories_of(content: bytes, path: Path) -> Trajectories:
-    """As `read_npz`, from what was read; the path is for messages."""
+    """The trajectories in the bytes of an archive, as `read_npz`; the path is for messages."""
     arrays = _arrays(path, content)
     for name in ("t", "q"):
         if name not in arrays:
@@ -76,7 +70,7 @@ def trajectories_of(content: bytes, path: Path) -> Trajectories:
 
 
 def write_npz(path: PathLike, trajectories: Trajectories) -> None:
-    """Write every array and label; `read_npz` returns a set with the same digest. The file appears whole or not at all.
+    """Write every array and label, whole or not at all; `read_npz` returns a set with the same digest.
 
     Raise InputError if the file cannot be written.
     """
@@ -84,7 +78,7 @@ def write_npz(path: PathLike, trajectories: Trajectories) -> None:
 
 
 def npz_bytes(trajectories: Trajectories) -> bytes:
-    """The archive itself."""
+    """The bytes of the archive."""
     arrays = {name: x.detach().cpu().numpy() for name in ARRAYS if (x := getattr(trajectories, name)) is not None}
     metadata = json.dumps({label: getattr(trajectories, label) for label in LABELS})
     buffer = io.BytesIO()
@@ -93,6 +87,7 @@ def npz_bytes(trajectories: Trajectories) -> bytes:
 
 
 def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an archive. Arrays that no set has stay empty: a small archive can hold gigabytes of zeros."""
     if not content.startswith(b"PK"):
         raise InputError(f"{path}: is not a .npz archive; write it with numpy.savez or herglotz.data.save")
     arrays: dict[str, np.ndarray] = {}
@@ -100,11 +95,12 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             _check_size(path, archive.zip)
-            for name in archive.files:  # only what is used is inflated: an archive can hold gigabytes of zeros
+            for name in archive.files:
                 arrays[name] = np.asarray(archive[name]) if name in USED else np.empty(0)
     except InputError:
         raise
-    except DAMAGE as error:
+    # numpy and zipfile raise exceptions of many kinds for a damaged archive.
+    except Exception as error:
         if "allow_pickle" in str(error):
             raise InputError(
                 f"{path}: array {name!r} holds Python objects, which are never loaded; save plain numbers"
@@ -116,18 +112,14 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
 
 
 def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
-    """Zeros take a thousandth of their size in an archive: memory is not spent before it is asked how much."""
-    used = [one for one in archive.infolist() if one.filename.removesuffix(".npy") in USED]
-    size = sum(one.file_size for one in used)
-    if size > LARGEST:
-        raise InputError(
-            f"{path}: its arrays take {size / 2**30:.1f} GB of memory, more than {LARGEST / 2**30:.0f}; "
-            "save fewer samples"
-        )
+    """Raise before memory is taken for arrays of more than `MAX_BYTES`."""
+    size = sum(one.file_size for one in archive.infolist() if one.filename.removesuffix(".npy") in USED)
+    memory = f"{size / 2**30:.1f} GB of memory, more than {MAX_BYTES / 2**30:.0f}"
+    refuse({f"{path}: its arrays take {memory}; save fewer samples": size > MAX_BYTES})
 
 
 def _floating(path: Path, name: str, x: np.ndarray) -> Tensor:
-    """Return float32 and float64 as they are, integers as float64."""
+    """An array of float32 or float64 unchanged, an array of integers in float64."""
     if x.dtype.kind in "iu":
         if x.size and max(abs(int(x.min())), abs(int(x.max()))) > EXACT:
             raise InputError(
@@ -140,12 +132,12 @@ def _floating(path: Path, name: str, x: np.ndarray) -> Tensor:
 
 
 def _labels(path: Path, metadata: np.ndarray | None) -> dict:
-    """Return the labels that the metadata have, with the types that `Trajectories` wants."""
+    """The labels in the metadata, with the types of the fields of `Trajectories`."""
     if metadata is None:
         return {}
     labels: Any = None
     with suppress(ValueError, RecursionError):
-        # numpy's own str takes any number for a character, and Python itself fails on one beyond Unicode.
+        # numpy's str takes any number for a character; Python then fails on a number beyond Unicode.
         order = "be" if metadata.dtype.byteorder == ">" else "le"
         labels = json.loads(metadata.tobytes().decode(f"utf-32-{order}").rstrip("\0"))
     check_entries(Metadata, labels, f"{path}: 'metadata' (a JSON object)", "write it again or drop it")

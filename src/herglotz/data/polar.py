@@ -1,4 +1,4 @@
-"""Positions x, y of bodies on circles, as cameras see them: one angle of each body, and chains of them.
+"""Positions x, y of bodies on circles, as cameras see them: one angle for each body, also of chains of bodies.
 
 The angle is θ = atan2(x − x_c, −(y − y_c)): 0 towards −y, growing towards +x, so that a body that hangs from the centre
 is at 0 where y grows upwards.
@@ -14,32 +14,38 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.data.column_roles import kind_of
-from herglotz.data.csv_columns import is_number, name_and_unit
+from herglotz.data.column_roles import kind_of, name_and_unit
+from herglotz.data.csv_columns import is_number
 from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import check_coordinates, refuse
 from herglotz.least_squares import least_squares
 
-POLAR = "polar"  # role of an angle that was made, in the table of columns
-MOST = 4000  # samples at most in which circles are looked for
+# Role, in the table of columns, of an angle that was computed from positions.
+POLAR = "polar"
+# More samples do not change a circle.
+MAX_SAMPLES = 4000
 # Largest misfit of a circle over the misfit of a straight line: bodies on arms are far below, ellipses above.
 ON_A_CIRCLE = 0.1
-# Gauss–Newton iterations at most, and the factor by which an iteration has to lower the error.
-ROUNDS, SMALLER = 50, 1 - 1e-12
+# Gauss–Newton iterations end when the variance falls by no more than rounding.
+MAX_ITERATIONS, MIN_DECREASE = 50, 1 - 1e-12
 # Error of an exact circle by rounding, over the radius.
-EXACT = 1e-12
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two columns that hold the position of a body, and where the centre of its circle is."""
+    """Two columns that hold the position of a body, and the centre of its circle.
+
+    A sign is −1 if its axis grows the other way. The centre is two columns, two numbers in the unit of the columns, or
+    None: to be found. `inherited` marks a centre from another recording.
+    """
 
     x: str
     y: str
-    signs: tuple[float, float] = (1.0, 1.0)  # −1 where an axis grows the other way
-    centre: tuple[str, str] | tuple[float, float] | None = None  # columns, numbers in their unit, or to be found
-    again: bool = False  # whether the centre comes from another recording
+    signs: tuple[float, float] = (1.0, 1.0)
+    centre: tuple[str, str] | tuple[float, float] | None = None
+    inherited: bool = False
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -62,18 +68,19 @@ def pairs_of(polar: str | Sequence[str] | None, like: Trajectories | None = None
     Raise InputError if a text does not name two columns.
     """
     if polar is None:
-        told = [] if like is None else [unit for _, role, unit in like.columns if role == POLAR]
-        return [replace(_pair(text), again=True) for text in told]
-    every = [polar] if isinstance(polar, str) else list(polar)
-    return [_pair(text) for text in every if text.strip().lower() != "none"]
+        specs = [] if like is None else [unit for _, role, unit in like.columns if role == POLAR]
+        return [replace(_pair(text), inherited=True) for text in specs]
+    specs = [polar] if isinstance(polar, str) else polar
+    return [_pair(text) for text in specs if text.strip().lower() != "none"]
 
 
 def named_by(polar: str | Sequence[str] | None) -> tuple[str, ...]:
-    """All columns that the user names in pairs of positions, which are coordinates."""
+    """All columns that the user names in pairs of positions: these columns are coordinates."""
     return tuple(name for pair in pairs_of(polar) for name in pair.columns)
 
 
 def _pair(text: str) -> Pair:
+    """The pair that a text names; raise InputError if the text is no pair of columns."""
     parts = [part.strip() for part in text.split(",")]
     signs = tuple(-1.0 if part.startswith("-") else 1.0 for part in parts[:2])
     axes = [name_and_unit(part.removeprefix("-")) for part in parts[:2]]
@@ -93,16 +100,19 @@ def _pair(text: str) -> Pair:
 def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
     """The set with an angle in the place of each pair of positions; notes give the centre and the distance.
 
-    A centre that is not given is a fixed point, found by least squares, or the body of an earlier pair, whichever
-    leaves the distance more constant. The centre of another recording is kept unless a new centre is better by the
-    Bayesian information criterion. Raise InputError if a pair does not name coordinates, or momenta are recorded.
+    A centre that is not given is a fixed point, found by least squares, or the body of an earlier pair: the more
+    constant distance decides. The centre of another recording is kept unless a new centre is better by the Bayesian
+    information criterion. Raise InputError if a pair does not name coordinates, or momenta are recorded.
     """
-    pairs = [pair for pair in pairs if not pair.again or set(pair.columns) <= set(data.names)]
+    pairs = [pair for pair in pairs if not pair.inherited or set(pair.columns) <= set(data.names)]
     if not pairs:
         return data
     _check(data, pairs)
+    weight = torch.ones_like(data.q) if data.observed is None else data.observed
+    old = {x: (x, data.q[:, k], data.units[k], data.angles[k], weight[:, k]) for k, x in enumerate(data.names)}
+    new: dict[str, tuple[str, Tensor, str, bool, Tensor]] = {}
     bodies: list[tuple[Pair, Tensor]] = []
-    angles, rows, notes, whole = [], [], [], data.complete
+    rows, notes = [], []
     for pair, name in zip(pairs, _names(data, pairs), strict=True):
         body = _positions(data, pair, (pair.x, pair.y))
         centre, spec, where = _centre(data, pair, body, bodies)
@@ -110,14 +120,27 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
         r = _radii(arm)
         at = f"{pair.x}, {pair.y} is at its centre at t = {float(data.t[int(r.argmin())]):g}, and has no angle there"
         refuse({f"{data.source or 'data'}: {at}; give another centre": bool((r == 0).any())})
-        angles.append(torch.atan2(arm[:, 0], -arm[:, 1]))
+        angle = torch.atan2(arm[:, 0], -arm[:, 1])
+        # An angle was read if all its positions were read.
+        read = torch.stack([old[column][-1] for column in _pair(spec).columns]).prod(0)
+        new[pair.x] = (name, angle, "rad", True, read)
         rows.append((name, POLAR, spec))
-        notes.append(_note(data, pair, name, where, r[whole], angles[-1]))
+        notes.append(_note(data, pair, name, where, r[data.complete], angle))
         bodies.append((pair, body))
-    return _with_angles(data, pairs, angles, rows, notes)
+    # A column that is both a position and a centre belongs to the pair of the position.
+    angle_of = {column: new[pair.x][0] for pair in pairs for column in pair.columns}
+    angle_of |= {column: new[pair.x][0] for pair in pairs for column in (pair.x, pair.y)}
+    kept = [new.get(x, old[x]) for x in data.names if x in new or x not in angle_of]
+    names, q, units, angles, observed = zip(*kept, strict=True)
+    columns = tuple((x, f"of {angle_of[x]}" if x in angle_of else role, unit) for x, role, unit in data.columns)
+    return replace(
+        data, q=torch.stack(q, 1), observed=None if data.observed is None else torch.stack(observed, 1), v=None,
+        names=names, units=units, angles=angles, columns=(*columns, *rows), notes=(*data.notes, *notes),
+    )  # fmt: skip
 
 
 def _check(data: Trajectories, pairs: Sequence[Pair]) -> None:
+    """Raise unless the pairs name coordinates, each in one unit and each once, of a set without momenta."""
     where = data.source or "data"
     named = [name for pair in pairs for name in (pair.x, pair.y)]
     for pair in pairs:
@@ -145,7 +168,7 @@ def _centre(
         return _positions(data, pair, names), pair.spec(names), ", ".join(names)
     found: list[tuple[float, Tensor, str, str]] = []
     read = body[data.complete]
-    if pair.centre is None or pair.again:
+    if pair.centre is None or pair.inherited:
         fixed = circle(read)
         found.append((_criterion(read - fixed, 2), fixed, *_words(data, pair, fixed)))
     if pair.centre is not None:
@@ -158,9 +181,9 @@ def _centre(
 
 
 def _criterion(arm: Tensor, numbers: int) -> float:
-    """The Bayesian information criterion of a circle by its radial errors, for a number of fitted coordinates."""
+    """The Bayesian information criterion of a circle by its radial errors, for this number of fitted coordinates."""
     r = _radii(arm)
-    error = float(r.var(correction=0)) + (EXACT * float(r.mean())) ** 2
+    error = float(r.var(correction=0)) + (ROUNDING * float(r.mean())) ** 2
     return len(r) * math.log(max(error, 1e-300)) + numbers * math.log(len(r))
 
 
@@ -171,10 +194,12 @@ def _words(data: Trajectories, pair: Pair, centre: Tensor) -> tuple[str, str]:
 
 
 def _unit(data: Trajectories, pair: Pair) -> str:
+    """The unit of a pair behind a space; "" for plain numbers."""
     return f" {data.units[data.names.index(pair.x)]}".removesuffix(" 1")
 
 
 def _note(data: Trajectories, pair: Pair, name: str, where: str, r: Tensor, angle: Tensor) -> str:
+    """The note on an angle: centre, distance, direction, and the remedy if the body seems to stand upside down."""
     unit, x = _unit(data, pair), pair.axes()[0]
     size = f"{float(r.mean()):.4g}{unit} to within {float(r.std(correction=0)):.2g}{unit}"
     other = replace(pair, signs=(pair.signs[0], -pair.signs[1]))
@@ -184,51 +209,10 @@ def _note(data: Trajectories, pair: Pair, name: str, where: str, r: Tensor, angl
 
 
 def _names(data: Trajectories, pairs: Sequence[Pair]) -> list[str]:
-    """`theta`, or `theta1`, `theta2`, … of several; with the name of x where a coordinate has that name already."""
+    """`theta`, or `theta1`, `theta2`, … for several pairs; extended by the name of x if a coordinate has that name."""
     others = set(data.names) - {name for pair in pairs for name in pair.columns}
-    plain = ["theta"] if len(pairs) == 1 else [f"theta{k + 1}" for k in range(len(pairs))]
-    return [name if name not in others else f"{name}_{pair.x}" for name, pair in zip(plain, pairs, strict=True)]
-
-
-def _with_angles(
-    data: Trajectories,
-    pairs: Sequence[Pair],
-    angles: Sequence[Tensor],
-    rows: Sequence[tuple[str, str, str]],
-    notes: Sequence[str],
-) -> Trajectories:
-    """The set with these angles in the place of the first column of each pair, without its other columns."""
-    made = {pair.x: (row[0], angle) for pair, row, angle in zip(pairs, rows, angles, strict=True)}
-    # A column that is both a position and a centre belongs to the pair of the position.
-    of = {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in pair.columns}
-    of |= {column: row[0] for pair, row in zip(pairs, rows, strict=True) for column in (pair.x, pair.y)}
-    kept = [k for k, name in enumerate(data.names) if name in made or name not in of]
-    old = {name: (name, data.q[:, k], data.units[k], data.angles[k]) for k, name in enumerate(data.names)}
-    new = {x: (name, angle, "rad", True) for x, (name, angle) in made.items()}
-    names, q, units, turning = zip(*((old | new)[data.names[k]] for k in kept), strict=True)
-    columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
-    return replace(
-        data,
-        q=torch.stack(q, 1),
-        observed=_observed(data, kept, names, rows),
-        v=None,
-        names=names,
-        units=units,
-        angles=turning,
-        columns=(*columns, *rows),
-        notes=(*data.notes, *notes),
-    )
-
-
-def _observed(
-    data: Trajectories, kept: Sequence[int], names: Sequence[str], rows: Sequence[tuple[str, str, str]]
-) -> Tensor | None:
-    """Where each coordinate was read, (N, n): an angle was read if all its positions were."""
-    if data.observed is None:
-        return None
-    parts = {name: [data.names.index(x) for x in _pair(spec).columns] for name, _, spec in rows}
-    places = [parts.get(name, [k]) for k, name in zip(kept, names, strict=True)]
-    return torch.stack([data.observed[:, own].prod(1) for own in places], 1)
+    usual = ["theta"] if len(pairs) == 1 else [f"theta{k + 1}" for k in range(len(pairs))]
+    return [name if name not in others else f"{name}_{pair.x}" for name, pair in zip(usual, pairs, strict=True)]
 
 
 def circle(x: Tensor) -> Tensor:
@@ -241,18 +225,19 @@ def circle(x: Tensor) -> Tensor:
     size = x.square().sum(1).mean().clamp_min(torch.finfo(x.dtype).tiny)
     z = (x.square().sum(1) - size) / (2 * size.sqrt())
     a, b, c = torch.linalg.svd(torch.column_stack([z, x]), full_matrices=False).Vh[-1].tolist()
-    scale = a / (2 * float(size.sqrt())) or torch.finfo(x.dtype).tiny  # 0: a straight line
+    # The scale is 0 for a straight line.
+    scale = a / (2 * float(size.sqrt())) or torch.finfo(x.dtype).tiny
     centre = -x.new_tensor([b, c]) / (2 * scale)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         moved = centre + _gauss_newton(x - centre)
-        if not _variance(x - moved) < SMALLER * _variance(x - centre):
+        if not _variance(x - moved) < MIN_DECREASE * _variance(x - centre):
             break
         centre = moved
     return centre + middle
 
 
 def _gauss_newton(arm: Tensor) -> Tensor:
-    """The step of a centre that makes distances most alike, to first order."""
+    """The step of a centre that minimises the variance of the distances, to first order."""
     r = _radii(arm)[:, None]
     along = arm / r.clamp_min(torch.finfo(arm.dtype).tiny)
     along = along - along.mean(0)
@@ -260,35 +245,40 @@ def _gauss_newton(arm: Tensor) -> Tensor:
 
 
 def _radii(arm: Tensor) -> Tensor:
+    """Distances (N,) of points (N, 2) from 0."""
     return arm.square().sum(1).sqrt()
 
 
 def _variance(arm: Tensor) -> float:
-    """That of the distances from a centre."""
+    """Variance of the distances of points from 0."""
     return float(_radii(arm).var(correction=0))
 
 
 def with_hints(data: Trajectories) -> Trajectories:
     """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
-    notes = [f"warning: {one.told}; one body on an arm? {one.remedy} makes one angle of it" for one in circles(data)]
+    found = circles(data)
+    notes = [f"warning: {one.description}; one body on an arm? {one.remedy} makes one angle of it" for one in found]
     return replace(data, notes=(*data.notes, *notes)) if notes else data
 
 
 class Circle(NamedTuple):
-    """A pair of coordinates that stays on a circle."""
+    """A pair of coordinates that stays on a circle.
 
-    told: str  # which, and where it is, in words
+    `error` is the standard deviation of the distances from the centre, `columns` the places among the coordinates.
+    """
+
+    description: str
     remedy: str
-    error: float  # standard deviation of the distances from the centre
-    columns: tuple[int, int]  # their places among the coordinates
+    error: float
+    columns: tuple[int, int]
 
 
 def circles(data: Trajectories) -> list[Circle]:
-    """The pairs of positions x, y that stay on a circle, about a fixed centre or about another such pair."""
+    """The pairs of positions x, y that stay on a circle, about a fixed centre or about an earlier pair."""
     found, earlier, read = [], [], complete(data)
     for x, y in _pairs_by_name(data):
         pair = Pair(x, y)
-        body = _positions(read, pair, (x, y))[:: -(-read.samples // MOST)]
+        body = _positions(read, pair, (x, y))[:: -(-read.samples // MAX_SAMPLES)]
         fixed = circle(body)
         centres = [(fixed, _words(data, pair, fixed)[1]), *((other, f"{one.x}, {one.y}") for one, other in earlier)]
         earlier.append((pair, body))
@@ -297,9 +287,9 @@ def circles(data: Trajectories) -> list[Circle]:
         line = float(torch.linalg.svdvals(body - body.mean(0))[-1]) / math.sqrt(len(body))
         if error < ON_A_CIRCLE * line:
             r = f"{float(_radii(body - centre).mean()):.4g}{_unit(data, pair)}"
-            told, remedy = f"{x}, {y} stay on a circle about {where}, at {r}", f"--polar {x},{y} (polar= in Python)"
+            words, remedy = f"{x}, {y} stay on a circle about {where}, at {r}", f"--polar {x},{y} (polar= in Python)"
             places = data.names.index(x), data.names.index(y)
-            found.append(Circle(told, remedy, error, places))
+            found.append(Circle(words, remedy, error, places))
     return found
 
 

@@ -1,4 +1,6 @@
-"""Columns of a table that were sampled at different times: rows are joined, and inputs filled between samples.
+"""Times of the rows of a table: repeated stamps, and columns that were sampled at different times.
+
+A clock may count more slowly than samples come, and a row may be written twice: `without_repeats`.
 
 A sample of the motion is a row in which a coordinate is known. An input is needed between its own samples, too: the
 input is held from sample to sample, or interpolated linearly, and a step of the motion takes the mean of the input.
@@ -12,28 +14,31 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Columns
-from herglotz.data.missing import NEAR, between
+from herglotz.data.missing import CUBIC_POINTS, between
 from herglotz.data.trajectories import Trajectories
 
-# Number of changes below which chance can set all changes of an input k or k + 1 rows apart.
-MIN_STEPS = 20
-# Least share of each of the two distances: a row that is missing here and there is no second clock.
-OFTEN = 0.1
+# Stamps within this part of a count are whole counts: decimal numbers are rounded in float64.
+COUNT_TOLERANCE = 1e-3
+# With fewer changes all distances between the changes of an input may be k or k + 1 rows by chance.
+MIN_CHANGES = 20
+# Each of the two distances has at least this share; a smaller share comes from missing rows, not from a second clock.
+MIN_SHARE = 0.1
 
 
 class Recording(NamedTuple):
-    """The rows of one trajectory."""
+    """The rows of one trajectory, and its label, "" if the table has one trajectory."""
 
-    label: str  # "" where the table has one trajectory
+    label: str
     at: np.ndarray  # (n,) number of each row in the file
-    values: np.ndarray  # (n, k) time, coordinates, s, momenta, inputs; NaN where there is none
+    values: np.ndarray  # (n, k) time, coordinates, s, momenta, inputs; NaN for a missing value
 
 
 def in_order(one: Recording) -> Recording:
-    """The recording with its rows sorted by time, if each column by itself is in order, as in stacked tables.
+    """The recording with its rows sorted by time, if the times of each column increase, as in stacked tables.
 
-    Rows of equal time become a single row if they hold different columns. All other rows stay as they are.
+    Rows of equal time become a single row if they hold different columns. All other rows stay unchanged.
     """
     t, known = one.values[:, 0], ~np.isnan(one.values)
     if (np.diff(t) < 0).any() and all((np.diff(t[known[:, k]]) > 0).all() for k in range(1, known.shape[1])):
@@ -43,11 +48,43 @@ def in_order(one: Recording) -> Recording:
     kept, first = np.ones(len(t), dtype=bool), 0
     for k in (np.flatnonzero(np.diff(t) == 0) + 1).tolist():
         first = k - 1 if kept[k - 1] else first
-        more, has = ~np.isnan(values[k]), ~np.isnan(values[first])
-        if not (more & has)[1:].any():
-            values[first] = np.where(more, values[k], values[first])
+        new, old = ~np.isnan(values[k]), ~np.isnan(values[first])
+        if not (new & old)[1:].any():
+            values[first] = np.where(new, values[k], values[first])
             kept[k] = False
     return Recording(one.label, one.at[kept], values[kept])
+
+
+def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
+    """The recording with increasing stamps, and a note on the repair; unchanged if no stamp repeats or some decrease.
+
+    If all stamps are whole counts, and equal steps miss no stamp by more than a count, the samples were taken in equal
+    steps: the number of a sample gives its time. Otherwise the first row of each stamp is kept.
+    """
+    t = one.values[:, 0]
+    d = np.diff(t)
+    if not (d == 0).any() or (d < 0).any() or not (d > 0).any():
+        return one, ""
+    count, steps = float(d[d > 0].min()), np.arange(len(t)) - (len(t) - 1) / 2
+    h = float(steps @ (t - t.mean()) / (steps @ steps))
+    even, counts = t.mean() + h * steps, (t - t[0]) / count
+    whole = bool((np.abs(counts - counts.round()) <= COUNT_TOLERANCE).all()) and bool((np.abs(even - t) <= count).all())
+    twice = d == 0
+    same = _written_twice(one.values[1:][twice], one.values[:-1][twice])
+    if whole and int(twice.sum()) >= MIN_SAMPLES and not same:
+        values = np.column_stack([even, one.values[:, 1:]])
+        size, step = (f"{x:.4g}" + ("" if unit == "1" else f" {unit}") for x in (count, h))
+        note = f"warning: stamps repeat in counts of {size}; rows are taken to be {step} apart, as their number says"
+        return Recording(one.label, one.at, values), note
+    kept, rows = np.concatenate([[True], ~twice]), one.at[1:][twice]
+    some = "a row is" if len(rows) == 1 else f"{len(rows)} rows are"
+    note = f"warning: {some} left out, with the stamp of the row before: the first is row {rows[0]}"
+    return Recording(one.label, one.at[kept], one.values[kept]), note
+
+
+def _written_twice(rows: np.ndarray, before: np.ndarray) -> bool:
+    """Whether each of these rows equals the row before."""
+    return bool(((rows == before) | (np.isnan(rows) & np.isnan(before))).all())
 
 
 def completed(
@@ -55,7 +92,8 @@ def completed(
 ) -> tuple[list[Recording], tuple[str, ...], str]:
     """The recordings with interpolated coordinates and filled inputs, notes for the user, and the hold of the inputs.
 
-    A hold that neither user nor file gives is "zero" if most samples of the motion have no input of their own.
+    If neither user nor file gives a hold, and most samples of the motion have no input of their own, the hold is
+    "zero".
     """
     q, u = slice(1, 1 + len(columns.q)), slice(len(columns.numeric) - len(columns.u), len(columns.numeric))
     straight, unit, notes = hold in ("first", "smooth"), columns.units[columns.time] or "s", []
@@ -68,7 +106,7 @@ def completed(
         return aligned, tuple(notes), hold
     filled = [_filled(one, u, straight) for one in aligned]
     names = [columns.names[i] for k, i in enumerate(columns.u) if blank[:, u.start + k].any()]
-    notes.append(_where_blank(names, straight, max(longest for _, longest in filled), unit))
+    notes.append(_fill_note(names, straight, max(longest for _, longest in filled), unit))
     sample = ~blank[:, q].any(1)
     own_rate = 2 * int(blank[sample][:, u].any(1).sum()) > int(sample.sum())
     return [one for one, _ in filled], tuple(notes), hold or ("zero" if own_rate else "")
@@ -83,28 +121,24 @@ def _together(one: Recording, q: slice) -> Recording:
     known = ~np.isnan(one.values[:, q])
     counts = known.sum(0)
     base = int(counts.argmin())
-    if counts[base] < NEAR or 2 * int(known.all(1).sum()) >= counts[base]:
+    if counts[base] < CUBIC_POINTS or 2 * int(known.all(1).sum()) >= counts[base]:
         return one
     values = one.values.copy()
     rows = np.flatnonzero(known[:, base])
     for k in range(known.shape[1]):
         if k != base:
             own = known[:, k]
-            values[rows, q.start + k] = _between(values[own, 0], one.values[own, q.start + k], values[rows, 0])
+            t, at = values[own, 0], values[rows, 0]
+            cubic = between(*map(torch.from_numpy, (t, one.values[own, q.start + k], at))).numpy()
+            values[rows, q.start + k] = np.where((at >= t[0]) & (at <= t[-1]), cubic, np.nan)
     return Recording(one.label, one.at, values)
 
 
-def _between(t: np.ndarray, x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values of cubics through the nearest four samples (t, x) at other times; NaN outside of the samples."""
-    values = between(*map(torch.from_numpy, (t, x, at))).numpy()
-    return np.where((at >= t[0]) & (at <= t[-1]), values, np.nan)
-
-
 def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]:
-    """The recording with its inputs in every row where the inputs are known, and the longest time of holding.
+    """The recording with its inputs in every row, and the longest time for which an input was held.
 
-    An input stays unknown before its first sample. Behind the last sample the input is known for the median distance
-    of its samples, or not at all if the input goes in `straight` lines.
+    An input stays unknown before its first sample. After the last sample the input is known for the median distance
+    of its samples, or not at all if `straight` lines connect the samples.
     """
     t, values, longest = one.values[:, 0], one.values.copy(), 0.0
     for x in values[:, u].T:
@@ -119,21 +153,20 @@ def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]
     return Recording(one.label, one.at, values), longest
 
 
-def _where_blank(names: Sequence[str], straight: bool, longest: float, unit: str) -> str:
+def _fill_note(names: Sequence[str], straight: bool, longest: float, unit: str) -> str:
     """The note on inputs that have no value in some rows."""
     some = f"{', '.join(names)} {'has' if len(names) == 1 else 'have'} no value in some rows"
     if straight:
         return f"{some}; straight lines go there from the row before to the row behind"
     size = f"{longest:.3g}" if unit == "1" else f"{longest:.3g} {unit}"
-    return (
-        f"warning: {some}: the last one is held, for up to {size}; --hold first (hold= in Python) draws straight lines"
-    )
+    lines = "--hold first (hold= in Python) draws straight lines"
+    return f"warning: {some}: the last one is held, for up to {size}; {lines}"
 
 
 def filled_inputs(data: Trajectories) -> list[str]:
-    """Names of inputs that were recorded at a slower rate and filled in: they change in every k-th or (k + 1)-th row.
+    """Names of inputs that a slower clock recorded, and the logger filled in: these change every k or k + 1 rows.
 
-    Two clocks that run together give changes in every k-th row alone; a signal that steps by itself changes after any
+    If both clocks run together, the input changes every k rows alone; a signal that steps by itself changes after any
     number of rows.
     """
     labels = [name for name, _ in data.input_labels]
@@ -141,14 +174,14 @@ def filled_inputs(data: Trajectories) -> list[str]:
 
 
 def _filled_in(data: Trajectories, u: torch.Tensor) -> bool:
-    """Whether an input (N,) steps in every k-th or (k + 1)-th row, and in both often."""
+    """Whether all changes of an input (N,) are k or k + 1 rows apart, with at least `MIN_SHARE` of each."""
     steps = data.steps()
     at = (u[steps.index + 1] != u[steps.index]).nonzero()[:, 0]
     apart = (steps.index[at].diff())[steps.trajectory[at].diff() == 0]
     numbers, counts = apart.unique(return_counts=True)
     return (
-        len(apart) >= MIN_STEPS
+        len(apart) >= MIN_CHANGES
         and len(numbers) == 2
         and int(numbers[1] - numbers[0]) == 1
-        and float(counts.min() / counts.sum()) > OFTEN
+        and float(counts.min() / counts.sum()) > MIN_SHARE
     )

@@ -1,4 +1,4 @@
-"""Estimates without a model: an upper bound on the noise of recordings, and how few samples show the motion."""
+"""Estimates without a model: an upper bound on the noise of recordings, and a part of them that shows the motion."""
 
 from __future__ import annotations
 
@@ -11,25 +11,29 @@ from herglotz.data.checks import offsets_of
 from herglotz.data.gaps import complete
 from herglotz.data.trajectories import Trajectories
 
-SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
-DEGREES = (3, 5, 7)  # of `precision`: noise leaves the same at each, coarsely sampled motion leaves less at the higher
-AT_THE_NOISE = 1.5  # times the precision: fitted states, and the noise's own estimate, leave 10 to 30 %
-MOST = 4000  # windows at most, evenly spread: more do not change an RMS
+# A polynomial of this degree is fitted to so many samples in a row.
+SAMPLES, DEGREE = 9, 5
+# Degrees of `precision`. Noise leaves the same residual at each degree; coarsely sampled motion leaves less at higher
+# degrees.
+DEGREES = (3, 5, 7)
+# A residual is at the noise up to this factor times the precision: fitted states, and the estimate of the noise, leave
+# 10 to 30 % more.
+AT_THE_NOISE = 1.5
+# Windows, evenly spread: more do not change an RMS.
+MAX_WINDOWS = 4000
 
 
 def roughness(data: Trajectories, degree: int = DEGREE) -> float:
     """Return the RMS residual of polynomials in time through nine samples in a row, in units of q over its balance.
 
-    Infinite where no trajectory has nine samples.
-
-    Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Steps may differ. Angles
-    should be `unwrapped()`.
+    Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Infinite if no trajectory has
+    nine samples. Steps may differ. Angles should be `unwrapped()`.
     """
     return float(_residuals(data, degree).square().mean().sqrt())
 
 
 def _residuals(data: Trajectories, degree: int) -> Tensor:
-    """`roughness` of every coordinate, (n,): each by its own readings where some are missing."""
+    """`roughness` of every coordinate, (n,), by its own readings."""
     q = data.q / data.balance
     if data.observed is None:
         return _of_readings(data.t, q, data.lengths, degree)
@@ -41,7 +45,7 @@ def _residuals(data: Trajectories, degree: int) -> Tensor:
 
 
 def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> Tensor:
-    """Of each column of q (N, k), read at times (N,) of trajectories of these lengths, (k,)."""
+    """`roughness` of each column of q (N, k), read at times t (N,) of trajectories of these lengths, (k,)."""
     firsts = [
         torch.arange(first, first + length - SAMPLES + 1)
         for first, length in zip(offsets_of(tuple(lengths)), lengths, strict=True)
@@ -50,7 +54,7 @@ def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> T
     if not firsts:
         return torch.full((q.shape[1],), torch.inf, dtype=torch.float64)
     rows = torch.cat(firsts)
-    rows = rows[:: -(-len(rows) // MOST)].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device)
+    rows = rows[:: -(-len(rows) // MAX_WINDOWS)].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device)
     t, q = t[rows].double().cpu(), q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
     Q = torch.linalg.qr(torch.stack([x**k for k in range(degree + 1)], -1)).Q
@@ -77,9 +81,9 @@ def relative_spread(data: Trajectories) -> float:
 
 
 def coarse(data: Trajectories) -> bool:
-    """Whether `precision` is that of the polynomials, and the noise may be far below: the last degree still halves it.
+    """Whether `precision` is an error of the polynomials and not noise: the highest degree still halves the residual.
 
-    Of white noise the two highest degrees leave the same, within a tenth.
+    The residuals of white noise at the two highest degrees agree within a tenth.
     """
     *_, lower, highest = (roughness(data, degree) for degree in DEGREES)
     return highest < lower / 2
@@ -91,7 +95,7 @@ def precisions(data: Trajectories) -> Tensor:
 
 
 def part_of(data: Trajectories, most: int) -> Trajectories:
-    """About `most` samples of more than twice as many: every second, fourth … one while these follow the motion.
+    """About `most` samples: every second, fourth … sample as long as polynomials follow the motion between them.
 
     The result is cut to the runs of samples that move most. Data with no more than `most` samples stay unchanged.
     Samples that lack positions are left out first: every m-th row may miss all rows of a slower sensor.

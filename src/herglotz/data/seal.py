@@ -12,8 +12,10 @@ import re
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 
-SIZE = 64  # hexadecimal digits
-EMPTY_ZIP_COMMENT = b"\0\0"  # the length of the comment, which ends a zip archive
+# Hexadecimal digits of a sha256.
+SIZE = 64
+# A zip archive ends with the length of its comment.
+EMPTY_ZIP_COMMENT = b"\0\0"
 ONNX_KEY = b"sha256"
 # An entry of `metadata_props`, field 14 of ModelProto: the message so far and one more entry are again a message.
 ONNX_ENTRY = b"\x72" + bytes([4 + len(ONNX_KEY) + SIZE, 0x0A, len(ONNX_KEY)]) + ONNX_KEY + b"\x12" + bytes([SIZE])
@@ -46,10 +48,7 @@ def sealed_bytes(content: bytes, tail: bytes = b"") -> bytes:
 
 
 def check_seal(content: bytes, path: PathLike, remedy: str = "export the model again", text: bool = False) -> None:
-    """Raise InputError for a changed file.
-
-    The hash is missing (the file is cut, or older than seals), or differs from the hash of the file.
-    """
+    """Raise InputError if the hash is missing (the file is cut, or older than seals) or is not the file's."""
     if text:
         content = content.replace(b"\r\n", b"\n").removesuffix(TEXT[1])
     body, seal = content[:-SIZE], content[-SIZE:]

@@ -1,4 +1,4 @@
-"""What sensors read: of each coordinate y = zero + drift t + q / scale, so that q = scale · (y − zero − drift t)."""
+"""Sensors: a reading y = zero + drift t + q / scale of each coordinate q, so that q = scale · (y − zero − drift t)."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from herglotz.errors import InputError, refuse
 def calibrated(
     data: Trajectories, zeros: Sequence[float] | None = (), scales: Sequence[float] | None = ()
 ) -> Trajectories:
-    """`measured` by what a user says: zeros are in the units of the columns, degrees where the table has degrees."""
-    read = [] if zeros is None else np.atleast_1d(zeros).tolist()
-    rad = [math.pi / 180 if name in data.degrees and unit == "rad" else 1.0 for name, unit in
-           zip(data.names, data.units, strict=True)]  # fmt: skip
-    return measured(data, [float(zero) * rad[k % data.dof] for k, zero in enumerate(read)], scales)
+    """`measured` with a user's zeros, in the units of the columns: degrees where the table has degrees."""
+    own = [] if zeros is None else np.atleast_1d(zeros).tolist()
+    units = zip(data.names, data.units, strict=True)
+    rad = [math.pi / 180 if name in data.degrees and unit == "rad" else 1.0 for name, unit in units]
+    return measured(data, [float(zero) * rad[k % data.dof] for k, zero in enumerate(own)], scales)
 
 
 def measured(
-    data: Trajectories,  # readings, in the units of q
-    zeros: Sequence[float] | None = (),  # n numbers; empty or None: 0
-    scales: Sequence[float] | None = (),  # what one unit of each reading is worth, n numbers; empty or None: 1
-    drifts: Sequence[float] = (),  # what the zeros gain in a unit of time since each recording began, n; empty: 0
+    data: Trajectories,
+    zeros: Sequence[float] | None = (),
+    scales: Sequence[float] | None = (),
+    drifts: Sequence[float] = (),
 ) -> Trajectories:
-    """The positions q = scale · (y − zero − drift t) of readings y, v likewise; p and s stay as they are recorded.
+    """The positions q = scale · (y − zero − drift t) of readings y, and their rates; p and s stay as recorded.
 
-    B recordings may have B · n numbers, recording after recording. Raise InputError for another count of numbers, for a
-    number that is not finite, or for a scale of 0.
+    t is the time since each recording began. Zeros, scales and drifts are n numbers each; empty or None: 0, 1 and 0. B
+    recordings may have B · n zeros or scales, recording after recording. Raise InputError for another count of numbers,
+    for a number that is not finite, or for a scale of 0.
     """
-    read, worth = ([] if x is None else np.atleast_1d(x).tolist() for x in (zeros, scales))
+    zeros, scales = ([] if x is None else np.atleast_1d(x).tolist() for x in (zeros, scales))
     if drifts:
         rate = data.q.new_tensor(drifts)
         v = None if data.v is None else data.v - rate
         data = replace(data, q=data.q - since_start(data)[:, None] * rate, v=v)
-    if not read and not worth:
-        return data
-    zero = _of_each_sample(data, "zeros", read or [0.0] * data.dof)
-    scale = _of_each_sample(data, "scales", worth or [1.0] * data.dof)
-    none = f"{data.source or 'data'}: a scale of 0 leaves no motion; give what one unit of the reading is worth"
-    refuse({none: 0.0 in [float(x) for x in worth]})
-    q = data.q - zero if read else data.q
-    v = scale * data.v if worth and data.v is not None else data.v
-    return replace(data, q=scale * q if worth else q, v=v)
+    if zeros:
+        data = replace(data, q=data.q - _of_each_sample(data, "zeros", zeros))
+    if scales:
+        scale = _of_each_sample(data, "scales", scales)
+        none = f"{data.source or 'data'}: a scale of 0 leaves no motion; give the position for one unit of the reading"
+        refuse({none: bool((scale == 0).any())})
+        data = replace(data, q=scale * data.q, v=None if data.v is None else scale * data.v)
+    return data
 
 
 def since_start(data: Trajectories) -> Tensor:
@@ -56,7 +56,7 @@ def since_start(data: Trajectories) -> Tensor:
 
 
 def _of_each_sample(data: Trajectories, what: str, numbers: Sequence[float]) -> Tensor:
-    """(N, n) or (n,) from n numbers, or n for each recording."""
+    """The user's numbers as (n,), or as (N, n) if every recording has its own n numbers."""
     n, count = data.dof, len(data)
     x = data.q.new_tensor([float(number) for number in numbers])
     where = f"{data.source or 'data'}: sensor {what}"

@@ -15,10 +15,10 @@ from herglotz.errors import InputError
 if TYPE_CHECKING:
     from herglotz.scenes import Scene
 
-LONGEST_GAP = 3  # consecutive samples that one gap deletes at most
+# Consecutive samples that one gap deletes at most.
+LONGEST_GAP = 3
 Range = tuple[float | Sequence[float] | Tensor, float | Sequence[float] | Tensor]
-
-
+# The remedy for an L_d in place of a scene.
 OF_AN_L_D = (
     "motions of an L_d are stepped: out = hz.Stepper(L_d).rollout(q, p, s, h=0.1, steps=100); "
     "data of one of them: hz.Trajectories.of(0.1 * torch.arange(101), out.q[0])"
@@ -29,14 +29,14 @@ def simulate(
     scene: Scene | str,
     *,
     trajectories: int = 4,
-    steps: int = 100,  # of each trajectory: steps + 1 samples before gaps
-    h: float | None = None,  # in the scene's unit of time; left out: the scene's own
-    noise: float = 0.0,  # standard deviation of the Gaussian noise on q, in its units
-    gaps: int = 0,  # runs of 1 to 3 consecutive interior samples deleted from each trajectory
+    steps: int = 100,
+    h: float | None = None,
+    noise: float = 0.0,
+    gaps: int = 0,
     seed: int = 0,
-    q_range: Range | None = None,  # (lowest, highest) initial position; left out: the scene's
-    v_range: Range | None = None,  # (lowest, highest) initial velocity; left out: the scene's
-    keep_state: bool = False,  # also store s and p, without noise
+    q_range: Range | None = None,
+    v_range: Range | None = None,
+    keep_state: bool = False,
     dtype: torch.dtype = torch.float64,
 ) -> Trajectories:
     """Sample motions of a scene from uniform random initial positions and velocities and s = 0.
@@ -80,7 +80,8 @@ def simulate(
         If there is no such scene, an argument is out of range, or the motion leaves the finite numbers.
     """
     if isinstance(scene, str):
-        from herglotz.scenes import scene as scene_named  # a fit needs no scene
+        # Imported here because a fit needs no scene.
+        from herglotz.scenes import scene as scene_named
 
         scene = scene_named(scene)
     if not hasattr(scene, "dof"):

@@ -1,7 +1,7 @@
 """Velocities and accelerations of noisy recordings: a polynomial in time through a window around each sample.
 
-Width and degree are those whose accelerations err least: noise asks for wide windows, motion between samples for narrow
-ones. What is read off starts a fit and does not end one.
+The width and the degree minimise the error of the accelerations: noise asks for wide windows, fast motion for narrow
+windows. A fit starts from these velocities and accelerations, and does not end with them.
 """
 
 from __future__ import annotations
@@ -14,21 +14,29 @@ from torch import Tensor
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.windows import Triples
 
-DEGREES = (4, 6)  # even: at the middle of a window an odd power says nothing about position and acceleration
-WIDTHS = (7, 9, 11, 15, 21, 29, 41, 57, 81, 113, 161)  # odd, each about √2 times the one before
-EXCESS = 1.2  # squared residuals beyond so many times the least are motion that the polynomials miss
-NEAR = 0.02  # of a window's half width: steps so short that the rule's own error does not count
-MOST = 2000  # windows that the choice looks at
+# Even: at the middle of a window an odd power adds nothing to position and acceleration.
+DEGREES = (4, 6)
+# Samples of a window: odd numbers, each about √2 times the number before.
+WIDTHS = (7, 9, 11, 15, 21, 29, 41, 57, 81, 113, 161)
+# A squared residual above so many times the least is motion that the polynomials miss.
+MAX_RESIDUAL_RATIO = 1.2
+# Step of `smooth_triples` over a window's half width: the error of order 2 of so short a step does not count.
+SHORT_STEP = 0.02
+# Windows by which width and degree are chosen: more do not change the choice.
+MAX_WINDOWS = 2000
 
 
 @dataclass(frozen=True)
 class LocalPolynomials:
-    """The polynomial of each sample, in x = (t − t_k) / half."""
+    """The polynomial of each sample, in x = (t − t_k) / half.
+
+    `half` is half the time that the window spans; a window is `centred` if as many samples are before t_k as after.
+    """
 
     width: int
     coefficients: Tensor  # (N, degree + 1, n)
-    half: Tensor  # (N,) half the time that the window spans
-    centred: Tensor  # (N,) bool: the window has as many samples before t_k as behind
+    half: Tensor  # (N,)
+    centred: Tensor  # (N,) bool
     rows: Tensor  # (N, width) samples of the window
 
     def at(self, x: Tensor | float) -> Tensor:
@@ -39,7 +47,7 @@ class LocalPolynomials:
 
 
 def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
-    """The local polynomials of the best width and degree; None where no trajectory has seven samples."""
+    """The local polynomials of the best width and degree; None if a trajectory has fewer than seven samples."""
     tried = []
     for width in WIDTHS:
         if width > max(7, min(data.lengths) // 2) or width > min(data.lengths):
@@ -50,8 +58,8 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     if not tried:
         return None
     noise = min(left for _, _, left, _ in tried)
-    fair = [x for x in tried if x[2] <= EXCESS * noise]
-    # A residual beyond the noise is a run of one sign, which an acceleration takes over whole; noise averages out.
+    fair = [x for x in tried if x[2] <= MAX_RESIDUAL_RATIO * noise]
+    # A residual beyond the noise keeps its sign over a window, and enters the acceleration whole; noise averages out.
     width, degree, _, _ = min(fair, key=lambda x: (noise + x[0] * (x[2] - noise)) * x[3])
     rows = _windows(data, width)
     half, A = _design(data, rows, degree)
@@ -61,35 +69,34 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
 
 
 def smoothed(data: Trajectories, local: LocalPolynomials | None = None) -> Trajectories:
-    """The recordings with positions on local polynomials, by default their own; as they are where they have none."""
+    """The recordings with positions on these local polynomials, or on their own; unchanged if too short for any."""
     local = local or local_polynomials(data)
     return data if local is None else replace(data, q=local.at(0.0).to(data.q))
 
 
 def smooth_triples(data: Trajectories, local: LocalPolynomials) -> tuple[Triples, Tensor | None]:
     """Three positions on each polynomial, a short time apart, and the inputs (T, m) averaged over its window."""
-    every = local.centred.nonzero()[:, 0]
-    q0, q1, q2 = (local.at(x)[every] for x in (-NEAR, 0.0, NEAR))
-    h = NEAR * local.half[every]
+    rows = local.centred.nonzero()[:, 0]
+    q0, q1, q2 = (local.at(x)[rows] for x in (-SHORT_STEP, 0.0, SHORT_STEP))
+    h = SHORT_STEP * local.half[rows]
     u = None
     if data.u is not None:
-        rows = local.rows[every]
-        t = data.t[rows].double()
-        middle = (t[:, 1:] + t[:, :-1]) / 2 - data.t[every].double()[:, None]
-        weight = (1 - (middle / local.half[every][:, None]).square()).clamp_min(0).square() * t.diff(dim=1)
-        u = (weight[..., None] * data.u[rows[:, :-1]].double()).sum(1) / weight.sum(1, keepdim=True)
-    like = data.q
-    q0, q1, q2, h = (x.to(like) for x in (q0, q1, q2, h))
-    found = Triples(q0, q1, q2, h, h, every)
-    return found, None if u is None else u.to(like)
+        window = local.rows[rows]
+        t = data.t[window].double()
+        middle = (t[:, 1:] + t[:, :-1]) / 2 - data.t[rows].double()[:, None]
+        weight = (1 - (middle / local.half[rows][:, None]).square()).clamp_min(0).square() * t.diff(dim=1)
+        u = (weight[..., None] * data.u[window[:, :-1]].double()).sum(1) / weight.sum(1, keepdim=True)
+        u = u.to(data.q)
+    q0, q1, q2, h = (x.to(data.q) for x in (q0, q1, q2, h))
+    return Triples(q0, q1, q2, h, h, rows), u
 
 
 def _quality(data: Trajectories, width: int, degree: int) -> tuple[float, float]:
-    """Mean squared residual by its degrees of freedom, and the noise's factor in the acceleration, squared."""
+    """Mean squared residual per degree of freedom, and the squared factor of the noise in the acceleration."""
     rows = _windows(data, width)
     inside = rows[:, width // 2] == torch.arange(data.samples)
     rows = rows[inside]
-    rows = rows[:: -(-len(rows) // MOST)]
+    rows = rows[:: -(-len(rows) // MAX_WINDOWS)]
     half, A = _design(data, rows, degree)
     q = data.q[rows].double()
     inverse = _inverse(A)
@@ -105,7 +112,7 @@ def _inverse(A: Tensor) -> Tensor:
 
 
 def _windows(data: Trajectories, width: int) -> Tensor:
-    """(N, width) samples around each, shifted inwards at the ends of a trajectory."""
+    """The samples (N, width) around each sample; windows are shifted inwards at the ends of a trajectory."""
     parts = []
     for first, length in zip(data.offsets, data.lengths, strict=True):
         start = (torch.arange(length) - width // 2).clamp(0, length - width)

@@ -10,18 +10,17 @@ from torch import Tensor
 from herglotz.data.checks import MIN_SAMPLES, offsets_of
 from herglotz.errors import InputError
 
-RUN = 200  # samples in a row of a part of a trajectory, at least
-Part = tuple[Tensor, tuple[int, ...]]  # rows of the concatenation, and how many of each trajectory
+# A part of a trajectory has at least so many samples in a row.
+RUN = 200
+# Rows of the concatenation, and the number of rows of each trajectory.
+Part = tuple[Tensor, tuple[int, ...]]
 
 
-def time_split(
-    lengths: Sequence[int],  # samples of each trajectory
-    fraction: float,  # of every trajectory that trains
-    source: str = "",
-) -> tuple[Part, Part]:
-    """Cut each trajectory after its first `round(fraction * length)` samples; one too short to be cut trains whole.
+def time_split(lengths: Sequence[int], fraction: float, source: str = "") -> tuple[Part, Part]:
+    """Cut each trajectory, of these lengths, after its first `round(fraction * length)` samples.
 
-    Raise InputError if the fraction is not inside (0, 1), or no trajectory has two parts of three samples.
+    A trajectory that is too short to be cut trains whole. Raise InputError if the fraction is not inside (0, 1), or no
+    trajectory has two parts of three samples.
     """
     if not 0.0 < fraction < 1.0:
         raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
@@ -40,13 +39,13 @@ def time_split(
 
 
 def cut_of(length: int, fraction: float) -> int:
-    """How many of so many samples train: this fraction, or all where a part would have fewer than three."""
+    """The number of samples that train: this fraction, or all if a part would have fewer than three samples."""
     cut = round(fraction * length)
     return cut if MIN_SAMPLES <= cut <= length - MIN_SAMPLES else length
 
 
 def trained_whole(lengths: Sequence[int], fraction: float) -> str:
-    """A warning of trajectories that are too short to be cut: nothing of them is held out; "" where there are none."""
+    """A warning of trajectories that are too short to be cut, so that no sample is held out; "" for no trajectory."""
     whole = [b for b, length in enumerate(lengths) if cut_of(length, fraction) == length]
     if fraction == 1 or len(whole) in (0, len(lengths)):
         return ""
@@ -58,22 +57,22 @@ def trained_whole(lengths: Sequence[int], fraction: float) -> str:
 
 
 def leading(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
-    """Which samples are the first `lengths[b]` ones of their trajectory b, which has `of[b]`; (N,) bool."""
+    """Which samples are among the first `lengths[b]` of the `of[b]` samples of trajectory b, (N,) bool."""
     return torch.cat([torch.arange(count) < k for count, k in zip(of, lengths, strict=True)])
 
 
 def leading_rows(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
-    """Rows of these samples."""
+    """Rows of the samples that are `leading`."""
     return leading(of, lengths).nonzero()[:, 0]
 
 
 def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
-    """At most about `most` samples: of trajectories evenly chosen the run of samples that moves most."""
+    """At most about `most` samples: from evenly chosen trajectories the run of samples that moves most."""
     own = min(max(most // len(lengths), RUN), max(lengths))
-    every = max(1, -(-own * len(lengths) // most))
+    stride = max(1, -(-own * len(lengths) // most))
     rows, kept = [], []
     size = q.std(0, correction=0).clamp_min(torch.finfo(q.dtype).tiny)
-    for first, length in list(zip(offsets_of(lengths), lengths, strict=True))[::every]:
+    for first, length in list(zip(offsets_of(lengths), lengths, strict=True))[::stride]:
         count = min(own, length)
         moved = (q[first : first + length].diff(dim=0) / size).square().sum(1).cumsum(0)
         gone = torch.cat([moved.new_zeros(1), moved])
@@ -96,13 +95,14 @@ def every_mth(lengths: Sequence[int], every: int) -> Tensor:
 def inputs_of_kept(
     t: Tensor,  # (N,) time
     u: Tensor,  # (N, m) inputs; each acts from its sample to the next
-    lengths: Sequence[int],  # samples of each trajectory
+    lengths: Sequence[int],
     kept: Tensor,  # (N,) bool
 ) -> Tensor:
     """Return the time-weighted mean of u over the step that starts at each kept sample, (kept, m)."""
     h = torch.cat([t.diff(), t.new_zeros(1)])
-    h[torch.tensor(lengths).cumsum(0) - 1] = 0  # no step starts at the last sample of a trajectory
-    h = h * torch.cat([part.cumsum(0) > 0 for part in kept.split(tuple(lengths))])  # nor before the first one kept
+    # No step starts at the last sample of a trajectory, nor before the first kept sample.
+    h[torch.tensor(lengths).cumsum(0) - 1] = 0
+    h = h * torch.cat([part.cumsum(0) > 0 for part in kept.split(tuple(lengths))])
     step = (kept.cumsum(0) - 1).clamp_min(0)
     time = h.new_zeros(int(step[-1]) + 1).index_add(0, step, h)
     impulse = u.new_zeros(len(time), u.shape[1]).index_add(0, step, u * h[:, None])

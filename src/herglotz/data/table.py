@@ -7,67 +7,77 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, time
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
-from herglotz.data.clock import without_repeats
+from herglotz.data.column_roles import name_and_unit
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import with_missing
-from herglotz.data.rates import Recording, completed, in_order
-from herglotz.data.rows import Unusable, group_rows, quote
+from herglotz.data.rates import Recording, completed, in_order, without_repeats
+from herglotz.data.rows import Unusable, quote
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import refuse_unknown, with_units
-from herglotz.data.units import in_seconds
+from herglotz.data.units import PER_SECOND, in_seconds
 from herglotz.errors import InputError, refuse
 
-CENTURIES = 1e11  # seconds, 3000 years: a time of so many counts milliseconds or less since 1970
+# 3000 years: a time of so many counts milliseconds, or smaller units, since 1970.
+MAX_SECONDS = 1e11
+Item = TypeVar("Item")
+Read = TypeVar("Read")
 
 
 def from_table(
-    path: Path,  # begins messages
+    path: Path,
     columns: Columns,
     at: Sequence[int],  # (N,) row number of each sample in the file, for messages
-    labels: Sequence[str] | np.ndarray | None,  # (N,) trajectory of each sample, names or whole numbers; None: of one
-    values: Any,  # (N, columns.numeric) numbers; NaN where a coordinate, s or a momentum is missing
-    said: Callable[[Trajectories], Trajectories] = lambda found: found,  # adds what the file says beside the table
+    labels: Sequence[str],  # (N,) trajectory of each sample
+    values: Any,  # (N, columns.numeric) numbers; NaN where a coordinate, s, a momentum or an input is missing
+    with_settings: Callable[[Trajectories], Trajectories] = lambda found: found,
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
     A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). Rows without any coordinate are
     left out, and a note gives their number: the step over these rows is longer, with the mean of the inputs
     (`herglotz.data.rates`). A trajectory that is too short, or whose time does not increase, is left out with a
-    warning. Raise InputError if most trajectories are unusable.
+    warning. `with_settings` adds the settings in the comments of a file. Raise InputError, which begins with `path`, if
+    most trajectories are unusable.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     columns, values = _without_blank(columns, values)
     recordings = _recordings(path, labels, np.asarray(at), values)
     blank = bool(np.isnan(values).any())
-    recordings, notes = _with_clocks(recordings, blank, columns.units[columns.time] or "s")
-    recordings, left = _usable(path, recordings, lambda one: _check_times(path, columns, one))
+    recordings, repairs = _with_clocks(recordings, blank, columns.units[columns.time] or "s")
+    recordings, unordered = usable(path, recordings, lambda one: _in_time(path, columns, one))
+    found = with_settings(_trajectories(path, columns, recordings))
     if not blank:
-        found = said(_trajectories(path, columns, recordings))
-        return replace(found, notes=(*found.notes, *notes, *left))
-    hold = said(_trajectories(path, columns, recordings)).hold
-    whole, made, hold = completed(recordings, columns, hold)
-    whole, gone = _usable(path, whole, lambda one: _check_enough(path, columns, one))
-    found = said(_trajectories(path, columns, whole))
-    found = replace(found, hold=hold, notes=(*found.notes, *notes, *left, *made, *gone))
-    missing = np.isnan(np.concatenate([one.values for one in whole]))
+        return replace(found, notes=(*found.notes, *repairs, *unordered))
+    recordings, filled, hold = completed(recordings, columns, found.hold)
+    recordings, too_few = usable(path, recordings, lambda one: _with_enough(path, columns, one))
+    found = with_settings(_trajectories(path, columns, recordings))
+    found = replace(found, hold=hold, notes=(*found.notes, *repairs, *unordered, *filled, *too_few))
+    return _with_missing(found, columns, recordings)
+
+
+def _with_missing(found: Trajectories, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
+    """The set with interpolated positions and without the rows that have no position, or miss another value."""
+    missing = np.isnan(np.concatenate([one.values for one in recordings]))
     if not missing.any():
         return found
-    rows, q = np.concatenate([one.at for one in whole]), slice(1, 1 + len(columns.q))
-    place = lambda k: f"row {rows[k]}, column '{columns.names[columns.numeric[missing[k].argmax()]]}'"  # noqa: E731
+    rows, q = np.concatenate([one.at for one in recordings]), slice(1, 1 + len(columns.q))
+
+    def place(k: int) -> str:
+        return f"row {rows[k]}, column '{columns.names[columns.numeric[missing[k].argmax()]]}'"
+
     lacking = torch.from_numpy(np.delete(missing, q, 1).any(1))
     return with_missing(found, torch.from_numpy(~missing[:, q]), place, lacking)
 
 
 def _without_blank(columns: Columns, values: np.ndarray) -> tuple[Columns, np.ndarray]:
-    """The columns without coordinates that have no value in any row, as remarks do, and theirs; a warning names them.
+    """The columns, and their numbers, without coordinates that have no value in any row, as columns of remarks.
 
-    All of them where no motion is left, or momenta are recorded; an input that has none is no remark.
+    A warning names these coordinates. All columns stay if no coordinate would be left, or if momenta are recorded.
     """
     gone = {i for k, i in enumerate(columns.numeric) if len(values) and i in columns.q and np.isnan(values[:, k]).all()}
     if not gone or columns.p or not (q := tuple(i for i in columns.q if i not in gone)):
@@ -80,64 +90,70 @@ def _without_blank(columns: Columns, values: np.ndarray) -> tuple[Columns, np.nd
 
 
 def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:
-    """The recordings sorted by time without repeated stamps, and notes on these, a single note for equal repairs."""
+    """The recordings sorted by time, without repeated stamps, and a note on the first repair and the number of others.
+
+    Only rows with blank cells may be stacked tables, whose rows have to be sorted.
+    """
     made = [without_repeats(in_order(one) if blank else one, unit) for one in recordings]
     notes = [note for _, note in made if note]
     more = f", and so of {len(notes) - 1} more recordings" if len(notes) > 1 else ""
     return [one for one, _ in made], [f"{note}{more}" for note in notes[:1]]
 
 
-def _usable(
-    path: Path, recordings: list[Recording], check: Callable[[Recording], None]
-) -> tuple[list[Recording], tuple[str, ...]]:
-    """The recordings that pass a check, and a warning of the others; raise the check's error if most do not pass."""
-    kept: list[Recording] = []
+def usable(path: Path, items: Sequence[Item], read: Callable[[Item], Read]) -> tuple[list[Read], tuple[str, ...]]:
+    """The results of `read`, without those of unusable recordings, and a warning that counts these recordings.
+
+    Raise the first error if most recordings are unusable.
+    """
+    kept: list[Read] = []
     wrong: list[Unusable] = []
-    for one in recordings:
+    for item in items:
         try:
-            check(one)
-            kept.append(one)
+            kept.append(read(item))
         except Unusable as error:
             wrong.append(error)
-    return kept, left_out(path, wrong, len(recordings))
-
-
-def left_out(path: Path, wrong: Sequence[Unusable], count: int) -> tuple[str, ...]:
-    """A warning of the recordings, of so many, that are wrong; raise the first error where most are."""
     if not wrong:
-        return ()
-    if 2 * len(wrong) > count:
+        return kept, ()
+    if 2 * len(wrong) > len(items):
         raise wrong[0]
     why = str(wrong[0]).removeprefix(f"{path}, ").removeprefix(f"{path}: ").partition(";")[0]
-    plural = ("is", "") if len(wrong) == 1 else ("are", "the first: ")
-    return (f"warning: {len(wrong)} of {count} recordings {plural[0]} left out: {plural[1]}{why}",)
+    are = "is left out: " if len(wrong) == 1 else "are left out: the first: "
+    return kept, (f"warning: {len(wrong)} of {len(items)} recordings {are}{why}",)
 
 
-def _recordings(
-    path: Path, labels: Sequence[str] | np.ndarray | None, at: np.ndarray, values: np.ndarray
-) -> list[Recording]:
-    """The rows of each trajectory, in order of first appearance; raise InputError where there is none."""
+def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.ndarray) -> list[Recording]:
+    """The rows of each trajectory, in order of first appearance; raise InputError if there is no row."""
     refuse({f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows": not len(at)})
-    if labels is None:
-        return [Recording("", at, values)]
-    named = labels if isinstance(labels, np.ndarray) else _one_spelling(labels)
-    _, first, place = np.unique(np.asarray(named), return_index=True, return_inverse=True)
-    rank = np.argsort(np.argsort(first))[place.reshape(-1)]
-    order = np.argsort(rank, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(rank[order])) + 1)
-    words = [f"{x:.0f}" if isinstance(x, float) else x for x in (named[int(rows[0])] for rows in groups)]
-    return [Recording(word, at[rows], values[rows]) for word, rows in zip(words, groups, strict=True)]
+    groups: dict[str, list[int]] = {}
+    for i, label in enumerate(labels):
+        groups.setdefault(label, []).append(i)
+    return [Recording(label, at[rows], values[rows]) for label, rows in groups.items()]
 
 
-def _check_times(path: Path, columns: Columns, one: Recording) -> None:
-    """Raise unless this trajectory has three rows, in order of time."""
-    t = one.values[:, 0]
-    if len(t) < MIN_SAMPLES or not (np.diff(t) > 0).all():
-        group_rows(path, one.at.tolist(), [one.label] * len(t), t.tolist(), _called(columns))
+def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
+    """The recording; raise Unusable unless it has three rows, in order of time."""
+    t, label, clock = one.values[:, 0], "", columns.names[columns.time]
+    if columns.trajectory is not None:
+        label = columns.names[columns.trajectory]
+    if len(t) < MIN_SAMPLES:
+        has = f"has {len(t)} sample{'s' if len(t) > 1 else ''}, at least {MIN_SAMPLES} are needed"
+        where = f"{path}, row {one.at[0]}"
+        if one.label:
+            raise Unusable(f"{where}, column '{label}': {quote(one.label)} {has}; delete it or add rows")
+        raise Unusable(f"{where}: the file {has}; add rows")
+    back = np.flatnonzero(~(np.diff(t) > 0))
+    if len(back):
+        k = int(back[0])
+        raise Unusable(
+            f"{path}, row {one.at[k + 1]}, column '{clock}': {float(t[k + 1])!r} does not increase on {float(t[k])!r} "
+            f"in row {one.at[k]}; sort the rows, delete one, or number the trajectories in a column 'trajectory' "
+            "(another name: --group NAME, group= in Python)"
+        )
+    return one
 
 
-def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
-    """Raise unless three rows of this trajectory have all their values."""
+def _with_enough(path: Path, columns: Columns, one: Recording) -> Recording:
+    """The recording; raise Unusable unless three rows have all their values."""
     gone = np.isnan(one.values)
     if (known := int((~gone.any(1)).sum())) < MIN_SAMPLES:
         name = columns.names[columns.numeric[int(gone.sum(0).argmax())]]
@@ -146,20 +162,7 @@ def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
             f"least {MIN_SAMPLES} are needed; column '{name}' has the most gaps: leave it out with --drop {name} "
             "(drop= in Python), or fill it in"
         )
-
-
-def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
-    """Labels as numbers, if all are whole numbers: 1 and 01 are then the same trajectory, as in a table of numbers."""
-    if any("_" in label for label in set(labels)):  # Python reads 1_000 as a number, and numpy does not
-        return labels
-    try:
-        value = {label: float(label) for label in set(labels)}
-    except ValueError:
-        return labels
-    if not all(abs(x) < EXACT and x.is_integer() for x in value.values()):
-        return labels
-    first: dict[float, str] = {}
-    return [first.setdefault(value[label], label) for label in labels]
+    return one
 
 
 def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
@@ -172,7 +175,7 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording])
     since_1970 = (
         f"{path}: {name} of {last:.4g} without a unit is no time in s; write its unit, {name}[ms] or {name}[us]"
     )
-    refuse({since_1970: last > CENTURIES and not columns.units[columns.time]})
+    refuse({since_1970: last > MAX_SECONDS and not columns.units[columns.time]})
     units = tuple(columns.units[i] or "1" for i in columns.q)
     found = Trajectories.of(
         t[:, 0],
@@ -202,15 +205,14 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
     heads, first = _heads(frame, raw, where, wanted)
     columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
-    if all(column.ndim == 1 and len(column) for column in raw):
-        refuse_unknown(columns, [_text(column[0]) for column in raw], f"{where}, row {first}")
-    clock = seconds(raw[columns.time])
-    told = None if clock is raw[columns.time] else "" if raw[columns.time].dtype.kind == "m" else "date"
-    raw[columns.time] = clock
+    times = raw[columns.time]
+    raw[columns.time] = clock = seconds(times)
     every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]
-    labels = None if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
+    labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     found = from_table(where, columns, range(first, first + len(clock)), labels, np.stack(every, 1))
-    return found if told is None else in_dates(found, told)
+    if clock is times:
+        return found
+    return in_dates(found, "" if times.dtype.kind == "m" else "date")
 
 
 def _heads(frame: Any, raw: Sequence[np.ndarray], where: Path, wanted: Wanted) -> tuple[list[str], int]:
@@ -223,8 +225,37 @@ def _heads(frame: Any, raw: Sequence[np.ndarray], where: Path, wanted: Wanted) -
     return (heads, 0) if named is None else (named, 1)
 
 
+def with_units(cells: Sequence[str], below: Sequence[str], where: str, wanted: Wanted) -> list[str] | None:
+    """The header's cells as `name[unit]` with the units of the row below; None if that row holds no units.
+
+    The row holds units if no cell is a number, and the cell of the time is a unit of time. Raise InputError, which
+    begins with `where` (file and row), if a name has different units in the header and below, or as
+    `herglotz.data.csv_columns.assign`.
+    """
+    units = [_bare(cell) for cell in below]
+    if len(units) != len(cells) or not {"s", *PER_SECOND}.intersection(units) or any(map(_is_sample, units)):
+        return None
+    own = [(name_and_unit(cell) or ("", ""))[1] for cell in cells]
+    named = list(zip(cells, units, own, strict=True))
+    both = [f"{cell!r} and below it {unit!r}" for cell, unit, head in named if head and unit not in ("", head)]
+    refuse({f"{where}: two units of one column, {both and both[0]}; keep one of them": both})
+    found = [f"{cell}[{unit}]" if unit and not head else cell for cell, unit, head in named]
+    clock = assign(found, where, wanted).time
+    return found if units[clock] in ("s", *PER_SECOND) else None
+
+
+def _bare(cell: str) -> str:
+    """A unit without brackets; a dash stands for no unit."""
+    return cell.strip("[]()<> ").removesuffix("-")
+
+
+def _is_sample(unit: str) -> bool:
+    """Whether a cell is a number; 1 may be the unit of plain numbers instead."""
+    return is_number(unit) and unit != "1"
+
+
 def _two_rows(names: Sequence[Any]) -> tuple[list[str], list[str]] | None:
-    """Names and units of a header of two rows, which pandas has as pairs; None of any other."""
+    """Names and units of a header of two rows, which pandas holds as pairs; None for any other header."""
     if not all(isinstance(name, tuple) and len(name) == 2 for name in names):
         return None
     units = [str(unit) for _, unit in names]
@@ -236,9 +267,9 @@ def _text(x: Any) -> str:
     return x if isinstance(x, str) else "" if x is None or x != x else "0"
 
 
-def in_dates(found: Trajectories, told: str = "date") -> Trajectories:
-    """The same, its times in s whatever the header says, as dates and durations are; the table of columns tells so."""
-    roles = ((name, role, (told or unit) if role == "time" else unit) for name, role, unit in found.columns)
+def in_dates(found: Trajectories, unit: str = "date") -> Trajectories:
+    """The set with its times in s, as dates and durations are whatever the header says; `unit` joins the table."""
+    roles = ((name, role, (unit or own) if role == "time" else own) for name, role, own in found.columns)
     return replace(in_seconds(found), t=found.t, time_unit="s", columns=tuple(roles))
 
 
@@ -250,7 +281,8 @@ def plain(x: Any, what: str = "numbers") -> np.ndarray:
     array = np.ma.filled(x.astype(np.float64), np.nan) if isinstance(x, np.ma.MaskedArray) else np.asarray(x)
     refuse({f"{what} are complex; give their real parts, x.real": np.iscomplexobj(array)})
     if array.dtype.kind == "O" and any(gaps := [type(x).__name__ == "NAType" for x in array.flat]):
-        array = array.copy()  # the user's own
+        # The user's own array stays as it is.
+        array = array.copy()
         array.flat[np.flatnonzero(gaps)] = np.nan
     return array
 
@@ -292,13 +324,8 @@ def moment(text: str) -> datetime | None:
     return None
 
 
-def _called(columns: Columns) -> tuple[str, str]:
-    label = "trajectory" if columns.trajectory is None else columns.names[columns.trajectory]
-    return label, columns.names[columns.time]
-
-
-def _numbers(where: Path, name: str, column: np.ndarray, known: bool, first: int) -> np.ndarray:
-    """A column, whose rows count from `first`, as float64: finite numbers, and NaN if missing values are allowed."""
+def _numbers(where: Path, name: str, column: np.ndarray, complete: bool, first: int) -> np.ndarray:
+    """A column as float64: finite numbers, and NaN unless the column has to be `complete`; rows count from `first`."""
     try:
         found = column.astype(np.float64)
     except (TypeError, ValueError):
@@ -307,7 +334,7 @@ def _numbers(where: Path, name: str, column: np.ndarray, known: bool, first: int
         raise InputError(f"{what}; convert it to numbers, or drop it") from None
     if column.dtype.kind in "iu" and column.size and max(abs(int(column.min())), abs(int(column.max()))) > EXACT:
         raise InputError(f"{where}, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one")
-    bad = np.nonzero(~np.isfinite(found) if known else np.isinf(found))[0]
+    bad = np.nonzero(~np.isfinite(found) if complete else np.isinf(found))[0]
     if len(bad):
         at, value = bad[0] + first, found[bad[0]]
         raise InputError(f"{where}, row {at}, column {quote(name)}: {value} is not finite; drop that row")

@@ -14,16 +14,19 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
 from herglotz.data.column_table import INPUT_TERM, column_table, summary_of
-from herglotz.data.holds import Arrival, check_arrival, held
+from herglotz.data.holds import Arrival, check_arrival, interpolated_input
 from herglotz.data.missing import interpolated, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
-from herglotz.errors import InputError, check_coordinates, refuse
+from herglotz.errors import check_coordinates, refuse
 
-TAKEN_FOR_DEGREES = "taken for deg"  # in the place of a unit that the header had not, or had wrong
+# Stands in place of a unit that is missing in the header, or wrong.
+TAKEN_FOR_DEGREES = "taken for deg"
 DEGREES = ("deg", "°", "degree", "degrees", TAKEN_FOR_DEGREES)
-GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
-IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of loggers stay below 0.02
+# A step longer than this many typical (median) steps is a gap.
+GAP = 1.5
+# Standard deviation of the steps over their median: the clocks of loggers stay below 0.02.
+IRREGULAR = 0.05
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,16 +38,20 @@ class Trajectories:
     Parameters
     ----------
     t, q, lengths, names, units, angles
-        (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
+        (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units ("rad", "m", "1", ...),
+        and which are angles, 2π-periodic and in "rad".
     s, p, u, v
         (N,) action and (N, n) momentum, as in `herglotz.State`, (N, m) control input and (N, n) velocity of a model, in
         units of the recording, where they are known.
     observed
-        (N, n) dimensionless weight of each position in a fit: 0 where none was read and q interpolates; None: 1.
+        (N, n) dimensionless weight of each position in a fit: 0 for a missing position, which q interpolates, else 1;
+        None: no position is missing.
     time_unit, source, columns, notes
-        Of t; origin, for messages; name, role and unit of each column that was read; notes on the reading.
+        Unit of t; file or scene of origin, for messages; name, role and unit of each column of a table, as read; notes
+        on the reading.
     hold, delay, lag
-        The input between samples; the delay and the time constant of the actuator, in the unit of t; 0: u itself acts.
+        The input between samples (`herglotz.data.holds`), "" if unspecified; the delay and the time constant of the
+        actuator (`herglotz.data.actuator`), in the unit of t: None if unspecified, 0: u itself acts.
 
     Raises
     ------
@@ -52,24 +59,24 @@ class Trajectories:
         Naming the field, the trajectory, the sample and the remedy.
     """
 
-    t: Tensor  # (N,) time
-    q: Tensor  # (N, n) position
-    lengths: tuple[int, ...]  # samples of each trajectory, adding up to N
-    names: tuple[str, ...]  # of the coordinates
-    units: tuple[str, ...]  # "rad", "m", "pixel", "1", ...
-    angles: tuple[bool, ...]  # a coordinate that is 2π-periodic, in "rad"
-    s: Tensor | None = None  # (N,) action variable, where known
-    p: Tensor | None = None  # (N, n) momentum, where known
-    u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
+    t: Tensor  # (N,)
+    q: Tensor  # (N, n)
+    lengths: tuple[int, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    angles: tuple[bool, ...]
+    s: Tensor | None = None  # (N,)
+    p: Tensor | None = None  # (N, n)
+    u: Tensor | None = None  # (N, m)
     time_unit: str = "s"
-    source: str = ""  # file or scene of origin, for messages
-    hold: str = ""  # the input between samples (`herglotz.data.holds`); "": not said
-    delay: float | None = None  # with which u acts (`herglotz.data.actuator`); None: not said
-    lag: float | None = None  # time constant of the actuator; None: not said
-    columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as read
-    notes: tuple[str, ...] = ()  # on reading the table: separators, rows left out
-    v: Tensor | None = None  # (N, n) velocity, of a model: recorded ones are not read
-    observed: Tensor | None = None  # (N, n) 0 where a position is missing, else 1; None: none is
+    source: str = ""
+    hold: str = ""
+    delay: float | None = None
+    lag: float | None = None
+    columns: tuple[tuple[str, str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    v: Tensor | None = None  # (N, n)
+    observed: Tensor | None = None  # (N, n)
 
     def __post_init__(self) -> None:
         check_arrival(self.source or "trajectories", self.arrival)
@@ -102,18 +109,15 @@ class Trajectories:
         Arrays and lists become float64; tensors keep their dtype. `q`, `p`, `v`, `u` and `observed` (N,) become (N, 1).
         Defaults: a single trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
-        columns_of = (("p", p), ("u", u), ("v", v), ("observed", observed))
-        own_p, own_u, own_v, own = (as_columns(name, x) for name, x in columns_of)
-        t, q = as_tensor("t", t), as_tensor("q", q)
-        q = q[:, None] if q.ndim == 1 else q
+        t, points = as_tensor("t", t), as_columns("q", q)
         counts = lengths.tolist() if isinstance(lengths, (Tensor, np.ndarray)) else lengths
-        n = q.shape[-1]
-        angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
+        n = points.shape[-1]
+        flags = (False,) * n if angles is None else tuple(bool(a) for a in angles)
         return cls(
-            t, q, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
-            tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
-            None if s is None else as_tensor("s", s), own_p, own_u, time_unit, source, hold, delay, lag, columns,
-            v=own_v, observed=own,
+            t, points, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
+            tuple("rad" if a else "1" for a in flags) if units is None else tuple(units), flags,
+            None if s is None else as_tensor("s", s), as_columns("p", p), as_columns("u", u), time_unit, source,
+            hold, delay, lag, columns, v=as_columns("v", v), observed=as_columns("observed", observed),
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -125,9 +129,7 @@ class Trajectories:
 
     def __getitem__(self, i: int) -> Trajectories:
         """Return trajectory i alone (negative i counts from the end)."""
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"trajectory {i} of {len(self)}")
-        return self.select([i % len(self)])
+        return self.select([range(len(self))[i]])
 
     def __iter__(self) -> Iterator[Trajectories]:
         return (self[i] for i in range(len(self)))
@@ -159,7 +161,7 @@ class Trajectories:
 
     @property
     def degrees(self) -> tuple[str, ...]:
-        """Coordinates that the table had in degrees: in rad here, and reported in degrees too."""
+        """Coordinates that the table had in degrees: they are in rad here, and reported in degrees, too."""
         return tuple(name for name, _, unit in self.columns if unit in DEGREES and name in self.names)
 
     @property
@@ -200,7 +202,7 @@ class Trajectories:
             return None
         row = torch.arange(self.samples, device=self.t.device) if row is None else row
         part = torch.full_like(row, 0.5, dtype=self.t.dtype) if part is None else part
-        return held(self.hold, self.t, self.u, self.lengths, row, part)
+        return interpolated_input(self.hold, self.t, self.u, self.lengths, row, part)
 
     @property
     def arrival(self) -> Arrival:
@@ -221,7 +223,7 @@ class Trajectories:
 
     @property
     def irregular(self) -> bool:
-        """Whether the steps differ by more than clocks do, also where no sample is missing."""
+        """Whether the steps differ by more than the clocks of loggers do, gaps aside."""
         h = self.steps().h
         return float(h[h <= GAP * h.median()].std(correction=0)) > IRREGULAR * self.typical_step
 
@@ -237,14 +239,14 @@ class Trajectories:
         return self.rows(train.to(device), train_lengths), self.rows(test.to(device), test_lengths)
 
     def liveliest(self, most: int) -> Trajectories:
-        """Return at most about `most` samples: of trajectories evenly chosen the run of samples that moves most."""
+        """Return at most about `most` samples: from evenly chosen trajectories the run of samples that moves most."""
         rows, lengths = liveliest_rows(self.q, self.lengths, most)
         return self if len(rows) == self.samples else self.rows(rows.to(self.t.device), lengths)
 
     def thinned(self, every: int) -> Trajectories:
         """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the longer steps.
 
-        If positions are missing, only complete samples and the first of each trajectory are counted.
+        If positions are missing, only complete samples and the first sample of each trajectory are counted.
 
         Raises
         ------
@@ -274,9 +276,8 @@ class Trajectories:
         """Return these trajectories, in this order; an index may come twice."""
         chosen = [int(i) for i in indices]
         for i in chosen:
-            if not 0 <= i < len(self):
-                where = self.source or "trajectories"
-                raise InputError(f"{where}: there is no trajectory {i}; select from 0 to {len(self) - 1}")
+            missing = f"{self.source or 'trajectories'}: there is no trajectory {i}; select from 0 to {len(self) - 1}"
+            refuse({missing: not 0 <= i < len(self)})
         spans = [torch.arange(self.offsets[i], self.offsets[i] + self.lengths[i]) for i in chosen]
         rows = torch.cat(spans) if spans else torch.arange(0)
         return self.rows(rows.to(self.t.device), tuple(self.lengths[i] for i in chosen))
@@ -321,7 +322,7 @@ class Trajectories:
         return replace(self, angles=flags, units=units)
 
     def digest(self) -> str:
-        """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
+        """Return the sha256 (hex) of values, dtype and labels, without source and device."""
         arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
         labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
         labels += [x if name == "hold" else {name: x} for name, x in self.arrival._asdict().items() if x]

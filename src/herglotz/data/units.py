@@ -1,4 +1,4 @@
-"""Degrees become radians and other times seconds, so that angles unwrap and rates are per second; and back."""
+"""Conversion of degrees to radians and back, and of times to seconds; lengths, angles and ranges in words."""
 
 from __future__ import annotations
 
@@ -20,16 +20,20 @@ PER_SECOND = {
 def in_radians_and_seconds(data: Trajectories) -> Trajectories:
     """Return the set with coordinates in degrees as angles in rad, and a time in ms, µs, ns, min or h in s."""
     degrees = [unit in DEGREES for unit in data.units]
-    if any(degrees):
-        factor = data.q.new_tensor([math.pi / 180 if turned else 1.0 for turned in degrees])
-        data = replace(
-            data,
-            q=data.q * factor,
-            v=None if data.v is None else data.v * factor,
-            units=tuple("rad" if turned else unit for turned, unit in zip(degrees, data.units, strict=True)),
-            angles=tuple(turned or angle for turned, angle in zip(degrees, data.angles, strict=True)),
-        )
-    return in_seconds(data)
+    angles = tuple(turned or angle for turned, angle in zip(degrees, data.angles, strict=True))
+    return in_seconds(replace(_converted(data, degrees, math.pi / 180, "rad"), angles=angles) if any(degrees) else data)
+
+
+def _converted(data: Trajectories, chosen: Sequence[bool], factor: float, unit: str) -> Trajectories:
+    """The set with the chosen coordinates times a factor, in this unit; the set has no angle among them."""
+    factors = data.q.new_tensor([factor if x else 1.0 for x in chosen])
+    return replace(
+        data,
+        q=data.q * factors,
+        v=None if data.v is None else data.v * factors,
+        units=tuple(unit if x else own for x, own in zip(chosen, data.units, strict=True)),
+        angles=tuple(angle and not x for x, angle in zip(chosen, data.angles, strict=True)),
+    )
 
 
 def in_seconds(data: Trajectories) -> Trajectories:
@@ -37,10 +41,10 @@ def in_seconds(data: Trajectories) -> Trajectories:
     if data.time_unit not in PER_SECOND:
         return data
     # A quotient by a power of ten is the float nearest to the decimal number: 300 ms prints as 0.3 s.
-    many = PER_SECOND[data.time_unit]
-    delay, lag = (None if x is None else x / many for x in data.arrival[1:])
-    v = None if data.v is None else data.v * many
-    return replace(data, t=data.t / many, v=v, time_unit="s", delay=delay, lag=lag)
+    count = PER_SECOND[data.time_unit]
+    delay, lag = (None if x is None else x / count for x in data.arrival[1:])
+    v = None if data.v is None else data.v * count
+    return replace(data, t=data.t / count, v=v, time_unit="s", delay=delay, lag=lag)
 
 
 def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
@@ -48,26 +52,18 @@ def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
 
     Momenta stay conjugate to radians.
     """
-    turned = [name in names and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
-    factor = data.q.new_tensor([180 / math.pi if x else 1.0 for x in turned])
-    return replace(
-        data,
-        q=data.q * factor,
-        v=None if data.v is None else data.v * factor,
-        units=tuple("deg" if x else unit for x, unit in zip(turned, data.units, strict=True)),
-        angles=tuple(angle and not x for x, angle in zip(turned, data.angles, strict=True)),
-    )
+    chosen = [name in names and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
+    return _converted(data, chosen, 180 / math.pi, "deg")
 
 
 def as_recorded(data: Trajectories) -> tuple[Trajectories, Tensor]:
     """The set in deg where the table had degrees, for figures, and the factor from rad to that unit, (n,)."""
-    turned = [180 / math.pi if name in data.degrees and unit == "rad" else 1.0
-              for name, unit in zip(data.names, data.units, strict=True)]  # fmt: skip
-    return in_degrees(data, data.degrees), data.q.new_tensor(turned)
+    found = in_degrees(data, data.degrees)
+    return found, data.q.new_tensor([180 / math.pi if unit == "deg" else 1.0 for unit in found.units])
 
 
 def common_unit(units: Sequence[str]) -> str:
-    """The unit that all coordinates have; "" where there are several, or none."""
+    """The unit that all coordinates have; "" for several units, and for plain numbers."""
     return units[0] if len(set(units)) == 1 and units[0] != "1" else ""
 
 
@@ -78,7 +74,7 @@ def size(value: float, unit: str, degrees: bool = False, digits: int = 3) -> str
 
 
 def span(ends: Sequence[float], unit: str = "", degrees: bool = False) -> str:
-    """A range in words: `-1 to 1 rad = -57.3 to 57.3 deg` where it was recorded in degrees, `0.1 s` without width."""
+    """A range in words: `-1 to 1 rad = -57.3 to 57.3 deg` if recorded in degrees, `0.1 s` for a range without width."""
     low, high = ends
     if f"{low:.3g}" == f"{high:.3g}":
         return size(high, unit, degrees)

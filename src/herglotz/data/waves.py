@@ -24,7 +24,7 @@ def waves(t: Tensor, frequencies: Sequence[float]) -> Tensor:
 
 
 def with_waves(data: Trajectories, frequencies: Sequence[float]) -> Trajectories:
-    """The data with waves of these frequencies (rad per unit of time) as inputs; as they are where there are none.
+    """The data with waves of these frequencies (rad per unit of time) as inputs; unchanged without frequencies.
 
     Raise InputError if a frequency is not positive, beyond half the rate of the samples (π/h), or the data hold other
     inputs.

@@ -48,9 +48,9 @@ def triples(
     t: Tensor,  # (N,) time
     q: Tensor,  # (N, n) position
     trajectory: Tensor,  # (N,) long
-    max_step: float | None = None,  # leave out windows with a longer step
+    max_step: float | None = None,
 ) -> Triples:
-    """Return every window of three consecutive samples."""
+    """Return every window of three consecutive samples, without windows that have a step longer than `max_step`."""
     index = (trajectory[2:] == trajectory[:-2]).nonzero()[:, 0]
     h0, h1 = t[index + 1] - t[index], t[index + 2] - t[index + 1]
     if max_step is not None:
@@ -73,9 +73,10 @@ def unwrap(
 ) -> Tensor:
     """Remove the multiple of 2π from every jump longer than π; each trajectory keeps the first value.
 
-    A sample between both ends of a jump, as in a resampled or filtered angle, leaves two steps of less than π. The turn
-    is removed if the motion on either side of the sample goes on after removal. A sensor that wraps leaps by the range,
-    or twice by half the range: if no step is longer than a quarter of the range, all turns were counted.
+    A sample between both ends of a jump, as in a resampled or filtered angle, leaves two steps of less than π. Their
+    turn is removed if the motion on either side of the sample then continues across the sample. A sensor that wraps
+    leaps by its range, or twice by half its range: if no step is longer than a quarter of the range, the sensor itself
+    counted all turns.
     """
     inside = (trajectory[1:] == trajectory[:-1])[:, None] & angles
     inside &= _wraps(q, trajectory)[trajectory[1:]]
@@ -83,7 +84,8 @@ def unwrap(
     turns[1:] = torch.where(inside, torch.round((q[1:] - q[:-1]) / (2 * torch.pi)), 0.0)
     turns[1:] += torch.where(inside, _divided_turns(q - 2 * torch.pi * turns.cumsum(0), trajectory)[1:], 0.0)
     total = turns.cumsum(0)
-    first = torch.searchsorted(trajectory, trajectory)  # row at which each row's trajectory starts
+    # The row at which the trajectory of each row starts.
+    first = torch.searchsorted(trajectory, trajectory)
     return q - 2 * torch.pi * (total - total[first])
 
 
@@ -97,16 +99,16 @@ def _wraps(q: Tensor, trajectory: Tensor) -> Tensor:
 
 
 def _divided_turns(q: Tensor, trajectory: Tensor) -> Tensor:
-    """Turns that a step and the next make together, (N, n), at the end of the second step.
+    """Turns that a step and the next step make together, (N, n), at the end of the second step.
 
-    Across a sample the motion goes as far as in the step before and the step behind; the difference is whole turns. The
-    steps on either side of these two agree, so that a wrong sample there is no turn.
+    Two steps together are as long as the step before and the step after, up to whole turns. The steps on either side
+    have to agree, so that a wrong sample is not taken for a turn.
     """
     turns, step = torch.zeros_like(q), q.diff(dim=0)
     if len(q) < 7:
         return turns
-    before, behind = step[:-5], step[5:]  # with the neighbouring steps: the motion on either side of five samples
-    near, far = step[1:-4], step[4:-1]
+    # Two steps on either side of the two steps that may share a turn.
+    before, near, far, behind = step[:-5], step[1:-4], step[4:-1], step[5:]
     across = q[4:-2] - q[2:-4]
     found = torch.round((across - near - far) / (2 * torch.pi))
     smooth = torch.stack([near - before, behind - far, far - near, across - near - far - 2 * torch.pi * found]).abs()

@@ -242,7 +242,7 @@ def bound(data: Trajectories) -> str:
     for one in circles(replace(data, notes=())):
         at = list(one.columns)
         if one.error <= AT_THE_NOISE * float(noise[at].maximum(EXACT_ENOUGH * size[at]).square().mean().sqrt()):
-            kept = f"The positions {one.told}, and what holds them there was not recorded"
+            kept = f"The positions {one.description}, and what holds them there was not recorded"
             return f"{kept}. Try {one.remedy}, which makes one angle of it, or motions that leave it"
     return ""
 

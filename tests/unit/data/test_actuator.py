@@ -11,7 +11,7 @@ import herglotz as hz
 from herglotz.cli import main
 from herglotz.data import Trajectories, load, save
 from herglotz.data.actuator import InputPieces, acting
-from herglotz.data.holds import Arrival, held
+from herglotz.data.holds import Arrival, interpolated_input
 from herglotz.errors import InputError
 from herglotz.training import FitConfig
 from herglotz.training.fit import told_arrival
@@ -35,7 +35,7 @@ def stepped_finely(t, u, hold, delay, lag, fine=2000):
     grid = torch.cat([(t[:-1, None] + part * t.diff()[:, None]).flatten(), t[-1:]])
     late = ((grid[1:] + grid[:-1]) / 2 - delay).clamp_min(float(t[0]))
     row = (torch.searchsorted(t, late, right=True) - 1).clamp(0, len(t) - 2)
-    source = held(hold, t, u, [len(t)], row, (late - t[row]) / (t[row + 1] - t[row])).numpy()
+    source = interpolated_input(hold, t, u, [len(t)], row, (late - t[row]) / (t[row + 1] - t[row])).numpy()
     decay, values = torch.exp(-grid.diff() / lag).tolist(), [u[0].numpy()]
     for wanted, left in zip(source, decay, strict=True):
         values.append(wanted + (values[-1] - wanted) * left)

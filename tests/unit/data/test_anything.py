@@ -107,12 +107,6 @@ def test_mistakes(data, options, message):  # fails if a mistake is a traceback,
         as_trajectories(data, **options)
 
 
-def test_what_a_frame_is_taken_for_is_printed(capsys):  # fails if the columns of a DataFrame are guessed silently
-    as_trajectories(Frame({"t": T, "load": Q[:, 0], "F": Q[:, 1]}))
-    lines = [line.split() for line in capsys.readouterr().err.splitlines()]
-    assert lines[2:] == [["t", "time", "-", "(taken", "for", "s)"], ["load", "coordinate", "-"], ["F", "input", "-"]]
-
-
 def test_a_notebook_is_told_without_red_ground(capsys, monkeypatch):
     # fails if the table of columns goes to stderr in a notebook, where it looks like a failure
     monkeypatch.setitem(sys.modules, "ipykernel", sys)

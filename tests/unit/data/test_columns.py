@@ -13,6 +13,7 @@ from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.table import from_frame
 from herglotz.data.units import in_degrees, size
 from herglotz.errors import InputError
+from herglotz.training.run_folder import reading_in
 
 
 class Frame(dict):
@@ -29,42 +30,6 @@ def read(folder, text, **options):
 
 def rows(*columns):
     return "\n".join(",".join(map(str, row)) for row in zip(*columns, strict=True)) + "\n"
-
-
-@pytest.mark.parametrize(
-    "head",
-    ["force[N]", "F[N]", "F", "torque[Nm]", "Torque", "tau", "tau_1", "tau2", "motor_left", "u1", "u2", "u_0",
-     "push[N]", "M[N*m]", "voltage[V]", "current", "cmd", "command_1", "control", "input", "effort_1", "pwm2"],
-)  # fmt: skip
-def test_forces_are_inputs(tmp_path, head):  # fails if a force becomes a second coordinate
-    data = read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7]))
-    assert data.names == ("x",)
-    assert data.u is not None
-    assert data.u[:, 0].tolist() == [8, 9, 7]
-
-
-@pytest.mark.parametrize("head", ["f", "N", "taut", "motion", "uplift", "forceful", "x[m]", "up", "unit[Nms]", "cmds"])
-def test_other_names_stay_coordinates(tmp_path, head):  # fails if a pattern swallows names that only begin like a force
-    assert read(tmp_path, f"t,{head}\n0,1\n1,2\n2,3\n").u is None
-
-
-@pytest.mark.parametrize(
-    "head",
-    ["v", "vx", "velocity_x", "x_dot", "x_ddot", "ax", "acc", "gyro[rad/s]", "a[m/s^2]", "b (mm/s²)", "index", "frame",
-     "Unnamed: 0", "xdot", "theta2ddot", "omega", "omega_1"],
-)  # fmt: skip
-def test_rates_and_counters_are_left_aside(tmp_path, head):
-    # fails if a logged velocity, an acceleration or a number of the row becomes a second coordinate
-    data = read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7]))
-    assert (data.names, data.u) == (("x",), None)
-    assert data.columns[2][1] == "left aside"
-    assert read(tmp_path, "v,t\n1,0\n2,1\n4,2\n", coordinates="v").names == ("v",)
-
-
-@pytest.mark.parametrize("head", ["v[m]", "vy (mm)", "ax[rad]", "az[deg]"])
-def test_letters_of_rates_with_the_unit_of_a_position_are_coordinates(tmp_path, head):
-    # fails if a coordinate is lost because its letters mean a velocity elsewhere
-    assert len(read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7])).names) == 2
 
 
 @pytest.mark.parametrize(("head", "kind"), [("speed", "rate"), ("voltage", "input")])
@@ -146,11 +111,6 @@ def test_the_users_word_counts(tmp_path):  # fails if a column keeps the role of
         read(tmp_path, text, drop="c")
 
 
-def test_an_unknown_clock_lists_the_columns(tmp_path):  # fails if the user is not told what there is to choose from
-    with pytest.raises(InputError, match=r"no time column; the columns are clock, x: choose one with --time NAME"):
-        read(tmp_path, "clock,x[m]\n0,1\n1,2\n2,3\n")
-
-
 def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
     # fails if a column is left out of the table, a conversion is not said, or the table soils stdout
     read(tmp_path, "t[ms],theta[deg],theta_dot,tau[Nm]\n" + rows([0, 1, 2], [1, 2, 3], [0, 0, 0], [4, 5, 6]))
@@ -170,17 +130,8 @@ def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize(("count", "shown"), [(199, 200), (200, 201), (1000, 201)])
-def test_a_table_of_many_columns_is_short(tmp_path, capsys, count, shown):
-    # fails if a wide table is printed line by line (100 000 of them), its ends are missing, or one that fits is cut
-    read(tmp_path, ",".join(["t", *(f"x{k}" for k in range(count))]) + "\n" + rows([0, 1, 2], *([[1, 2, 3]] * count)))
-    lines = capsys.readouterr().err.splitlines()[2:]
-    assert len(lines) == shown
-    assert (lines[0].split()[0], lines[-1].split()[0]) == ("t", f"x{count - 1}")
-    assert [line.split()[1:] for line in lines if "…" in line] == ([[str(count - 199), "more"]] if count > 199 else [])
-
-
-def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the command line is dropped on the way
+def test_flags_reach_the_reader(tmp_path, capsys):
+    # fails if a flag of the command line is dropped on the way, or a run that had the flag cannot be opened
     path = tmp_path / "motion.csv"
     path.write_text("clock,a,b\n0,1,2\n1,2,3\n")
     flags = ["--time", "clock", "--coordinates", "a", "--inputs", "none", "--drop", "b", "--group", "lap"]
@@ -191,9 +142,11 @@ def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the com
     ):
         assert main([*command, *flags]) == 2
         assert "there is no column 'lap'; the columns are clock, a, b" in capsys.readouterr().err
-        taken = columns_of(build_parser().parse_args([*command, *flags, "--angles", "a"]))
-        names = {"coordinates": ["a"], "inputs": [], "drop": ["b"], "angles": ["a"]}
-        assert taken == {"time": "clock", "group": "lap", **names}
+        more = ["--angles", "a", "--degrees", "b,c", "--polar", "x1,y1", "--polar", "x2,-y2"]
+        taken = columns_of(build_parser().parse_args([*command, *flags, *more]))
+        names = {"coordinates": ["a"], "inputs": [], "drop": ["b"], "angles": ["a"], "degrees": ["b", "c"]}
+        assert taken == {"time": "clock", "group": "lap", **names, "polar": ["x1,y1", "x2,-y2"]}
+        assert reading_in({"reading": taken}, "config.json") == taken
 
 
 def test_columns_are_of_tables(tmp_path):  # fails if a flag is ignored where it has no meaning

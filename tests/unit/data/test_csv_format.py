@@ -93,7 +93,6 @@ def test_blank_trajectory_column_is_one_trajectory(tmp_path):  # fails if a blan
         ("t,a,b,p_a,p_c\n0,1,2,3,4\n", r"row 1: momentum columns p_a, p_c are not p_a, p_b; rename or delete them"),
         ("t,q\n0,1\n1,abc\n2,3\n", r"data.csv, row 3, column 'q': 'abc' is not a number; correct or delete the row"),
         ("t,q\n\n# x\n0,1\n,2\n2,3\n", r"data.csv, row 5, column 't': a blank cell is not a number; correct or delete"),
-        ("t,q,u\n0,1,\n1,2,\n2,3,\n", r"data.csv, row 2: .* 0 have a value in .* column 'u' has the most gaps"),
         ("t,q,a\n0,1,ok\n1,2,no\n", r"row 2, column 'a': 'ok' is not a number; leave the column out with --drop a "),
         ("t,q\n1:00,1\n2:00,2\n", r"row 2, column 't': '1:00' is not a number; write numbers, or dates such"),
         ("t,q,a\ns,5,m\n1,2,3\n", r"row 2, column 't': 's' is not a number; correct or delete the row"),
@@ -104,15 +103,12 @@ def test_blank_trajectory_column_is_one_trajectory(tmp_path):  # fails if a blan
             r"row 2: of the 4 rows from here, 0 have a value in every column, at least 3 are needed; column 'x' has "
             r"the most gaps: leave it out with --drop x \(drop= in Python\), or fill it in",
         ),
-        ("t,q\n0,1\n1,2\ninf,3\n", r"data.csv, row 4, column 't': 'inf' is not finite"),
         ("t,q\n0,1\n1,1e999\n2,3\n", r"data.csv, row 3, column 'q': '1e999' is not finite"),
         ("t,q\n0,1\n1,2,3\n", r"data.csv, row 3: 3 cells where the header has 2; correct or delete the row"),
-        ("t,q\n0,1\n1\n", r"data.csv, row 3: 1 cells where the header has 2"),
         (
             "t,q\n0,1\n2,2\n1,3\n",
             r"row 4, column 't': 1.0 does not increase on 2.0 in row 3; sort the rows, delete one, or number the traj",
         ),
-        ("trial,t,q\n5,0,1\n5,3,1\n5,2,1\n", r"data.csv, row 4, column 't': 2.0 does not increase on 3.0 in row 3"),
         (
             GOOD + "x,0,9\ny,0,9\nz,0,9\n",
             r"data.csv, row 8, column 'trajectory': 'x' has 1 sample, at least 3 are needed; delete it",
@@ -153,12 +149,6 @@ def test_round_trip_is_exact(tmp_path):  # fails if a digit, a label or an optio
     unnamed = replace(data, time_unit="1")  # fails if [1] is read as seconds
     write_csv(tmp_path / "a.csv", unnamed)
     assert read_csv(tmp_path / "a.csv").digest() == unnamed.digest()
-
-
-def test_float32_round_trip(tmp_path):  # fails if float32 is printed with too few digits
-    data = rich().select([0]).to(torch.float32)
-    write_csv(tmp_path / "a.csv", data)
-    assert read_csv(tmp_path / "a.csv").to(torch.float32).digest() == data.digest()
 
 
 @settings(max_examples=50, deadline=None)

@@ -1,18 +1,14 @@
 """Angles in degrees without a word of it: converted where their motion shows it, asked for where it does not."""
 
-import json
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from herglotz.cli.flags import columns_of
-from herglotz.cli.parser import build_parser
 from herglotz.data import Trajectories, as_trajectories, load
 from herglotz.data.degrees import is_in_degrees
 from herglotz.errors import InputError
-from herglotz.training.run_folder import Reading, reading_in
 
 T = np.arange(400) / 30
 SWING = 2.6 * np.cos(5 * T) * np.exp(-0.05 * T)  # rad; 25 deg a sample at most
@@ -129,11 +125,3 @@ def test_zeros_of_such_sensors_are_in_degrees(tmp_path):  # fails if a zero in d
     path = written(tmp_path, "t,theta", DEGREES["a swing"] + 20)
     found = load(path, sensor_zeros=[20.0], show=False)
     torch.testing.assert_close(found.q[:, 0], torch.from_numpy(SWING + NOISE), atol=1e-5, rtol=0)
-
-
-def test_the_flag_and_the_settings_of_a_run():
-    # fails if --degrees is dropped on its way to the reader, or a run that had it cannot be opened or repeated
-    told = build_parser().parse_args(["fit", __file__, "--out", "x", "--degrees", "theta,phi"])
-    assert columns_of(told) == {"degrees": ["theta", "phi"]}
-    assert reading_in({"reading": json.loads('{"degrees": ["theta"]}')}, "config.json") == {"degrees": ["theta"]}
-    assert "degrees" in Reading.__annotations__

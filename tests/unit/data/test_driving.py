@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, save
-from herglotz.data.driving import CLOSE, driven, even_times, input_recording
+from herglotz.data.driving import START_TOLERANCE, driven, even_times, input_recording
 from herglotz.errors import InputError
 
 T = torch.tensor([0.0, 0.1, 0.2, 0.4, 0.5], dtype=torch.float64)
@@ -31,7 +31,7 @@ def test_inputs_act_when_they_were_recorded():  # fails if the first K inputs ar
 def test_the_last_input_acts_in_no_step():
     # fails if a run that ends a rounding after the last sample takes its input, which holds for a step never recorded
     found = replace(RECORDING, u=torch.tensor([1.0, 2.0, 4.0, 8.0, 1e12], dtype=torch.float64)[:, None])
-    u, _ = driven(found, 0.4, 1, 0.1 * (1 + CLOSE / 2))
+    u, _ = driven(found, 0.4, 1, 0.1 * (1 + START_TOLERANCE / 2))
     assert u.item() == pytest.approx(8.0)
 
 

@@ -88,8 +88,8 @@ RUN = {"t": T, "x": np.cos(T)}
         ({"exp": {"runs": [RUN, RUN], "fs": 10.0}}, (40, 40)),
         ({"data": RUN, "cells": [T, T[1:]]}, (40,)),
         ({"empty": np.zeros((0, 0))}, r"a\.mat: holds no vectors of numbers; save t and q"),
-        ({"empty": np.zeros(0)}, r"a\.mat: holds no vectors of numbers; save t and q"),
         ({"data": {"name": "text"}}, r"a\.mat: holds no vectors of numbers; save t and q"),
+        ({"a": RUN, "b": RUN}, "two arrays are called"),
         ({"runs": [RUN, RUN], "t": T}, r"a\.mat: runs is a struct array beside other variables; save it in a file of"),
     ],
 )

@@ -60,7 +60,7 @@ def test_what_a_killed_writer_leaves_is_removed(tmp_path, monkeypatch):
 
 def test_a_device_is_said_once():
     # fails if a message stands inside another one
-    with pytest.raises(InputError, match=r"^/dev/zero: is a pipe or a device, not a file; save what it says to a file"):
+    with pytest.raises(InputError, match=r"^/dev/zero: is a pipe or a device, not a file; save its output to a file"):
         read_bytes("/dev/zero")
 
 

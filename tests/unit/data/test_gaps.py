@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, as_trajectories, load
-from herglotz.data.gaps import CROSSED, parted
+from herglotz.data.gaps import MAX_CROSSED_STEPS, parted
 from herglotz.errors import InputError
 
 
@@ -28,9 +28,9 @@ def test_a_night_between_samples_begins_another_recording():
 
 def test_gaps_that_can_be_crossed_stay():
     # fails if any gap is cut: motion on both of its sides is one, and fixes periods best
-    short = recorded((0, 40), (CROSSED + 40, CROSSED + 80))
+    short = recorded((0, 40), (MAX_CROSSED_STEPS + 40, MAX_CROSSED_STEPS + 80))
     assert parted(short) is short
-    assert parted(recorded((0, 40), (CROSSED + 41, CROSSED + 80))).lengths == (41, 40)
+    assert parted(recorded((0, 40), (MAX_CROSSED_STEPS + 41, MAX_CROSSED_STEPS + 80))).lengths == (41, 40)
     long = recorded((0, 1499), (2999, 3100))  # of 1602 samples
     assert parted(long) is long
     assert parted(recorded((0, 1499), (3102, 3203))).lengths == (1500, 102)

@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from herglotz.cli.flags import columns_of
-from herglotz.cli.parser import build_parser
 from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.polar import circle
 from herglotz.errors import InputError
-from herglotz.training.run_folder import reading_in
 
 T = np.arange(200) / 30
 A, B = 1.1 * np.cos(3 * T) * np.exp(-0.02 * T), 0.9 * np.sin(2.3 * T)
@@ -92,12 +89,15 @@ def test_an_axis_that_grows_downwards_is_said(tmp_path, capsys):  # fails if a h
 
 
 def test_a_chain_and_two_bodies_apart(tmp_path, capsys):
-    # fails if the second arm is measured from the pivot, or a body beside is hung on the first
+    # fails if the second arm is measured from the pivot, a body beside is hung on the first, or the table says that a
+    # position which is also a centre belongs to the second angle
     names = "x1[m],y1[m],x2[m],y2[m]"
     chain = load(written(tmp_path, names, ONE + NOISE[0], TWO + NOISE[1]), polar=["x1,y1", "x2,y2"])
     assert chain.names == ("theta1", "theta2")
     assert "theta2 is the angle of x2, y2 about x1, y1, at " in capsys.readouterr().err
     close(chain.q[:, 1], B, 0.012)
+    given = load(tmp_path / "a.csv", polar=["x1,y1", "x2,y2,x1,y1"], show=False)
+    assert [role for _, role, _ in given.columns[1:5]] == ["of theta1"] * 2 + ["of theta2"] * 2
     other = np.array([3.0, 0.5]) + arm(B, 0.5)
     apart = load(written(tmp_path, names, ONE + NOISE[0], other + NOISE[1]), polar=["x1,y1", "x2,y2"])
     assert "theta2 is the angle of x2, y2 about (" in capsys.readouterr().err
@@ -197,10 +197,3 @@ def test_nothing_is_said_where_the_user_has_spoken(tmp_path, capsys):  # fails i
     load(path, like=load(path, polar=()))
     load(written(tmp_path, "x[m],z[m]", ONE))
     assert "circle" not in capsys.readouterr().err
-
-
-def test_the_flag_and_the_settings_of_a_run():
-    # fails if one of several pairs is lost on the way to the reader, or a run that had them cannot be opened
-    told = build_parser().parse_args(["fit", __file__, "--out", "x", "--polar", "x1,y1", "--polar", "x2,-y2"])
-    assert columns_of(told) == {"polar": ["x1,y1", "x2,-y2"]}
-    assert reading_in({"reading": columns_of(told)}, "config.json") == columns_of(told)

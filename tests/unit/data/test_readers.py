@@ -17,13 +17,6 @@ def test_save_then_load(tmp_path, name):  # fails if an extension goes to the wr
     assert load(str(tmp_path / name)).digest() == in_radians_and_seconds(rich()).digest()
 
 
-def test_text_of_schmidt_and_lipson(tmp_path):  # fails if .txt is not looked into
-    (tmp_path / "a.txt").write_text("% o v\n0 0 3 1\n0 1 -3 1\n0 2 -2.5 1\n")
-    data = load(tmp_path / "a.txt")
-    assert data.names == ("theta",)
-    np.testing.assert_allclose(data.q[:, 0], [3, 2 * np.pi - 3, 2 * np.pi - 2.5], atol=1e-15)
-
-
 def test_angles_are_unwrapped_unless_told(tmp_path):  # fails if unwrapping or either option is dropped
     (tmp_path / "a.csv").write_text(WRAPPED)
     np.testing.assert_allclose(load(tmp_path / "a.csv").q[:, 0], [3, 2 * np.pi - 3, 2 * np.pi - 2.5], atol=1e-15)
@@ -39,7 +32,7 @@ def test_angles_are_unwrapped_unless_told(tmp_path):  # fails if unwrapping or e
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.xyz", "x", r"a.xyz: cannot read .xyz; known formats: .*\.npz.*Schmidt & Lipson.*\.txt.*\.csv"),
+        ("a.xyz", "x", r"a.xyz: cannot read .xyz; known formats: .*\.npz.*\.csv"),
         ("a", "x", r"a: cannot read a file without extension"),
         ("a.txt", "t,q\n", r"a.txt: there is a header but no samples"),
         ("a.npz", "t,q\n", r"a.npz: is not a .npz archive"),

@@ -20,10 +20,13 @@ def two_recordings() -> Trajectories:
 
 def test_each_recording_has_its_zeros_and_all_have_one_scale():
     data = two_recordings()
-    q = measured(data, (0.1, -0.2, 0.3, 0.5), (2.0, -1.0)).q
+    found = measured(replace(data, v=data.q), (0.1, -0.2, 0.3, 0.5), (2.0, -1.0))
     zero = torch.tensor([[0.1, -0.2]] * 5 + [[0.3, 0.5]] * 4, dtype=torch.float64)
-    # fails if the zeros of one recording go to the other, or if the zero is subtracted after the scale
-    assert torch.equal(q, torch.tensor([2.0, -1.0], dtype=torch.float64) * (data.q - zero))
+    scale = torch.tensor([2.0, -1.0], dtype=torch.float64)
+    # fails if the zeros of one recording go to the other, a zero is subtracted after the scale, or rates keep theirs
+    assert torch.equal(found.q, scale * (data.q - zero))
+    assert found.v is not None
+    assert torch.equal(found.v, scale * data.q)
 
 
 def test_one_zero_a_coordinate_is_that_of_all_recordings():

@@ -158,20 +158,6 @@ def test_every_mistake_has_its_message(changes, message):
     assert "\n" not in str(caught.value)
 
 
-def test_the_real_damped_pendulum():  # fails if scenes and `simulate` disagree on shapes or names
-    scenes = pytest.importorskip("herglotz.scenes", reason="herglotz.scenes is not there yet")
-    scene = scenes.scene("damped_pendulum")
-    data = simulate(scene, trajectories=3, steps=40, h=0.1, seed=2, keep_state=True)
-    assert (data.names, data.angles, data.units) == (scene.coordinates, (True,), ("rad",))
-    triples = data.triples()
-    # central differences of θ″ + 0.2 θ′ + sin θ vanish to O(h²), and without the damping term they do not
-    acceleration = (triples.q2 - 2 * triples.q1 + triples.q0) / 0.01
-    residual = acceleration + triples.q1.sin()
-    velocity = (triples.q2 - triples.q0) / 0.2
-    assert (residual + 0.2 * velocity).abs().max() < 0.01
-    assert residual.abs().max() > 0.1
-
-
 def test_the_name_of_a_scene_is_enough():  # fails if a name is refused, or the numbers are not those of the command
     data = simulate("duffing")
     assert (data.lengths, data.typical_step) == ((101,) * 4, pytest.approx(0.1))

@@ -46,10 +46,8 @@ SIX = torch.zeros(6, dtype=torch.float64)
     [
         ({"t": torch.arange(6)}, r"f: t has dtype torch.int64; convert it to torch.float64"),
         ({"q": SIX.to(torch.complex128)}, r"f: q has dtype torch.complex128; convert"),
-        ({"q": SIX.half()}, r"f: q has dtype torch.float16; convert"),
         ({"q": SIX.float()}, r"f: q is torch.float32 on cpu but t is torch.float64 on cpu; use the same"),
         ({"q": [[0.0, 1.0], [2.0]]}, r"q is not an array of numbers .*; give a tensor"),
-        ({"q": ["a"] * 6}, r"q is not an array of numbers .*; give a tensor"),
         ({"t": SIX[:, None]}, r"f: t must have shape \(N,\), got \(6, 1\); flatten it"),
         ({"q": [0.0] * 5}, r"f: q must have shape \(6, n\), .*got \(5, 1\)"),
         ({"q": torch.zeros(6, 0, dtype=torch.float64)}, r"f: q must have shape \(6, n\), .*got \(6, 0\)"),
@@ -62,26 +60,18 @@ SIX = torch.zeros(6, dtype=torch.float64)
         ({"lengths": (3, 4)}, r"f: lengths add up to 7 but t has 6 samples; correct the lengths"),
         ({"lengths": (3, 3.0)}, r"f: lengths\[1\] is 3.0, not an int"),
         ({"names": ("a", "b")}, r"f: names has 2 entries for 1 coordinates"),
-        ({"units": ()}, r"f: units has 0 entries for 1 coordinates"),
-        ({"angles": (True, False), "units": ("rad",)}, r"f: angles has 2 entries for 1 coordinates"),
         ({"units": ("",)}, r"f: a unit is empty \(\('',\), 's'\); write '1' for none"),
         ({"time_unit": ""}, r"f: a unit is empty \(\('1',\), ''\); write '1'"),
         ({"names": ("a\ud800",)}, r"f: 'a.ud800' has control characters or half a character; rename it"),
-        ({"units": ("\x1b[31m",)}, r"f: '.x1b\[31m' has control characters"),
         ({"time_unit": "s\n"}, r"f: 's.n' has control characters"),
         ({"names": ("",)}, r"f: names \(''\,\) must differ and not be empty; rename"),
         ({"angles": (True,), "units": ("deg",)}, r"f: the angle 'q' is in 'deg'; convert it to radians"),
         ({"q": [0.0, 1.0, 2.0, 3.0, NAN, 5.0]}, r"f: q\[0\] of trajectory 1, sample 1, is nan; delete that sample"),
         ({"t": [0.0, 1.0, INF, 0.0, 1.0, 2.0]}, r"f: t of trajectory 0, sample 2, is inf; delete that sample"),
-        ({"s": SIX + INF}, r"f: s of trajectory 0, sample 0, is inf"),
         ({"u": SIX * NAN}, r"f: u\[0\] of trajectory 0, sample 0, is nan"),
         (
             {"t": [0.0, 1.0, 2.0, 0.0, 1.0, 1.0]},
             r"f: t of trajectory 1 does not increase from sample 1 to 2 \(1.0 then 1.0\); sort the samples or delete",
-        ),
-        (
-            {"t": [0.0, 1.0, 0.5, 0.0, 1.0, 2.0]},
-            r"t of trajectory 0 does not increase from sample 1 to 2 \(1.0 then 0.5\)",
         ),
     ],
 )
@@ -94,10 +84,6 @@ def test_every_mistake_has_its_message(changes, message):
 def test_constructor_wants_tensors():  # fails if an array slips through to torch operations
     with pytest.raises(InputError, match=r"s: q must be a torch.Tensor, got ndarray; use Trajectories.of"):
         replace(ragged(), q=np.zeros((13, 2)), source="s")  # pyright: ignore[reportArgumentType]
-
-
-def test_times_of_different_trajectories_may_overlap():  # fails if increase is asked across a border
-    assert len(build(t=[5.0, 6.0, 7.0, 0.0, 1.0, 2.0])) == 2
 
 
 def test_defaults():  # fails if lists become float32 or an angle keeps the unit 1
@@ -160,11 +146,6 @@ def test_triples_leave_out_long_steps():  # fails if only h0 or only h1 is looke
     for bad in (0.0, -1.0, NAN):
         with pytest.raises(InputError, match="max_step must be finite and > 0"):
             data.triples(bad)
-
-
-def test_typical_step_and_gaps():  # fails if the mean is taken for the median
-    assert ragged().typical_step == pytest.approx(0.1)
-    assert ragged().gaps == 2
 
 
 def test_split_time():  # fails if the cut is not per trajectory, or a sample is lost or seen twice
