@@ -1,4 +1,4 @@
-"""A model compiled and loaded at once: `hz.compile`, the fastest stepper that this machine can offer, and C itself."""
+"""A model compiled as C and loaded: `hz.compile`, with the eager stepper where C is impossible, and `compile_c`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 from herglotz.codegen.c_compiler import compiler
 from herglotz.data.files import PathLike
@@ -20,7 +20,8 @@ from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.stepping import Stepper
 
-MODELS = (ContactLagrangian, OwnLagrangian)  # what can be traced
+# The models that can be traced.
+MODELS = (ContactLagrangian, OwnLagrangian)
 
 
 def compile(
@@ -28,8 +29,8 @@ def compile(
 ) -> ExportedStepper | Stepper:
     """A stepper with the interface of `Stepper` that steps in C, without derivatives.
 
-    Compiled once: the library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a
-    model that has no C, the eager stepper comes back, with one warning that says what is missing.
+    The library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a model that has
+    no C, the result is the eager stepper, and a warning says what is missing.
 
     Parameters
     ----------
@@ -41,12 +42,12 @@ def compile(
     Returns
     -------
     ExportedStepper or Stepper
-        The second where C cannot be had.
+        The eager stepper where C is not possible.
 
     Raises
     ------
     InputError
-        If the source is none of these, or a header cannot be compiled: it has no eager stepper to fall back on.
+        If the source is none of these, or a header cannot be compiled: a header has no eager stepper to fall back on.
     """
     if isinstance(source, str | os.PathLike):
         return load_c(source, trust_code=trust_code)
@@ -81,7 +82,7 @@ def _fall_back(eager: Stepper, reason: str) -> Stepper:
 
 
 def compile_c(
-    model: Any,  # ContactLagrangian or OwnLagrangian
+    model: Any,
     *,
     h: float = 1.0,
     box: Mapping[str, Sequence[float]] | None = None,
@@ -90,7 +91,7 @@ def compile_c(
     tolerance: float | None = None,
     parameters: Chosen = (),
 ) -> ExportedStepper:
-    """Compile a model's C and load it; `load_c` does so with a header.
+    """Compile a model's C and load it; `load_c` compiles a header.
 
     The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
     processor. The compiler is $CC, or cc, gcc or clang from the PATH.
@@ -98,9 +99,9 @@ def compile_c(
     Parameters
     ----------
     model
-        Not changed.
+        A ContactLagrangian or OwnLagrangian, not changed.
     h, box, units, dtype, tolerance, parameters
-        As in `export_c`; dtype defaults to the model's. `with_parameters` of the stepper sets the last ones.
+        As in `export_c`; dtype defaults to the model's. `with_parameters` of the stepper sets parameters.
 
     Returns
     -------
@@ -110,16 +111,15 @@ def compile_c(
     Raises
     ------
     InputError
-        If there is no compiler, or an argument is not usable.
+        If no compiler is installed, or an argument is not usable.
     """
-    given: object = model
-    if not isinstance(given, MODELS):
+    if not isinstance(model, MODELS):
         raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
-    model = cast("Any", model)
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     extra = {"parameters": described_parameters(model, parameters)} if parameters else {}
     entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None, **extra})
     entries = described(model, entries, "model", dtype, tolerance)
-    kept: Any = copy.deepcopy(model)  # the model may be trained on
+    # A copy, because training may change the model before `whole` is called.
+    kept: Any = copy.deepcopy(model)
     header = c_source(kept, entries, "stepper.h", derivatives=False)
     return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))
