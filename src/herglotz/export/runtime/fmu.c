@@ -6,6 +6,9 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter" /* functions of the standard have arguments that no FMU has to read */
+#endif
 @HOLD@
 #define fmu_TOKEN "@TOKEN@"
 
@@ -180,13 +183,6 @@ static int fmu_differentiate(fmu_instance *it, const unsigned int *unknowns, siz
     }
   return fmu_OK;
 #else
-  (void)unknowns;
-  (void)rows;
-  (void)knowns;
-  (void)columns;
-  (void)seed;
-  (void)result;
-  (void)adjoint;
   return fmu_said(it, fmu_ERROR, "The model has too many coordinates for derivatives.");
 #endif
 }
