@@ -52,26 +52,22 @@ def compile(
     if isinstance(source, str | os.PathLike):
         return load_c(source, trust_code=trust_code)
     eager = source if isinstance(source, Stepper) else None
-    described: dict[str, Any] = {}
-    model: Any = source
-    if eager is not None:
-        model = eager.L_d
-    elif not isinstance(source, MODELS):
-        run: Any = source
-        model = getattr(run, "model", None)
-        if isinstance(model, MODELS):
-            described = {"h": run.h, "box": run.box, "units": run.data.units}
+    # A run has its model as an attribute.
+    run: Any = source
+    own = source if isinstance(source, MODELS) else getattr(source, "model", None)
+    model: Any = own if eager is None else eager.L_d
     if not isinstance(model, MODELS):
         if eager is None:
             given = type(source).__name__
             raise InputError(f"compile needs a model, a Stepper, a run or the path of a C header, got {given}")
         return _fall_back(eager, f"{type(model).__name__} is no ContactLagrangian and has no C form")
+    of_run: dict[str, Any] = {} if eager or model is run else {"h": run.h, "box": run.box, "units": run.data.units}
     eager = eager or Stepper(model)
     if eager.throw:
         return _fall_back(eager, "throw=True needs the eager stepper")
     try:
         compiler()
-        return compile_c(model, **described)
+        return compile_c(model, **of_run)
     except InputError as error:
         return _fall_back(eager, str(error))
 
@@ -113,8 +109,9 @@ def compile_c(
     InputError
         If no compiler is installed, or an argument is not usable.
     """
-    if not isinstance(model, MODELS):
-        raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
+    given: object = model
+    if not isinstance(given, MODELS):
+        raise InputError(f"compile_c takes a model, got {type(given).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     extra = {"parameters": described_parameters(model, parameters)} if parameters else {}
     entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None, **extra})

@@ -8,7 +8,14 @@ from xml.etree import ElementTree as xml
 
 from herglotz.export.c_header import MAX_DERIVATIVES
 
-VERSIONS = ("3.0", "2.0")
+# The versions of FMI, with their names of the capabilities to give derivatives and to save states.
+VERSIONS = {
+    "3.0": (
+        ("providesDirectionalDerivatives", "providesAdjointDerivatives"),
+        ("canGetAndSetFMUState", "canSerializeFMUState"),
+    ),
+    "2.0": (("providesDirectionalDerivative",), ("canGetAndSetFMUstate", "canSerializeFMUstate")),
+}
 # The units that FMI knows; other units are only names.
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
@@ -46,7 +53,7 @@ def variables(entries: Mapping[str, Any]) -> list[Variable]:
 
 def model_description(entries: Mapping[str, Any], version: str, token: str, source: str) -> bytes:
     """The file `modelDescription.xml` of FMI 3.0 or 2.0."""
-    new, has = version == "3.0", variables(entries)
+    new, listed = version == "3.0", variables(entries)
     root = xml.Element(
         "fmiModelDescription",
         fmiVersion=version,
@@ -56,21 +63,20 @@ def model_description(entries: Mapping[str, Any], version: str, token: str, sour
         variableNamingConvention="flat",
     )
     root.set("instantiationToken" if new else "guid", token)
-    able = {"canHandleVariableCommunicationStepSize": True, "providesDirectionalDerivative" + "s" * new: True}
-    able |= {"providesAdjointDerivatives": True} if new else {}
-    able = dict.fromkeys(able, entries["dof"] <= MAX_DERIVATIVES) | {"canHandleVariableCommunicationStepSize": True}
-    able |= {"canGetAndSetFMU" + "Ss"[not new] + "tate": True, "canSerializeFMU" + "Ss"[not new] + "tate": True}
+    derivatives, states = VERSIONS[version]
+    capabilities = {"canHandleVariableCommunicationStepSize": True}
+    capabilities |= dict.fromkeys(derivatives, entries["dof"] <= MAX_DERIVATIVES) | dict.fromkeys(states, True)
     simulation = xml.SubElement(root, "CoSimulation", modelIdentifier=entries["name"])
-    for key, value in able.items():
+    for key, value in capabilities.items():
         simulation.set(key, str(value).lower())
     if not new:
         xml.SubElement(xml.SubElement(simulation, "SourceFiles"), "File", name=source)
-    _units(root, has)
+    _units(root, listed)
     categories = xml.SubElement(root, "LogCategories")
     for name in ("logStatusWarning", "logStatusError"):
         xml.SubElement(categories, "Category", name=name)
     xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(entries["h"]))
-    (_fmi3 if new else _fmi2)(root, has)
+    (_fmi3 if new else _fmi2)(root, listed)
     return _written(root)
 
 

@@ -52,13 +52,13 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any], *, unroll: in
     problem = ("q", "p", "s", "h", *(("u",) if entries["inputs"] else ()))
     outputs = OUTPUTS if entries["box"] is not None else OUTPUTS[:-1]
     friction = ("grip", "grip_by_v") if entries["model"].get("sticking") else ()
-    further = {
+    further: dict[str, tuple[Sequence[str], Sequence[str]]] = {
         "init": (("q0", "q1", "s0", *problem[3:]), ("p", "s")),
         "linearise": (problem, (*outputs, "jacobian")),
         "legendre": (("q", "v", "s", "h"), ("L_v", "L_vv", *friction)),
     }
-    for name, names in further.items():
-        properties[f"{KEY}_{name}"] = base64.b64encode(graph_of(programs[name], *names, {})).decode()
+    for name, (inputs, results) in further.items():
+        properties[f"{KEY}_{name}"] = base64.b64encode(graph_of(programs[name], inputs, results, {})).decode()
     return sealed_onnx(graph_of(programs[main], problem, outputs, properties))
 
 
