@@ -37,7 +37,6 @@ def config(n, angles=None, **settings):
 
 MODELS = {
     "linear": config(1),
-    "linear, no network": config(1, potential_width=0),
     "linear, correction": config(1, potential_width=0, correction_width=8),
     "linear, two coordinates": config(2, correction_width=5),
     "affine": config(1, level="affine"),
@@ -45,7 +44,6 @@ MODELS = {
     "affine, three coordinates": config(3, level="affine"),
     "conservative": config(1, level="conservative"),
     "conservative, correction": config(1, level="conservative", correction_width=6),
-    "conservative, eight coordinates": config(8, level="conservative"),
     "full": config(1, level="full"),
     "full, two coordinates, correction": config(2, level="full", action_width=2, correction_width=5),
     "full, three coordinates": config(3, level="full", action_width=1),
@@ -63,7 +61,6 @@ MODELS = {
     "mass of position, two coordinates": config(2, mass_width=5),
     "mass of position, forced": config(2, mass_width=5, level="forced", coulomb=True),
     "mass of position, full": config(1, mass_width=4, level="full", action_width=2),
-    "mass of position, eight coordinates": config(8, mass_width=4, level="conservative"),
     "features": config(1, features=("cos(2q1)", "sin(2q1)"), potential_width=0),
     "features of speed, coupled friction": config(
         2, features=("cos(q1 - q2) v1 v2", "q2 v1", "q2^3"), level="forced", coupled=True

@@ -1,4 +1,4 @@
-"""Where a model was fitted (the box of states, the range of steps), and what steps report of themselves."""
+"""The box of states and the range of steps that a model was fitted in, and the outputs of a step in a file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from herglotz.stepping import Status
 
 
 class Box:
-    """Where the model was fitted; angles count modulo 2π. `h_range` is (low, high), or None for any step."""
+    """The box of states that the model was fitted in; angles count modulo 2π.
+
+    `h_range` is (low, high), or None for any step. The action s grows without bound; `by_s` is true where the motion
+    depends on s, and only then s counts.
+    """
 
     def __init__(
         self,
@@ -23,7 +27,7 @@ class Box:
         angles: Sequence[bool],
         dtype: torch.dtype,
         h_range: Sequence[float] | None = None,
-        by_s: bool = True,  # whether s counts: it grows without bound, and matters only where the motion depends on it
+        by_s: bool = True,
     ):
         self.by_s = by_s
         names = "qps" if by_s else "qp"
@@ -33,27 +37,28 @@ class Box:
         )
         turn = torch.zeros_like(low)
         turn[: len(angles)] = torch.tensor([2 * math.pi * bool(a) for a in angles], dtype=torch.float64)
-        inverse = torch.where(turn > 0, 1 / turn, 0.0)  # 1/2π for an angle, else 0
-        self.low, self.high, self.turn, self.inverse = (x.to(dtype) for x in (low, high, turn, inverse))
+        turns_per_radian = torch.where(turn > 0, 1 / turn, 0.0)
+        values = low, high, turn, turns_per_radian
+        self.low, self.high, self.turn, self.turns_per_radian = (x.to(dtype) for x in values)
         self.span = None if h_range is None else torch.tensor(h_range, dtype=dtype)
 
     @classmethod
     def of(
         cls, box: Mapping[str, Sequence[float]] | None, model: ContactLagrangian, h_range: Sequence[float] | None = None
     ) -> Box | None:
-        """The box of a model, if there is one."""
+        """The box of a model; None where no box is recorded."""
         if box is None:
             return None
         return cls(box, model.config.angles, next(model.parameters()).dtype, h_range, model.s_enters_motion)
 
     def __call__(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        """(...) True where a state lies outside, or is not a number."""
+        """(...) True where a state lies outside the box or has a NaN."""
         x = torch.cat([q, p, s[..., None]] if self.by_s else [q, p], -1)
-        x = x - self.turn * torch.round((x - (self.low + self.high) / 2) * self.inverse)
+        x = x - self.turn * torch.round((x - (self.low + self.high) / 2) * self.turns_per_radian)
         return ~((x >= self.low) & (x <= self.high)).all(-1)
 
     def flags(self, h: Tensor, before: tuple[Tensor, ...], after: tuple[Tensor, ...]) -> Tensor:
-        """(...) uint8: 1 where a step starts or ends outside, plus 2 where h is beyond its range."""
+        """(...) uint8: 1 where a step starts or ends outside the box, plus 2 where h is outside `h_range`."""
         flags = (self(*before) | self(*after)).to(torch.uint8)
         if self.span is None:
             return flags
@@ -61,21 +66,21 @@ class Box:
 
 
 def s_matters(metadata: Mapping[str, Any]) -> bool:
-    """Whether the motion of a file's model depends on s, by its level."""
+    """Whether the motion of a file's model depends on s; the model's level decides."""
     return metadata.get("level") in ("affine", "full")
 
 
 def report(box: Box | None, h: Tensor, *x: Tensor) -> tuple[Tensor, ...]:
-    """q1, p1, s1, c, residual, status[, outside]: what a step says of itself, NaN where it failed.
+    """The outputs of a step, q1, p1, s1, c, residual, status[, outside]; the first four are NaN where the step failed.
 
     x is (q, p, s) before and after the step, then c, then the residual and status of steps that iterate.
     """
     before, (q1, p1, s1), (c, *solved) = x[:3], x[3:6], x[6:]
-    residual, said = solved or (0.0 * c, None)
-    sound = torch.isfinite(residual + s1) & torch.isfinite(q1 + p1).all(-1)
-    status = torch.where(sound, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
-    if said is not None:
-        status = torch.where(said != int(Status.CONVERGED), said, status)
+    residual, newton_status = solved or (0.0 * c, None)
+    finite = torch.isfinite(residual + s1) & torch.isfinite(q1 + p1).all(-1)
+    status = torch.where(finite, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
+    if newton_status is not None:
+        status = torch.where(newton_status != int(Status.CONVERGED), newton_status, status)
     status = torch.where(c == 0, int(Status.SINGULAR), status)
     status = torch.where((h > 0) & torch.isfinite(h), status, int(Status.BAD_INPUT)).to(torch.uint8)
     nan = torch.where(status == int(Status.CONVERGED), 0.0, torch.nan).to(q1.dtype)

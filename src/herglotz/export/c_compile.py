@@ -1,4 +1,4 @@
-"""A model compiled and loaded at once: `hz.compile`, the fastest stepper that this machine can offer, and C itself."""
+"""A model compiled as C and loaded: `hz.compile`, with the eager stepper where C is impossible, and `compile_c`."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ import copy
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 from herglotz.codegen.c_compiler import compiler
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_ITERATIONS, c_source, described
+from herglotz.export.c_header import c_source, described
 from herglotz.export.c_stepper import compiled
 from herglotz.export.exported import ExportedStepper
 from herglotz.export.load import load_c
 from herglotz.export.metadata import describe
 from herglotz.export.parameters import Chosen, described_parameters
+from herglotz.export.step import MAX_ITERATIONS
 from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.stepping import Stepper
 
-MODELS = (ContactLagrangian, OwnLagrangian)  # what can be traced
+# The models that can be traced.
+MODELS = (ContactLagrangian, OwnLagrangian)
 
 
 def compile(
@@ -28,8 +30,8 @@ def compile(
 ) -> ExportedStepper | Stepper:
     """A stepper with the interface of `Stepper` that steps in C, without derivatives.
 
-    Compiled once: the library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a
-    model that has no C, the eager stepper comes back, with one warning that says what is missing.
+    The library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a model that has
+    no C, the result is the eager stepper, and a warning says what is missing.
 
     Parameters
     ----------
@@ -41,36 +43,32 @@ def compile(
     Returns
     -------
     ExportedStepper or Stepper
-        The second where C cannot be had.
+        The eager stepper where C is not possible.
 
     Raises
     ------
     InputError
-        If the source is none of these, or a header cannot be compiled: it has no eager stepper to fall back on.
+        If the source is none of these, or a header cannot be compiled: a header has no eager stepper to fall back on.
     """
     if isinstance(source, str | os.PathLike):
         return load_c(source, trust_code=trust_code)
     eager = source if isinstance(source, Stepper) else None
-    described: dict[str, Any] = {}
-    model: Any = source
-    if eager is not None:
-        model = eager.L_d
-    elif not isinstance(source, MODELS):
-        run: Any = source
-        model = getattr(run, "model", None)
-        if isinstance(model, MODELS):
-            described = {"h": run.h, "box": run.box, "units": run.data.units}
+    # A run has its model as an attribute.
+    run: Any = source
+    own = source if isinstance(source, MODELS) else getattr(source, "model", None)
+    model: Any = own if eager is None else eager.L_d
     if not isinstance(model, MODELS):
         if eager is None:
             given = type(source).__name__
             raise InputError(f"compile needs a model, a Stepper, a run or the path of a C header, got {given}")
         return _fall_back(eager, f"{type(model).__name__} is no ContactLagrangian and has no C form")
+    of_run: dict[str, Any] = {} if eager or model is run else {"h": run.h, "box": run.box, "units": run.data.units}
     eager = eager or Stepper(model)
     if eager.throw:
         return _fall_back(eager, "throw=True needs the eager stepper")
     try:
         compiler()
-        return compile_c(model, **described)
+        return compile_c(model, **of_run)
     except InputError as error:
         return _fall_back(eager, str(error))
 
@@ -81,7 +79,7 @@ def _fall_back(eager: Stepper, reason: str) -> Stepper:
 
 
 def compile_c(
-    model: Any,  # ContactLagrangian or OwnLagrangian
+    model: Any,
     *,
     h: float = 1.0,
     box: Mapping[str, Sequence[float]] | None = None,
@@ -90,7 +88,7 @@ def compile_c(
     tolerance: float | None = None,
     parameters: Chosen = (),
 ) -> ExportedStepper:
-    """Compile a model's C and load it; `load_c` does so with a header.
+    """Compile a model's C and load it; `load_c` compiles a header.
 
     The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
     processor. The compiler is $CC, or cc, gcc or clang from the PATH.
@@ -98,9 +96,9 @@ def compile_c(
     Parameters
     ----------
     model
-        Not changed.
+        A ContactLagrangian or OwnLagrangian, not changed.
     h, box, units, dtype, tolerance, parameters
-        As in `export_c`; dtype defaults to the model's. `with_parameters` of the stepper sets the last ones.
+        As in `export_c`; dtype defaults to the model's. `with_parameters` of the stepper sets parameters.
 
     Returns
     -------
@@ -110,16 +108,16 @@ def compile_c(
     Raises
     ------
     InputError
-        If there is no compiler, or an argument is not usable.
+        If no compiler is installed, or an argument is not usable.
     """
     given: object = model
     if not isinstance(given, MODELS):
-        raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
-    model = cast("Any", model)
+        raise InputError(f"compile_c takes a model, got {type(given).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     extra = {"parameters": described_parameters(model, parameters)} if parameters else {}
     entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None, **extra})
     entries = described(model, entries, "model", dtype, tolerance)
-    kept: Any = copy.deepcopy(model)  # the model may be trained on
+    # A copy, because training may change the model before `whole` is called.
+    kept: Any = copy.deepcopy(model)
     header = c_source(kept, entries, "stepper.h", derivatives=False)
     return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

@@ -1,4 +1,4 @@
-"""What a C header may hold beside its steps: files of `export/runtime`, and what in them depends on the model."""
+"""Further functions of a C header: files of `export/runtime`, and their constants that depend on the model."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers
 from herglotz.export.metadata import EXTRAS
 
-FILES = {"adjoint": ("adjoint",), "filter": ("filter", "smoother")}  # of `export/runtime`
+# The files of `export/runtime` of each extra.
+FILES = {"adjoint": ("adjoint",), "filter": ("filter", "smoother")}
 
 
 def check_extras(extras: object, dof: int, most: int) -> None:
-    """Refuse what there is not, and a filter of more coordinates than derivatives are written out for."""
+    """Refuse unknown extras, and a filter of more than `most` coordinates, which have no derivative in C."""
     unknown = [x for x in extras if x not in EXTRAS] if isinstance(extras, list | tuple) else [extras]
     if unknown:
         raise InputError(f"extras may be {', '.join(EXTRAS)}, got {unknown[0]!r}; name them as a list")
@@ -22,7 +23,7 @@ def check_extras(extras: object, dof: int, most: int) -> None:
 
 
 def extras_source(entries: Mapping[str, Any], file: Callable[[str], str]) -> list[str]:
-    """The texts of the extras that a header's metadata names; `file` reads one of the runtime."""
+    """The texts of the extras that a header's metadata names; `file` reads a file of the runtime."""
     found = []
     for name in entries.get("extras", ()):
         found += [file(f"{x}.h") for x in FILES[name]]
@@ -31,7 +32,5 @@ def extras_source(entries: Mapping[str, Any], file: Callable[[str], str]) -> lis
             rows += [noise["theta"]] if entries.get("parameters") else []
             values = ", ".join(f"{{{numbers(row, entries['dtype'])}}}" for row in rows)
             values += f", {number(noise['adaptation'], entries['dtype'])}"
-            found.append(
-                f"/* The noise that the fit found. */\nstatic const hz_noise hz_noise_of_fit = {{{values}}};\n"
-            )
+            found += [f"/* The noise of the fit. */\nstatic const hz_noise hz_noise_of_fit = {{{values}}};\n"]
     return found

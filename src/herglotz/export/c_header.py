@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from herglotz.codegen.c_function import as_scalars
-from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.files import PathLike
 from herglotz.data.holds import Arrival
 from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
@@ -30,16 +30,21 @@ from herglotz.export.lower.c_parameters import (
 )
 from herglotz.export.metadata import check_metadata, describe, from_json
 from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
+from herglotz.export.step import MAX_ITERATIONS, ROUNDING_EPSILONS
 from herglotz.export.step_parts import pushed
-from herglotz.export.trusted import remember
+from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "
-NAME = r"[A-Za-z][A-Za-z0-9_]{0,40}"  # of the prefix
-TOLERANCE = 16  # machine epsilons; the header steps in increments, so this is within reach
-MAX_ITERATIONS = 30  # as of the eager stepper; a step from a good guess takes two to four
-MAX_DERIVATIVES = 8  # coordinates; the elimination of the derivatives is written out and grows with their cube
-MAX_WIDE = 24  # coordinates; with more, registers of n x n matrices outgrow the stack that some threads have
+# The prefix of the names in a header.
+NAME = r"[A-Za-z][A-Za-z0-9_]{0,40}"
+# Newton's default tolerance in machine epsilons of q, which a step in increments reaches.
+TOLERANCE = 16
+# Coordinates: the elimination of a step's derivative is written out, and its length grows with their cube.
+MAX_DERIVATIVES = 8
+# Coordinates: the n x n matrices of more, one number a sample in each register, are larger than the stack of some
+# threads.
+MAX_WIDE = 24
 
 TOP = """\
 /* hz_: the time stepper of a learned contact Lagrangian. C99 (and C++11), <math.h> only, no allocation.
@@ -75,22 +80,22 @@ TOP = """\
 
 #include <math.h>
 
-/* What the model is made of, for the preprocessor. */
+/* Sizes and kinds of the model, for the preprocessor. */
 #define hz_N {n} /* coordinates */
 #define hz_M {m} /* inputs */
-#define hz_INPUTS {inputs} /* numbers that they are to a step: forces, or themselves */
+#define hz_INPUTS {inputs} /* numbers that a step takes of the inputs: generalised forces, or the inputs themselves */
 #define hz_SINGLE {single} /* float, not double */
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
 #define hz_STICKING {sticking} /* dry friction can hold a coordinate still */
 #define hz_BOXED {boxed} /* a box of the fitted data is recorded */
 #define hz_CARRIES_S {carries_s} /* the motion depends on s */
-#define hz_DERIVATIVES {derivatives} /* hz_step_jacobian is there */
-#define hz_WIDE {wide} /* batches go by registers of samples */
+#define hz_DERIVATIVES {derivatives} /* the header has hz_step_jacobian */
+#define hz_WIDE {wide} /* batches are stepped by registers of samples */
 
 typedef {real} hz_real;
 """
 CONSTANTS = """
-/* What the model is. */
+/* The model. */
 static const char hz_weights_sha256[] = {sha};
 static const char hz_level[] = {level};
 static const char hz_dtype[] = {dtype};
@@ -105,7 +110,8 @@ static const hz_real hz_top_speed = {top_speed}; /* the networks' rounding is re
 static const hz_real hz_near = {near}; /* moves below this, relative, keep the last J */
 enum {{ hz_max_iterations = {max_iterations} }};
 {box}{start}"""
-# `step.h` and `run.h` are texts of `REAL` and `FN_`, as the emitted functions are.
+# The files of the runtime in every header; `step.h` and `run.h` are texts of `REAL` and `FN_`, like the emitted
+# functions.
 RUNTIME = ("types.h", "numbers.h", "functions.h", "products.h", "checks.h", "step.h", "run.h", "api.h")
 
 
@@ -133,25 +139,25 @@ def export_c(
     Parameters
     ----------
     model, path, h, box, units, metadata
-        As of `export_pt2`. The name of the file should end in `.h`; states outside the box are flagged in the status,
-        and metadata stand in the comment at the top.
+        As in `export_pt2`. The name of the file should end in `.h`. The status flags states outside the box; the
+        comment at the top has the metadata.
     name
-        Prefix of every name in the file, a C identifier; default that of the file. Headers of different prefixes can
+        Prefix of every name in the file, a C identifier; default: the file's name. Headers of different prefixes can
         be included in one program.
     dtype
         "float64" (C double) or "float32" (C float).
     h_range
-        Smallest and largest step the model was fitted for: steps outside are flagged in the status. Default: that of
+        Smallest and largest step that the model was fitted for: the status flags other steps. Default: `h_range` of
         the metadata, or any h > 0.
     tolerance
-        Of Newton, relative to the size of q: where the model is no more exact than this, fewer iterations serve as
-        well. Default: 16 machine epsilons.
+        Newton's tolerance, relative to the size of q; fewer iterations are enough for a model that is less exact than
+        this. Default: 16 machine epsilons.
     parameters
-        Numbers of the model that are set at run time, in its own units: names as of `numbers_of`, those of several
-        numbers (`friction.viscous`) too, or names with (low, high), None without a bound. Their values in the model are
-        the defaults.
+        Numbers of the model that are set at run time, in the model's own units: names as in `numbers_of`, also those
+        of several numbers (`friction.viscous`), or names with (low, high), None without a bound. Their values in the
+        model are the defaults.
     extras
-        What else the header holds: "adjoint" (`NAME_step_vjp`, `NAME_rollout_vjp`), "filter" (`NAME_filter_…`).
+        Further functions: "adjoint" (`NAME_step_vjp`, `NAME_rollout_vjp`), "filter" (`NAME_filter_…`).
 
     Returns
     -------
@@ -175,22 +181,20 @@ def export_c(
         extra["extras"] = list(extras)
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     check_metadata(entries, path)
-    content = sealed_text(c_source(model, entries, path.name)).encode()
-    write_atomically(path, content)
-    remember(content)
-    return path
+    return write_trusted(path, sealed_text(c_source(model, entries, path.name)).encode())
 
 
 def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, derivatives: bool = True) -> str:
     """The text of the header.
 
-    Without `derivatives` NAME_step_jacobian, NAME_init_qv and NAME_velocity are left out. Beyond 8 coordinates the
-    first one is: it is most of the work.
+    Without `derivatives` NAME_step_jacobian, NAME_init_qv and NAME_velocity are left out: they take most of the time
+    of an export. NAME_step_jacobian is left out beyond 8 coordinates, too.
     """
     velocities, derivatives = derivatives, derivatives and entries["dof"] <= MAX_DERIVATIVES
     chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
     model = with_moved_numbers(model, entries)
-    equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)  # rounded once, when numbers are written
+    # In float64: numbers are rounded once, when they are written.
+    equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)
     step = StepInC(equations)
     inputs, parameters = inputs_constants(model, entries["dtype"]), ""
     if chosen:
@@ -215,18 +219,19 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
         "FILE": re.sub(r"[^A-Za-z0-9_.-]", "_", file),
         "UNITS": ", ".join(map(text_constant, entries["units"] or [""] * entries["dof"])),
     }
-    return re.sub(r"@(\w+)@", lambda m: last.get(m[1], m[0]), text)  # last: a user's text is taken as it is
+    # A user's texts are put in last, so that no replacement above changes them.
+    return re.sub(r"@(\w+)@", lambda m: last.get(m[1], m[0]), text)
 
 
 def runtime(file: str) -> str:
-    """A file of the C runtime, which is package data."""
+    """The text of a file of the C runtime, which is package data."""
     return resources.files("herglotz.export").joinpath("runtime", file).read_text(encoding="utf-8")
 
 
 def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
     """The entries that `export_c` wrote into the comment at the top.
 
-    Raise InputError if there are none, or they cannot be.
+    Raise InputError if the text has no entries, or impossible ones.
     """
     found = re.search(rf"^ *{re.escape(MARK)}(.*)$", text, re.MULTILINE)
     entries = from_json(found and found[1], path)
@@ -238,7 +243,7 @@ def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
 def described(
     model: ContactLagrangian, entries: dict[str, Any], name: str, dtype: str, tolerance: float | None
 ) -> dict[str, Any]:
-    """The checked entries of the comment at the top: those of any file, and those of C."""
+    """The entries of any file with the checked entries of C: name, dtype and newton_tolerance."""
     if not re.fullmatch(NAME, name):
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
@@ -260,12 +265,12 @@ def identifier(stem: str) -> str:
 
 
 def _time_unit(entries: Mapping[str, Any]) -> str:
-    """That of h, without what would end the comment."""
+    """The unit of h, without asterisks, which could end the comment."""
     return entries.get("time_unit", "s").replace("*", "")
 
 
 def _arrival(entries: Mapping[str, Any]) -> str:
-    """What to do with recorded inputs before a step takes them; nothing where they act at once."""
+    """How recorded inputs are delayed or filtered before a step takes them; empty where they act at once."""
     delay, lag = Arrival(**entries.get("arrival", {})).late
     if not delay and not lag:
         return ""
@@ -276,7 +281,7 @@ def _arrival(entries: Mapping[str, Any]) -> str:
 
 
 def _top(model: ContactLagrangian, entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
-    """The comment, the guard, and what the preprocessor decides by."""
+    """The comment at the top, the include guard, and sizes and kinds for the preprocessor."""
     inputs = entries["inputs"]
     return TOP.format(
         version=entries["herglotz_version"],
@@ -301,7 +306,7 @@ def _top(model: ContactLagrangian, entries: Mapping[str, Any], step: StepInC, de
 
 
 def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
-    """What the model is, as constants."""
+    """The constants of the model: digest, units, steps, tolerances, box and start."""
     dtype = entries["dtype"]
     info = torch.finfo(getattr(torch, dtype))
     span = entries["h_range"] or (0.0, info.max)
@@ -317,7 +322,7 @@ def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
         h_low=number(span[0], dtype),
         h_high=number(span[-1], dtype),
         tolerance=number(entries["newton_tolerance"], dtype),
-        floor=number(1000 * info.eps, dtype),
+        floor=number(ROUNDING_EPSILONS * info.eps, dtype),
         top_speed=number(max(model.config.speed), dtype),
         near=number(0.01, dtype),
         max_iterations=MAX_ITERATIONS,
@@ -335,7 +340,7 @@ def _box_constants(box: Mapping[str, list[float]] | None, dtype: str) -> str:
 
 
 def _start_constant(entries: Mapping[str, Any], dtype: str) -> str:
-    """A state to start from: that of the metadata, or rest at zero."""
+    """A state to start from: the start of the metadata, or rest at zero."""
     start, n = entries.get("start"), entries["dof"]
     q, p, s = (start[key] for key in "qps") if start else ([0.0] * n, [0.0] * n, 0.0)
     where = "where the fitted samples end" if start else "at rest, as no recording was given"

@@ -11,7 +11,7 @@ CONSTANT = re.compile(r"\bR\(([^()]*)\)")
 
 
 def number(value: float, dtype: str) -> str:
-    """One number as a C constant that reads back exactly."""
+    """One number as a C constant that a compiler reads back exactly."""
     if dtype == "float64":
         return _decimal(repr(float(value)))
     return _decimal(f"{float(np.float32(value)):.9g}") + "f"
@@ -25,7 +25,7 @@ def numbers(values: Iterable[float], dtype: str) -> str:
 
 
 def written(text: str, dtype: str) -> str:
-    """The text with every constant `R(0.5)` of the emitted functions written in the number type."""
+    """The text with the constants of emitted functions, such as `R(0.5)`, written in the number type."""
     return CONSTANT.sub(lambda m: number(float(m[1]), dtype), text)
 
 

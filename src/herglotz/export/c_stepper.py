@@ -1,4 +1,4 @@
-"""A generated header, compiled and loaded: the interface of `herglotz.stepping.Stepper` at the speed of C."""
+"""A generated header, compiled and loaded, with the interface of `herglotz.stepping.Stepper`."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from herglotz.stepping.rollout import Track
 
 
 def library_of(metadata: Mapping[str, Any]) -> str:
-    """The loops around a header with this metadata."""
+    """The C source of the loops over samples around a header with this metadata."""
     text = runtime("library.c")
     text = text if metadata.get("parameters") else without_parameters(text)
     return re.sub(r"\bhz_", f"{metadata['name']}_", text)
 
 
 class CLibrary:
-    """The compiled functions of a generated header, sample by sample on one thread, as functions of tensors.
+    """The compiled functions of a generated header as functions of tensors, on one thread.
 
     `path` is named in messages; `whole` gives the header with derivatives, where this one has none. Raise InputError if
     the text is not such a header, or no C compiler is there to compile it.
@@ -50,7 +50,7 @@ class CLibrary:
         )
 
     def with_values(self, values: Mapping[str, float]) -> CLibrary:
-        """The same with other values of the numbers that are set at run time; those not named have their defaults."""
+        """The library with these values of numbers that are set at run time; numbers not named have their defaults."""
         other = copy.copy(self)
         other.theta = torch.tensor(checked_values(self.parameters, values), dtype=self.dtype)
         return other
@@ -60,19 +60,19 @@ class CLibrary:
         return (self.theta,) if self.parameters else ()
 
     def init(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """(p1, s1) at q1; NaN where there is none."""
+        """(p1, s1) at q1; NaN where the step from q0 to q1 has none."""
         p, s, status = self._empty(len(s0), self.dof), self._empty(len(s0)), self._failed(len(s0))
         self.library.herglotz_inits(*_arguments(len(s0), q0, q1, s0, h, u, *self._theta, p, s, status))
         return p, s
 
     def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """The momenta p of velocities, NaN where there is none, and statuses."""
+        """The momenta p of velocities, NaN where a velocity has no momentum, and statuses."""
         p, status = self._empty(len(s), self.dof), self._failed(len(s))
         self.differentiates().herglotz_momenta(*_arguments(len(s), q, v, s, h, *self._theta, p, status))
         return p, status
 
     def velocity(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """The velocities v of momenta, NaN where there is none, and statuses."""
+        """The velocities v of momenta, NaN where a momentum has no velocity, and statuses."""
         v, status = self._empty(len(s), self.dof), self._failed(len(s))
         self.differentiates().herglotz_velocities(*_arguments(len(s), q, p, s, h, *self._theta, v, status))
         return v, status
@@ -101,7 +101,7 @@ class CLibrary:
     def prepared(
         self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None
     ) -> tuple[Callable[[], None], tuple[Tensor, ...]]:
-        """The same call with its arguments made beforehand, and the tensors that it writes."""
+        """A call of the rollout with its arguments already converted, and the tensors that the call writes."""
         (count, steps), n = h.shape, self.dof
         u = u if u is None or u[0].is_contiguous() else u.contiguous()
         outputs = (
@@ -112,19 +112,20 @@ class CLibrary:
         keep = (*(x.contiguous() for x in (q, p, s)), h, *h.stride(), u, u_stride, *self._theta, *outputs)
         arguments = _arguments(count, steps, *keep)
         function = self.library.herglotz_rollouts
-        return lambda keep=keep: function(*arguments), outputs  # noqa: ARG005  the tensors live as long as the call
+        # `keep` keeps the tensors alive as long as the call.
+        return lambda keep=keep: function(*arguments), outputs  # noqa: ARG005
 
     def holds(
         self, states: Tensor, h: Tensor, u: Tensor, steps: int, low: Tensor, high: Tensor, out: tuple[Tensor, Tensor]
     ) -> Callable[[], None]:
-        """The call that steps `states` in place, each under its input, and observes them (`herglotz_holds`).
+        """The call that steps `states` in place, each under its input, and observes the states (`herglotz_holds`).
 
-        States are rows (q, p, s, σ), (B, 2n+2); u is (B, m). `out` is what it writes: (q, v), (B, 2n), with q between
-        low and high (n,), and statuses (B,) int32 with their flags.
+        States are rows (q, p, s, σ), (B, 2n+2); u is (B, m). The call writes `out`: (q, v), (B, 2n), with q between low
+        and high (n,), and statuses (B,) int32 with their flags.
         """
         keep = (states, h, u, *self._theta, low, high, *out)
         arguments, function = _arguments(len(states), steps, *keep), self.differentiates().herglotz_holds
-        return lambda keep=keep: function(*arguments)  # noqa: ARG005  the tensors live as long as the call
+        return lambda keep=keep: function(*arguments)  # noqa: ARG005
 
     def _empty(self, *shape: int) -> Tensor:
         return torch.full(shape, torch.nan, dtype=self.dtype)
@@ -134,14 +135,14 @@ class CLibrary:
 
 
 def _arguments(*values: Tensor | int | None) -> list[Any]:
-    """Numbers and addresses as C takes them."""
+    """Numbers and addresses of tensors as arguments of a C function."""
     return [
         ctypes.c_long(x) if isinstance(x, int) else ctypes.c_void_p(None if x is None else x.data_ptr()) for x in values
     ]
 
 
 def compiled(header: str, path: PathLike = "header", whole: Callable[[], str] | None = None) -> ExportedStepper:
-    """The stepper of a header; arguments and errors as of `CLibrary`."""
+    """The stepper of a header; arguments and errors are those of `CLibrary`."""
     return stepper_of(CLibrary(header, path, whole), str(path), whole is not None or "_VELOCITIES" in header)
 
 

@@ -1,4 +1,4 @@
-"""The C header as a source file that CasADi or acados takes: the header, and their interface around its step."""
+"""A C source file for CasADi or acados: the header, and the functions that CasADi or acados calls."""
 
 from __future__ import annotations
 
@@ -7,29 +7,31 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.files import PathLike
 from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, runtime
-from herglotz.export.trusted import remember
+from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
-INNER = "_c"  # what the prefix of the header ends in: its NAME_step is another function than CasADi's
+# The suffix of the header's own prefix: the header has a NAME_step, and CasADi calls another NAME_step.
+INNER = "_c"
 
 
 def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None = None, **settings: Any) -> Path:
     """Write the step as one C file that `casadi.external` loads once it is compiled.
 
-    The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`; NAME_hold, the
-    same over a time h of as few equal steps as are no longer than the typical one; NAME_shoot, that of all intervals
-    of a horizon at once, where it is compiled with -DNAME_HORIZON=COUNT; and up to 8 coordinates their Jacobians.
-    Without inputs there is no u. A step that does not exist is an error of CasADi. docs/control.md has an example.
+    The file has x₁ = NAME_step(x, u, h), x = (q, p, s) of 2n + 1 numbers, in the units of `export_c`; NAME_hold, a time
+    h of the fewest equal steps that are no longer than the typical one; NAME_shoot, NAME_hold of all intervals of a
+    horizon in one call, where the file is compiled with -DNAME_HORIZON=COUNT; and up to 8 coordinates their Jacobians.
+    Without inputs no function has the argument u. A step without a solution is an error of CasADi. docs/control.md has
+    an example.
 
     Parameters
     ----------
     model, path, name, settings
-        As of `export_c`, without parameters and extras; the name of the file should end in `.c`. What is returned and
-        raised is as there.
+        As in `export_c`, without parameters and extras; the name of the file should end in `.c`. Results and errors
+        are those of `export_c`.
     """
     one, held = "1.0", "hz_steps_of(h, (double)hz_h)"
     step, hold, shoot = (
@@ -49,12 +51,12 @@ def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None 
     Parameters
     ----------
     model, path, name, settings
-        As of `export_casadi`; h is the shooting interval.
+        As in `export_casadi`; h is the shooting interval.
 
     Raises
     ------
     InputError
-        As `export_c`, and if the model has more than 8 coordinates: acados needs the Jacobian.
+        As in `export_c`, and if the model has more than 8 coordinates: acados needs the Jacobian.
     """
     if (n := model.config.dof) > MAX_DERIVATIVES:
         raise InputError(
@@ -70,7 +72,7 @@ def header_of(model: ContactLagrangian, name: str, settings: dict[str, Any]) -> 
 
 
 def prefix(path: Path, name: str | None) -> str:
-    """The name that was given, or that of the file; raise InputError if it is no C identifier."""
+    """The given name, or the file's; raise InputError if the given name is no C identifier."""
     longest = 41 - len(INNER)
     name = identifier(path.stem)[:longest] if name is None else name
     if not re.fullmatch(NAME, name) or len(name) > longest:
@@ -83,7 +85,4 @@ def _wrapped(model: ContactLagrangian, path: Path, name: str | None, text: str, 
     inner = name + INNER
     around = (runtime("unread.h") + text).replace("NAME_", f"{name}_")
     around = re.sub(r"\bhz_", f"{inner}_", around)
-    content = sealed_text(header_of(model, inner, settings) + around).encode()
-    write_atomically(path, content)
-    remember(content)
-    return path
+    return write_trusted(path, sealed_text(header_of(model, inner, settings) + around).encode())

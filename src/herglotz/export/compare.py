@@ -1,4 +1,4 @@
-"""An exported stepper held against the eager one over many fed-back steps."""
+"""The difference between an exported stepper and the eager one over rollouts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from herglotz.errors import InputError
 from herglotz.export.metadata import weights_digest
 from herglotz.stepping import Rollout, State, Stepper, state_of
 
-DISTINCT = 64  # starts that the eager stepper is run on; a larger batch of the file holds each of them many times
+# Starts that the eager stepper is run from; a larger batch of the file repeats them.
+MAX_STARTS = 64
 
 
 def compare(
@@ -27,8 +28,8 @@ def compare(
 ) -> dict[str, Any]:
     """Largest difference between two rollouts from the same starts, relative to the largest eager value.
 
-    Each rollout feeds its own states back, so that a difference grows as it would in use. A model with inputs is driven
-    by uniform random ones in [−1, 1].
+    Each rollout goes on from its own states, so that differences grow as in use. The inputs of a model with inputs are
+    uniform random numbers in [−1, 1].
 
     Parameters
     ----------
@@ -37,20 +38,20 @@ def compare(
     stepper
         The eager stepper of the same model, in the same dtype.
     batches
-        Batch sizes; 1 and a prime number find specialised graphs. In a batch of more than 64, starts repeat in an
-        order of their own: every sample of the file is held against the eager rollout of its start.
+        Batch sizes; 1 and a prime number find specialised graphs. A batch of more than 64 repeats starts in a random
+        order: every sample of the file is compared with the eager rollout of its start.
     steps, h
         Length and step of the rollouts; h defaults to the file's own.
     states
-        Where starts are drawn from; default the file's box, or the unit cube where it records none.
+        States to draw the starts from; default: uniform in the file's box, or in [−1, 1] where the file has no box.
     seed
-        Of the draw.
+        Seed of the draw.
 
     Returns
     -------
     dict
         `q`, `p`, `s`, `c` (largest over batches), `status` (samples whose statuses differ), `failed` (samples with a
-        failed step), `same_weights` (None where the stepper holds no model), `per_batch` {B: {...}}.
+        failed step), `same_weights` (None where the stepper's L_d is no module), `per_batch` {B: {...}}.
     """
     if not batches or min(batches) < 1:
         raise InputError(f"batches must be sizes >= 1, got {list(batches)}")
@@ -59,7 +60,7 @@ def compare(
     inputs = getattr(stepper.L_d, "inputs", 0)
     per_batch = {}
     for size in batches:
-        few = min(size, DISTINCT)
+        few = min(size, MAX_STARTS)
         start = draw(exported, few, make) if states is None else _pick(states, few, make)
         order = torch.arange(few)
         if size > few:
@@ -72,8 +73,8 @@ def compare(
             ours = exported.rollout(*(x[order] for x in start), h=size_of_step, steps=steps, inputs=mine)
             eager = stepper.rollout(*start, h=size_of_step, steps=steps, inputs=u)
         per_batch[int(size)] = _difference(ours, eager, order)
-    worst: dict[str, Any] = {key: max(one[key] for one in per_batch.values()) for key in ("q", "p", "s", "c")}
-    totals = {key: sum(one[key] for one in per_batch.values()) for key in ("status", "failed")}
+    worst: dict[str, Any] = {key: max(x[key] for x in per_batch.values()) for key in ("q", "p", "s", "c")}
+    totals = {key: sum(x[key] for x in per_batch.values()) for key in ("status", "failed")}
     same = None
     if isinstance(stepper.L_d, torch.nn.Module):
         same = weights_digest(stepper.L_d) == exported.metadata.get("weights_sha256")
@@ -81,7 +82,7 @@ def compare(
 
 
 def draw(exported: Any, size: int, generator: torch.Generator) -> State:
-    """States drawn uniformly from the file's box, or from [−1, 1] where it records none."""
+    """States drawn uniformly from the file's box, or from [−1, 1] where the file has no box."""
     box = exported.metadata["box"]
     unit = torch.rand(size, 2 * exported.dof + 1, generator=generator, dtype=torch.float64)
     low, high = -torch.ones_like(unit[0]), torch.ones_like(unit[0])
@@ -97,7 +98,7 @@ def _pick(states: State, size: int, generator: torch.Generator) -> State:
 
 
 def _difference(ours: Rollout, eager: Rollout, order: Tensor) -> dict[str, Any]:
-    """Sample i of ours is held against sample order[i] of the eager rollout."""
+    """The differences between sample i of ours and sample order[i] of the eager rollout."""
     eager = Rollout(*(getattr(eager, name)[order] for name in ("q", "p", "s", "sigma", "status", "residual")))
     failed = (~ours.ok) | (~eager.ok)
     keep = ~failed
@@ -114,7 +115,7 @@ def _difference(ours: Rollout, eager: Rollout, order: Tensor) -> dict[str, Any]:
 
 
 def _relative(a: Tensor, b: Tensor) -> float:
-    """Largest |a − b| over the largest |b|; NaN where nothing is left to compare."""
+    """Largest |a − b| over the largest |b|; NaN for empty tensors."""
     if not a.numel():
         return float("nan")
     return float((a - b).abs().max() / b.abs().max().clamp_min(torch.finfo(b.dtype).tiny))

@@ -1,4 +1,4 @@
-"""Derivatives of a step map that autograd cannot enter (ONNX, machine code, C): its file's own, or differences."""
+"""Derivatives of step maps that autograd cannot enter (ONNX, machine code, C), from the file or by differences."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from herglotz.stepping import State, Step, state_of
 
 # Central differences of order 8 at offsets 1 … 4.
 WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
-# Offset relative to 1 + |x_i|: truncation ~ offset⁸ and rounding ~ eps/offset are of one size near eps^{1/9}.
+# Offset relative to 1 + |x_i|: truncation ~ offset⁸ and rounding ~ eps/offset are equal near offset = eps^{1/9}.
 OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
 
 
 class LinearisedStepper:
-    """A stepper whose `step` gives autograd the derivative that a file holds (`ExportedStepper.linearise`).
+    """A stepper whose `step` gives autograd the derivative of `linearise` (`ExportedStepper.linearise`).
 
     For verification only.
 
@@ -36,10 +36,10 @@ class LinearisedStepper:
 
 
 class DifferencedStepper:
-    """A stepper whose `step` gives autograd a derivative, measured on the map itself by 8 (2n + 1) further steps.
+    """A stepper whose `step` gives autograd a derivative by central differences, 8 (2n + 1) further steps.
 
-    For verification only. The error is about 1e-12 relative in float64 where the map is smooth over 4 % of its
-    arguments; in float32 about 1e-4.
+    For verification only. The relative error is about 1e-12 in float64 where the map is smooth over 4 % of its
+    arguments, and about 1e-4 in float32.
 
     Parameters
     ----------
@@ -67,13 +67,14 @@ def stepped(step: Callable[[State, float], Step], x: Tensor, h: float) -> Tensor
 
 
 def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor, sticks: bool = False) -> Tensor:
-    """The derivative (..., m, m) of f: (N, m) → (N, m) at x (..., m); in one batch; x_j moves by 1 … 4 offsets.
+    """The derivative (..., m, m) of f: (N, m) → (N, m) at x (..., m); x_j moves by 1 … 4 offsets, all in one batch.
 
     A map with set-valued dry friction (`sticks`) is smooth where no coordinate changes between sliding forward, sliding
-    back and standing still. Elsewhere it has no derivative: NaN where the points around x differ in that.
+    back and standing still. The result is NaN where the points around x differ in this.
     """
     move = torch.stack([torch.diag_embed(k * offset.expand_as(x)) for k in range(1, len(WEIGHTS) + 1)])
-    points = torch.stack([x[..., None, :] + move, x[..., None, :] - move])  # row j moves x_j
+    # Row j moves x_j.
+    points = torch.stack([x[..., None, :] + move, x[..., None, :] - move])
     ends = f(points.reshape(-1, x.shape[-1])).reshape(points.shape)
     columns = torch.stack([w * change for w, change in zip(WEIGHTS, ends[0] - ends[1], strict=True)]).sum(0)
     slopes = (columns / offset[..., None]).mT
@@ -85,7 +86,7 @@ def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor
 
 
 def directions(x: Tensor, y: Tensor) -> Tensor:
-    """Where each coordinate goes in a step from x to y, (..., 2n+1) each: 1, −1 or, where it stands still, 0."""
+    """The sign of each coordinate's move in a step from x to y, (..., 2n+1) each; 0 where it stands still."""
     n = x.shape[-1] // 2
     return (y - x)[..., :n].sign()
 

@@ -1,4 +1,9 @@
-"""The step equation of a model as plain functions of tensors, for tracing: nothing in them differentiates."""
+"""The step equation of a model as traced functions of tensors, and its derivatives by the implicit-function theorem.
+
+The arguments of a step equation are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the
+model has known terms, then u (B, m) where the model takes inputs. p1 and s1 come without the share of the potential at
+q1, which the caller adds.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +29,6 @@ from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip
 from herglotz.stepping.velocity import legendre
 
-# Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
-# u (B, m) where it takes inputs. What a step gains is told without the potential at q1, which the caller adds.
-
 
 class Terms:
     """The step equation at (q0, p0, s0, h): by terms where `model_equation` knows the model, else by jets."""
@@ -46,20 +48,20 @@ class Terms:
         return self.equation(x, second)
 
     def gained(self, x: Tensor, point: Point) -> End:
-        """p1, L and c at Δ = x, without what the potential at q1 adds to them; `point` may be beside it by very little.
+        """p1, L and c at Δ = x, without the share of the potential at q1.
 
-        The kinetic term, which changes fastest, is taken at x.
+        `point` may be the equation at a Δ very near to x; the kinetic term, which changes fastest, is evaluated at x.
         """
         form = self.equation
         return form.end(x, point) if isinstance(form, PartialsEquation) else form.end_without_field(form.at(x, point))
 
 
-def step_equation(model: ContactLagrangian, held: int, *x: Tensor) -> tuple[Tensor, ...]:
-    """A Newton step from a trial Δ, and what the step gains there: −J⁻¹F, |J⁻¹cp0|, |F|, p1, L, c, J.
+def step_equation(model: ContactLagrangian, bounds: int, *x: Tensor) -> tuple[Tensor, ...]:
+    """A Newton step from a trial Δ and the end of the step there: −J⁻¹F, |J⁻¹cp0|, |F|, p1, L, c, J.
 
-    Where the arguments end with K and w/K (`held` is 2), Δ is the z of `herglotz.stepping.stick_slip`.
+    Where the arguments end with K and w/K (`bounds` is 2), Δ is the z of `herglotz.stepping.stick_slip`.
     """
-    (q, p, s, h, delta), more, sticking = x[:5], x[5 : len(x) - held], x[len(x) - held :]
+    (q, p, s, h, delta), more, sticking = x[:5], x[5 : len(x) - bounds], x[len(x) - bounds :]
     form = terms = Terms(model, State(q, p, s), h, more)
     if sticking:
         assert isinstance(terms.equation, PartialsEquation)
@@ -72,7 +74,7 @@ def step_equation(model: ContactLagrangian, held: int, *x: Tensor) -> tuple[Tens
 
 
 def first_order(model: ContactLagrangian, *x: Tensor) -> tuple[Tensor, ...]:
-    """F, p1 (B, n), L, c (B,) of the same equation, with first derivatives only."""
+    """F, p1 (B, n), L, c (B,) of the step equation, from first derivatives of L_d alone."""
     (q, p, s, h, delta), more = x[:5], x[5:]
     terms = Terms(model, State(q, p, s), h, more)
     point = terms(delta, False)
@@ -81,9 +83,10 @@ def first_order(model: ContactLagrangian, *x: Tensor) -> tuple[Tensor, ...]:
 
 @dataclass(frozen=True)
 class Equations:
-    """A model's equations, each traced once however many programs hold it.
+    """A model's equations, each traced once for all programs.
 
-    `numbers` of the model, with their values, are the last argument θ (K,) of each: those that are set at run time.
+    `numbers` are the model's numbers that are set at run time, with their values: the last argument θ (K,) of each
+    equation.
     """
 
     model: ContactLagrangian
@@ -91,21 +94,21 @@ class Equations:
 
     @classmethod
     def of(cls, model: ContactLagrangian, numbers: Mapping[str, float] | None = None) -> Equations:
-        """Those of a copy of the model, which no export can change or train."""
+        """The equations of a copy of the model, which no export can change or train."""
         return cls(copy.deepcopy(model).eval().requires_grad_(False), numbers)
 
     @property
     def theta(self) -> tuple[Tensor, ...]:
-        """The values of `numbers`, (K,), where there are some."""
+        """(θ,) with the values of `numbers`, (K,); empty without numbers."""
         like = next(self.model.parameters())
         return (like.new_tensor([*self.numbers.values()]),) if self.numbers else ()
 
     def of_numbers(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """A function of the model as one of θ too, its last argument, where there are some."""
+        """A function of the model with the last argument θ; unchanged without numbers."""
         return WithNumbers(self.model, function, [*self.numbers]).at if self.numbers else function
 
     def traced(self, function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph:
-        """Such a function as a graph."""
+        """The graph of `of_numbers(function)` at these arguments and θ."""
         return traced(self.of_numbers(function), (*arguments, *self.theta))
 
     @cached_property
@@ -116,17 +119,17 @@ class Equations:
 
     @property
     def field(self) -> Graph | None:
-        """The potential, where steps hand it on."""
+        """The potential, where a step hands its value at q1 on to the next step; else None."""
         return self.potential if self.model.capabilities.by_terms else None
 
     @cached_property
     def slopes(self) -> Graph:
-        """`step_equation`."""
+        """`step_equation` as a graph."""
         return self._traced(partial(step_equation, self.model, 0))
 
     @cached_property
     def first_order(self) -> Graph:
-        """`first_order`."""
+        """`first_order` as a graph."""
         return self._traced(partial(first_order, self.model))
 
     @cached_property
@@ -136,21 +139,24 @@ class Equations:
         functions = self.of_numbers(step_functions(self.model))
 
         def slopes(q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> Tensor:
-            u, theta = more[0] if self.model.inputs else None, more[-1] if self.numbers else None
+            u, theta = self._u_and_theta(more)
             return dense(step_jacobian(functions, State(q, p, s), h, delta, u, theta=theta))
 
         return traced(slopes, (q, p, s, h, 0.1 * p, *u, *self.theta))
 
     @cached_property
     def pull(self) -> Graph:
-        """`step_pull` of a solved step at Δ, side by side: (2n+2+m+K,) of the derivatives (B, 2n+1) by what follows."""
+        """`step_pull` of a solved step at Δ: from derivatives (B, 2n+1) by the state after the step, those before it.
+
+        The result is by (q, p, s, h, u), (B, 2n+2+m), and with `numbers` by θ, (B, K).
+        """
         q, p, s, h, *u = example(self.model, 0.1)
         functions = self.of_numbers(step_functions(self.model))
 
         def pull(
             q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, after: Tensor, *more: Tensor
         ) -> tuple[Tensor, ...]:
-            u, theta = more[0] if self.model.inputs else None, more[-1] if self.numbers else None
+            u, theta = self._u_and_theta(more)
             rows, by_theta = step_pull(functions, State(q, p, s), h, delta, u, after, theta)
             return (dense(rows),) if by_theta is None else (dense(rows), dense(by_theta))
 
@@ -159,13 +165,17 @@ class Equations:
 
     @cached_property
     def momentum(self) -> Graph:
-        """`herglotz.stepping.velocity.legendre` at (q, v, s, h): L_v, L_vv and what set-valued friction adds."""
+        """`herglotz.stepping.velocity.legendre` at (q, v, s, h): L_v, L_vv and the terms of set-valued friction."""
         q, v, s, h, *_ = example(self.model, 0.1)
 
-        def found(*x: Tensor) -> tuple[Tensor, ...]:
+        def transform(*x: Tensor) -> tuple[Tensor, ...]:
             return tuple(dense(y) for y in legendre(self.model, *x) if y is not None)
 
-        return self.traced(found, (q, v, s, h))
+        return self.traced(transform, (q, v, s, h))
+
+    def _u_and_theta(self, more: tuple[Tensor, ...]) -> tuple[Tensor | None, Tensor | None]:
+        """The inputs and θ among the last arguments of a function."""
+        return more[0] if self.model.inputs else None, more[-1] if self.numbers else None
 
     def _traced(self, function: Callable[..., Any]) -> Graph:
         q, p, s, h, *u = example(self.model, 0.1)
@@ -174,7 +184,7 @@ class Equations:
 
 
 def field_like(q: Tensor) -> tuple[Tensor, Tensor]:
-    """Stand-ins for V and V′ at q."""
+    """Example values of V (B,) and V′ (B, n) at q, to trace with."""
     return 0.3 * q.sum(-1), 0.3 * q
 
 
@@ -189,12 +199,12 @@ def length(x: Tensor) -> Tensor:
 
 
 def dense(x: Tensor) -> Tensor:
-    """A copy in standard layout: `.contiguous()` does nothing at B = 1, and loops compare strides."""
+    """A copy in standard layout: `.contiguous()` keeps the strides at B = 1, and loops compare strides."""
     return x.clone(memory_format=torch.contiguous_format)
 
 
 def example(model: ContactLagrangian, h: float) -> tuple[Tensor, ...]:
-    """q, p (B, n), s, h (B,) and, where the model takes some, u (B, m) to trace with: every tensor its own."""
+    """q, p (B, n), s, h (B,) and, where the model takes inputs, u (B, m) to trace with; no two share memory."""
     parameter = next(model.parameters())
     batch = example_batch({size for x in model.parameters() for size in x.shape})
     make = torch.Generator().manual_seed(0)

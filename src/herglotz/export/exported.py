@@ -1,4 +1,4 @@
-"""Exported files as steppers with the interface of `herglotz.stepping.Stepper`, whatever their format."""
+"""Exported files of any format as steppers with the interface of `herglotz.stepping.Stepper`."""
 
 from __future__ import annotations
 
@@ -25,22 +25,33 @@ FILES = {"pt2": "a .pt2", "aoti": "an AOTInductor", "onnx": "an ONNX", "c": "a C
 
 
 class ExportedStepper(OneStepMethod):
-    """The flow Φ̃ of an exported model; results are those of `Stepper`. `load_exported` makes it of a file.
+    """The flow Φ̃ of an exported model, with the results of `Stepper`; `load_exported` reads a file.
 
-    The programs are what the file can run, each a function of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) →
-    K steps, and where the format has them `model`, one differentiable step, `linearise`, `init`, and `legendre` (or
-    `momentum` and `velocity`). A format without the program `rollout` gives the loop of K steps instead, which needs no
-    inputs where none act.
+    Parameters
+    ----------
+    programs
+        Functions of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) → K steps, and where the format has them
+        `model`, one differentiable step, `linearise`, `init`, and `legendre` (or `momentum` and `velocity`).
+    metadata
+        The file's own: model, dof, dtype, h, units, angles, box, versions, weights_sha256.
+    path
+        Where the file was read from, for messages.
+    kind
+        "pt2", "aoti", "onnx" or "c".
+    loop
+        The loop of K steps of a format without the program `rollout`; it needs no inputs where none act.
+    again
+        Makes the stepper of other values of the numbers that are set at run time.
     """
 
     def __init__(
         self,
         programs: Mapping[str, Program],
-        metadata: dict[str, Any],  # the file's own: model, dof, dtype, h, units, angles, box, versions, weights_sha256
-        path: str = "exported model",  # where it came from, for messages
-        kind: str = "pt2",  # or "aoti", "onnx", "c"
+        metadata: dict[str, Any],
+        path: str = "exported model",
+        kind: str = "pt2",
         loop: Loop | None = None,
-        again: Callable[[Mapping[str, float]], ExportedStepper] | None = None,  # with other parameters
+        again: Callable[[Mapping[str, float]], ExportedStepper] | None = None,
     ):
         self._again = again
         self.programs = dict(programs)
@@ -51,9 +62,11 @@ class ExportedStepper(OneStepMethod):
         self.inputs: int = metadata.get("inputs", 0)
         self.dtype: torch.dtype = getattr(torch, metadata["dtype"])
         self.h: float = metadata["h"]
-        self._like = torch.empty((), dtype=self.dtype)  # for what comes as a number
+        # An example of the dtype, for a step given as a Python number.
+        self._like = torch.empty((), dtype=self.dtype)
         self.loop = scanned(self.programs["rollout"]) if loop is None else loop
-        self._idle: Tensor | None = None  # the inputs that do not act, for programs that want some
+        # The inputs at which no force acts, for programs that need inputs.
+        self._idle: Tensor | None = None
         if loop is None and self.inputs:
             self._idle = torch.tensor(metadata.get("input_zero") or [0.0] * self.inputs, dtype=self.dtype)
         box = metadata["box"]
@@ -70,14 +83,14 @@ class ExportedStepper(OneStepMethod):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The defaults of the numbers that are set at run time, by name."""
+        """The default values of the numbers that are set at run time, by name."""
         return {name: value for name, (value, *_) in self.metadata.get("parameters", {}).items()}
 
     def with_parameters(self, values: Mapping[str, float]) -> ExportedStepper:
-        """The stepper with other values of numbers that are set at run time; the others have their defaults.
+        """The stepper with these values of numbers that are set at run time; numbers not named have their defaults.
 
-        `parameters` has the names, in the model's own units. Raise InputError if the file has no such number, or a
-        value is not finite or outside its bounds.
+        `parameters` has the names; values are in the model's own units. Raise InputError if the file has no such
+        number, or a value is not finite or outside its bounds.
         """
         checked_values(self.metadata.get("parameters", {}), values)
         return self if self._again is None else self._again(values)
@@ -87,7 +100,7 @@ class ExportedStepper(OneStepMethod):
     ) -> State:
         """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions h apart; s0 defaults to 0.
 
-        Raise InputError as `step`, and where the format holds no such program.
+        Raise InputError as in `step`, and where the file has no such program.
         """
         if "init" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file starts from (q, p, s) only; use a .pt2 file for init")
@@ -97,9 +110,9 @@ class ExportedStepper(OneStepMethod):
         return check_started(State(q1, p.reshape(q1.shape), s.reshape(s0.shape)))
 
     def init_qv(self, q: Tensor, v: Tensor, s: Tensor | None = None, h: Tensor | float = 1.0) -> State:
-        """The state (q, p, s) of a position and a velocity, as `Stepper.init_qv`.
+        """The state (q, p, s) of a position and a velocity, as in `Stepper.init_qv`.
 
-        Raise InputError as `step`, and where the file holds no velocities.
+        Raise InputError as in `step`, and where the file has no velocities.
         """
         s = torch.zeros_like(q[..., 0]) if s is None else s
         self._check(q, v, s, ("q", "v", "s"), finite=True)
@@ -111,9 +124,9 @@ class ExportedStepper(OneStepMethod):
         return check_started(State(q, p.reshape(q.shape), s))
 
     def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:
-        """The velocity v (..., n) of states, as `Stepper.velocity`, without derivatives.
+        """The velocity v (..., n) of states, as in `Stepper.velocity`, without derivatives.
 
-        Raise InputError as `step`, and where the file holds no velocities; StepError where a state has none.
+        Raise InputError as in `step`, and where the file has no velocities; StepError where a state has no velocity.
         """
         self._check(*state, finite=True)
         with torch.no_grad():
@@ -130,10 +143,10 @@ class ExportedStepper(OneStepMethod):
         return Legendre(*self.programs["legendre"](*map(plain, x)))
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
-        """One step, as `Stepper.step`, in the dtype of the file, which has its own guess; u None: no input acts.
+        """One step, as in `Stepper.step`, in the dtype of the file, which makes its own guess; u None: no input acts.
 
         NaN in the samples whose status is not `Status.CONVERGED`; `iterations` is the bound, not a count. Raise
-        InputError if a shape, the dtype, h or u is not what the file takes; what is not finite has a status.
+        InputError if the file does not take this shape, dtype, h or u; a state that is not finite has a status instead.
         """
         del guess
         self._check(*state)
@@ -149,8 +162,8 @@ class ExportedStepper(OneStepMethod):
         """One step and its derivative with respect to the state, h and u, by the implicit-function theorem.
 
         The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du; NaN where
-        the step failed. Autograd does not go through the result. Raise InputError as `step`, and where the format holds
-        no derivative.
+        the step failed. The result has no derivatives by autograd. Raise InputError as in `step`, and where the format
+        has no derivative.
         """
         if "linearise" not in self.programs:
             many = f" of {self.dof} coordinates" if self.kind == "c" else ""
@@ -166,9 +179,9 @@ class ExportedStepper(OneStepMethod):
         return Linearised(self._step(out, state), J[..., :size], J[..., size], by_input, by_theta)
 
     def outside_box(self, state: State) -> Tensor:
-        """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
+        """(...) True where a state lies outside the box that the model was fitted in; angles count modulo 2π.
 
-        Raise InputError if the file records no box, or the state is not of its shape or dtype.
+        Raise InputError if the file records no box, or the state has another shape or dtype than the file.
         """
         if self._box is None:
             raise InputError(f"{self.path}: records no box; export it again with box=")
@@ -184,7 +197,7 @@ class ExportedStepper(OneStepMethod):
         watch: Watch | None = None,
         **plan: Any,
     ) -> Track:
-        """K steps inside the file, without derivatives."""
+        """K steps in the file's own loop, without derivatives."""
         if watch is not None:
             raise InputError(f"{self._file} file has no events; use herglotz.Stepper")
         every, batch = plan["every"], start.s.shape
@@ -198,14 +211,14 @@ class ExportedStepper(OneStepMethod):
         return _decimated(track, every, batch)
 
     def _with_box(self, track: Track) -> Track:
-        """With the flag of every step that starts or ends outside, where the loop has not set it."""
+        """The track with a flag of every step that starts or ends outside the box, where the loop has set no flags."""
         if self._box is None or track.outside is not None:
             return track
         there = self._box(*track.states)
         return track._replace(outside=(there[..., 1:] | there[..., :-1]).to(torch.uint8))
 
     def _step(self, out: Sequence[Tensor], state: State) -> Step:
-        """The outputs of a program as a step of the shape of `state`."""
+        """The outputs of a program as a step with the shape of `state`."""
         q, _, s = state
         q1, p1, s1, c, residual, status, *outside = out
         new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
@@ -220,7 +233,9 @@ class ExportedStepper(OneStepMethod):
         self._check(*state)
         return state
 
-    def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:  # noqa: ARG002  another dtype is refused
+    def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:
+        # Not converted to the dtype of the states: `check_inputs` refuses another dtype.
+        del like
         check_rows(inputs)
         return inputs
 
@@ -250,11 +265,12 @@ class ExportedStepper(OneStepMethod):
         return q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.reshape(-1), *more
 
     def _inputs(self, u: Tensor | None, shape: tuple[int, ...]) -> tuple[Tensor, ...]:
-        """(u,) of shape (*shape, m) for a model that takes inputs; for None those that do not act, or nothing."""
+        """(u,) of shape (*shape, m); for None the inputs at which no force acts, or () where the loop needs none."""
         if u is None:
             return () if self._idle is None else (self._idle.expand(*shape, self.inputs),)
         if u.ndim and u.ndim <= len(shape) + 1:
-            with suppress(RuntimeError):  # left as it is, for the message below
+            # A shape that does not expand is refused below, with a message.
+            with suppress(RuntimeError):
                 u = u.expand(*shape, u.shape[-1])
         check_inputs(u, self.inputs, shape, self.dtype)
         return (u,)
@@ -274,9 +290,9 @@ def check_range(h: Tensor, span: Sequence[float] | None) -> None:
 
 
 def spread_h(h: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """The step h, of every sample of a batch of that shape.
+    """The step h of every sample of a batch of this shape.
 
-    Raise InputError if it is neither a scalar nor of that shape.
+    Raise InputError if h is neither a scalar nor has this shape.
     """
     if h.ndim > len(shape) or not all(a in (1, b) for a, b in zip(h.shape[::-1], shape[::-1], strict=False)):
         raise InputError(f"h must be a scalar or match the batch {tuple(shape)}, got shape {tuple(h.shape)}")
@@ -305,12 +321,12 @@ def scanned(program: Program) -> Loop:
 
 
 def plain(x: Tensor) -> Tensor:
-    """Standard layout; compiled code reads memory in that order whatever the strides say."""
+    """A copy in standard layout: compiled code ignores strides."""
     return x.contiguous() if x.requires_grad else x.clone(memory_format=torch.contiguous_format)
 
 
 def _decimated(track: Track, every: int, batch: tuple[int, ...]) -> Track:
-    """Each m-th state, with the worst status, residual and flag of the steps before it, for a batch of any shape."""
+    """Each `every`-th state, with the worst status, residual and flag of the steps since the state before."""
 
     def kept(x: Tensor) -> Tensor:
         return x[:, ::every].reshape(*batch, -1, *x.shape[2:])

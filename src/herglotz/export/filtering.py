@@ -1,4 +1,4 @@
-"""`hz.filter`: states, velocities and chosen numbers of a model, sample by sample as a controller would have them."""
+"""`hz.filter`: estimates of states, velocities and chosen numbers of a model from the samples so far."""
 
 from __future__ import annotations
 
@@ -30,16 +30,21 @@ from herglotz.training.problems.grid import step_inputs
 
 @dataclass(frozen=True)
 class Filtered:
-    """What a filter knows after each sample, N in all, in the units of the data and of the model."""
+    """The estimates of a filter after each of N samples, in the units of the data and of the model.
+
+    * theta: the estimated numbers, with their names in `names`
+    * covariance: of q, p, s where the motion depends on s, and θ, F numbers in all
+    * surprise: squared innovation over its variance, n on average; NaN at the first sample of a trajectory
+    """
 
     t: Tensor  # (N,)
     state: State  # (N, n), (N, n), (N,)
     v: Tensor  # (N, n)
-    theta: Tensor  # (N, K) the numbers that are estimated too
-    names: list[str]  # theirs
-    covariance: Tensor  # (N, F, F) of q, p, s where the motion depends on it, and θ
+    theta: Tensor  # (N, K)
+    names: list[str]
+    covariance: Tensor  # (N, F, F)
     covariance_of_v: Tensor  # (N, n, n)
-    surprise: Tensor  # (N,) squared innovation over its variance, n on average; NaN at the first of a trajectory
+    surprise: Tensor  # (N,)
 
 
 def filter(
@@ -51,11 +56,11 @@ def filter(
 ) -> Filtered:
     """Follow a recording by an extended Kalman filter on the run's step: x = x⁻ + P_q (y − q)/S at each sample.
 
-    With a `lag` each sample is what is known of it `lag` samples later, or at the end of its trajectory: fixed-lag
-    smoothing.
+    With a `lag` the estimate of each sample also uses the `lag` samples after it, as far as the trajectory has them:
+    fixed-lag smoothing.
 
-    Each trajectory starts at its first two samples. The same filter stands in a C header that is exported with
-    `extras=["filter"]` (`docs/c.md`).
+    Each trajectory starts at its first two samples. A C header exported with `extras=["filter"]` has the same filter
+    (`docs/c.md`).
 
     Parameters
     ----------
@@ -65,12 +70,12 @@ def filter(
         Positions of the same coordinates, in the same units, with inputs where the model takes them: anything that
         `fit` takes.
     parameters
-        Numbers of the model that are estimated too: by name, the standard deviation that each starts with, and how far
-        it wanders in the root of a unit of time, in the number's own unit.
+        Numbers of the model that are estimated too: by name, the standard deviation at the start, and that of the
+        number's random walk over a unit of time, in the number's own unit.
     noise
-        Standard deviations in the units of the data; by default those of the fit (`noise_of`).
+        Standard deviations in the units of the data; default: those of the fit (`noise_of`).
     lag
-        Samples that each one waits for; the time of the work grows with the square of it.
+        Number of later samples that an estimate uses; the computing time grows with its square.
 
     Returns
     -------
@@ -80,8 +85,8 @@ def filter(
     Raises
     ------
     InputError
-        If the recording is not of the run, has trajectories of fewer than two samples or of no more than the lag, or
-        leaves where the model has steps; or a deviation is none.
+        If the recording has other coordinates than the run, has trajectories of fewer than two samples or of no more
+        than the lag, or moves to where the model has no step; or a deviation is negative or not finite.
     """
     chosen = dict(parameters or {})
     for name, pair in chosen.items():
@@ -98,7 +103,7 @@ def filter(
     if len(kalman.names) != len(chosen):
         raise InputError(f"{', '.join(chosen)} stand for several numbers of the model; name each of them")
     std = torch.tensor([first for first, _ in chosen.values()], dtype=torch.float64)
-    beliefs, surprises, steps, most = [], [], [], run.h_range[1]
+    beliefs, surprises, steps, longest = [], [], [], run.h_range[1]
     _check_lengths(data, lag)
     for first, length in zip(data.offsets, data.lengths, strict=True):
         belief, surprise = _started(kalman, data, first, std), math.nan
@@ -106,15 +111,15 @@ def filter(
             h = float(data.t[row] - data.t[row - 1]) if row > first else float(data.t[row + 1] - data.t[row])
             if row > first:
                 belief = kalman.remember(belief, lag) if lag else belief
-                before = _carried(kalman, model, data, belief, row, h, most)
+                before = _predicted(kalman, data, belief, row, h, longest)
                 belief, surprise = kalman.update(before, data.q[row])
             beliefs.append(kalman.smoothed(belief, 0))
-            # The sample that waits no longer; all of them at the end.
+            # The sample `lag` before this one; at the end of the trajectory all that are left.
             for back in range(1, lag + 1) if row + 1 == first + length else [lag] * (lag <= row - first):
                 beliefs[row - back] = kalman.smoothed(belief, back)
             surprises.append(surprise)
-            steps.append(min(h, most))
-    return _told(kalman, model, data, beliefs, surprises, steps)
+            steps.append(min(h, longest))
+    return _filtered(kalman, data, beliefs, surprises, steps)
 
 
 def _check_lengths(data: Trajectories, lag: int) -> None:
@@ -127,19 +132,17 @@ def _check_lengths(data: Trajectories, lag: int) -> None:
         )
 
 
-def _carried(
-    kalman: KalmanFilter, model: ContactLagrangian, data: Trajectories, belief: Belief, row: int, h: float, most: float
-) -> Belief:
-    """What is known at a row before its sample, by as few equal steps as are no longer than `most`."""
-    parts = parts_of(h, most)
+def _predicted(kalman: KalmanFilter, data: Trajectories, belief: Belief, row: int, h: float, longest: float) -> Belief:
+    """The prediction of a row from the row before, by the fewest equal steps that are no longer than `longest`."""
+    parts = parts_of(h, longest)
     for k in range(parts):
         part = torch.tensor((k + 0.5) / parts, dtype=torch.float64)
-        belief = kalman.predict(belief, h / parts, input_at(model, data, row - 1, part))
+        belief = kalman.predict(belief, h / parts, input_at(kalman.model, data, row - 1, part))
     return belief
 
 
 def _compiled(model: ContactLagrangian, names: list[str]) -> ExportedStepper | None:
-    """The model in C, at a hundredth of the time; None where there is no compiler or no C of it."""
+    """The model in C, which takes a hundredth of the time; None without a compiler or for a model without C."""
     if model.dof > MAX_DERIVATIVES:
         return None
     with suppress(InputError):
@@ -148,16 +151,17 @@ def _compiled(model: ContactLagrangian, names: list[str]) -> ExportedStepper | N
     return None
 
 
-def _told(
-    kalman: KalmanFilter, model: ContactLagrangian, data: Trajectories, beliefs: list[Belief], surprises: list[float],
-    steps: list[float],
-) -> Filtered:  # fmt: skip
+def _filtered(
+    kalman: KalmanFilter, data: Trajectories, beliefs: list[Belief], surprises: list[float], steps: list[float]
+) -> Filtered:
+    """The beliefs as tensors, with velocities at steps of the model."""
     states, thetas, covariances = (torch.stack(x) for x in zip(*(_flat(belief) for belief in beliefs), strict=True))
     scales = data.t.new_tensor([float(belief.scale) for belief in beliefs])
     n = kalman.n
     state = State(states[:, :n], states[:, n:-1], states[:, -1])
-    u = data.u if model.inputs else None
-    if kalman.names:  # each sample has its own model
+    u = data.u if kalman.model.inputs else None
+    if kalman.names:
+        # Each sample has a model with its own numbers.
         found = [
             kalman.velocity(belief, h, None if u is None else u[i])
             for i, (belief, h) in enumerate(zip(beliefs, steps, strict=True))
@@ -175,7 +179,7 @@ def _flat(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _started(kalman: KalmanFilter, data: Trajectories, row: int, std: Tensor) -> Belief:
-    """At the first sample, with the momentum that FL⁻ gives the first two: its noise is m √2 σ/h."""
+    """The belief at the first sample, with the momentum FL⁻ of the first two: its standard deviation is m √2 σ/h."""
     n, q0, zero = kalman.n, data.q[row], torch.zeros((), dtype=torch.float64)
     p, by_q1 = momentum_at(kalman.model, data, row)
     own = q0.new_tensor(kalman.noise.position)

@@ -1,4 +1,4 @@
-"""A model as an FMU for co-simulation, FMI 3.0 or 2.0: the C header, the standard's functions around it, a binary."""
+"""A model as an FMU for co-simulation, FMI 3.0 or 2.0: the C header, the functions of the standard, a binary."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.codegen.c_compiler import SOURCE, compiler, portable_library
-from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.files import PathLike
 from herglotz.data.seal import sealed_zip
 from herglotz.errors import InputError
 from herglotz.export.c_header import read_metadata, runtime
 from herglotz.export.c_numbers import numbers
 from herglotz.export.c_wrappers import header_of, prefix
 from herglotz.export.fmu_description import VERSIONS, build_description, model_description
-from herglotz.export.trusted import remember
+from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
+# Names of operating systems and processors in Python → in the standard.
 SYSTEM = {"Linux": "linux", "Darwin": "darwin", "Windows": "windows"}
-MACHINE = {"AMD64": "x86_64", "arm64": "aarch64"}  # as the standard spells it
+MACHINE = {"AMD64": "x86_64", "arm64": "aarch64"}
 FMI2_FOLDER = {"x86_64-linux": "linux64", "x86_64-darwin": "darwin64", "x86_64-windows": "win64"}
 ENDING = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
-# What the two versions of the standard write in other letters.
+# Names that the two versions of the standard spell with other capital letters.
 SPELLED = {
     "2.0": {"STATE": "FMUstate", "DESERIALIZE": "DeSerializeFMUstate"},
     "3.0": {"STATE": "FMUState", "DESERIALIZE": "DeserializeFMUState"},
 }
-EPOCH = (1980, 1, 1, 0, 0, 0)  # of every entry: the same model gives the same bytes
+# The date of every entry of the archive, so that the same model gives the same bytes.
+EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 def export_fmu(
@@ -40,22 +42,22 @@ def export_fmu(
 ) -> Path:
     """Write the model as an FMU for co-simulation: inputs u, outputs q, p, s, C sources and a binary.
 
-    A communication step is one step of the header, or as few equal ones as the steps that the model was fitted for
-    allow. The binary is for the system and kind of processor that it was made on; where there is no C compiler, a
-    warning says so, and the FMU holds the sources alone. docs/control.md says what the FMU does with each call.
+    A communication step is one step of the header, or the fewest equal steps that are not longer than those the model
+    was fitted for. The binary is for this machine's operating system and kind of processor; without a C compiler the
+    FMU holds the sources alone, and a warning says so. docs/control.md says what the FMU does with each call.
 
     Parameters
     ----------
     model, path, name, settings
-        As of `export_casadi`; the name of the file should end in `.fmu`, and `name` is the model's identifier. Of the
-        metadata, names, columns, start and time_unit name the variables, their starts and units.
+        As in `export_casadi`; the name of the file should end in `.fmu`, and `name` is the model's identifier. The
+        entries names, columns, start and time_unit of the metadata give the variables' names, starts and units.
     version
-        "3.0" or "2.0", of FMI.
+        Version of FMI, "3.0" or "2.0".
 
     Raises
     ------
     InputError
-        As `export_c`, and if the version is another one.
+        As in `export_c`, and if the version is neither.
     """
     if version not in VERSIONS:
         raise InputError(f"version must be one of {', '.join(VERSIONS)} (of FMI), got {version!r}")
@@ -79,37 +81,34 @@ def export_fmu(
         warnings.warn(f"{path}: C sources without a binary: {error}", RuntimeWarning, stacklevel=2)
     else:
         content[_binary(name, version)] = portable_library({f"{name}.h": header, SOURCE: source})
-    archive = sealed_zip(_zipped(content))
-    write_atomically(path, archive)
-    remember(archive)
-    return path
+    return write_trusted(path, sealed_zip(_zipped(content)))
 
 
 def header_in(content: bytes, path: PathLike) -> str:
-    """The C header in an FMU; raise InputError if there is none."""
+    """The C header in an FMU; raise InputError if the file has none."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for name in archive.namelist():
                 if re.fullmatch(r"sources/\w+\.h", name):
                     return archive.read(name).decode("utf-8", "replace")
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise InputError(f"{path}: is no readable FMU ({error}); export the model again") from None
-    raise InputError(f"{path}: holds no header that herglotz wrote; export the model again")
+        raise InputError(f"{path}: is not a readable FMU ({error}); export the model again") from None
+    raise InputError(f"{path}: has no header that herglotz wrote; export the model again")
 
 
 def _source(entries: Mapping[str, Any], version: str, token: str) -> str:
-    """The functions of the standard around the header."""
-    zero = [*entries["input_zero"], 0.0]
-    given = {"HEADER": f"{entries['name']}.h", "TOKEN": token, "INPUTS": numbers(zero, entries["dtype"])}
-    given |= {"V": version[0]} | SPELLED[version]
-    given["HOLD"] = runtime("hold.h")
+    """The C source file: the functions of the standard around the header."""
+    # An array of C has at least one entry.
+    inputs = numbers([*entries["input_zero"], 0.0], entries["dtype"])
+    words = {"HEADER": f"{entries['name']}.h", "TOKEN": token, "INPUTS": inputs, "HOLD": runtime("hold.h")}
+    words |= {"V": version[0]} | SPELLED[version]
     text = "".join(map(runtime, ("fmu.c", f"fmi{version[0]}.c", "fmi.c")))
-    text = re.sub(r"@(\w+)@", lambda m: given[m[1]], text)
+    text = re.sub(r"@(\w+)@", lambda m: words[m[1]], text)
     return re.sub(r"\bhz_", f"{entries['name']}_", text)
 
 
 def _binary(name: str, version: str) -> str:
-    """Where the binary for this machine stands in an FMU."""
+    """The path of the binary for this machine in an FMU."""
     system = SYSTEM.get(platform.system(), platform.system().lower())
     folder = f"{MACHINE.get(platform.machine(), platform.machine())}-{system}"
     folder = FMI2_FOLDER.get(folder, folder) if version == "2.0" else folder

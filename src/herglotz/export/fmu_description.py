@@ -1,4 +1,4 @@
-"""The XML files of an FMU: what its variables are called, and what it can do."""
+"""The XML files of an FMU: its variables and capabilities."""
 
 from __future__ import annotations
 
@@ -8,22 +8,33 @@ from xml.etree import ElementTree as xml
 
 from herglotz.export.c_header import MAX_DERIVATIVES
 
-VERSIONS = ("3.0", "2.0")
-BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")  # those that FMI knows; others are names to it
+# The versions of FMI, with their names of the capabilities to give derivatives and to save states.
+VERSIONS = {
+    "3.0": (
+        ("providesDirectionalDerivatives", "providesAdjointDerivatives"),
+        ("canGetAndSetFMUState", "canSerializeFMUState"),
+    ),
+    "2.0": (("providesDirectionalDerivative",), ("canGetAndSetFMUstate", "canSerializeFMUstate")),
+}
+# The units that FMI knows; other units are only names.
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
 class Variable(NamedTuple):
-    """A variable of the FMU; its value reference is its place among all of them (`runtime/fmu.c`)."""
+    """A variable of the FMU; its value reference is its place in the list of all variables (`runtime/fmu.c`).
+
+    The causality is "independent", "input" or "output".
+    """
 
     name: str
-    causality: str  # "independent", "input" or "output"
+    causality: str
     unit: str
     start: float | None
     description: str
 
 
 def variables(entries: Mapping[str, Any]) -> list[Variable]:
-    """Time, the inputs, q, p and s, as the value references of the C file count them; others would follow."""
+    """Time, the inputs, q, p and s, in the order of the value references in the C file."""
     n, m = entries["dof"], entries["inputs"]
     names = entries.get("names") or [f"q{i + 1}" for i in range(n)]
     units = entries.get("units") or [""] * n
@@ -42,7 +53,7 @@ def variables(entries: Mapping[str, Any]) -> list[Variable]:
 
 def model_description(entries: Mapping[str, Any], version: str, token: str, source: str) -> bytes:
     """The file `modelDescription.xml` of FMI 3.0 or 2.0."""
-    new, has = version == "3.0", variables(entries)
+    new, listed = version == "3.0", variables(entries)
     root = xml.Element(
         "fmiModelDescription",
         fmiVersion=version,
@@ -52,26 +63,25 @@ def model_description(entries: Mapping[str, Any], version: str, token: str, sour
         variableNamingConvention="flat",
     )
     root.set("instantiationToken" if new else "guid", token)
-    able = {"canHandleVariableCommunicationStepSize": True, "providesDirectionalDerivative" + "s" * new: True}
-    able |= {"providesAdjointDerivatives": True} if new else {}
-    able = dict.fromkeys(able, entries["dof"] <= MAX_DERIVATIVES) | {"canHandleVariableCommunicationStepSize": True}
-    able |= {"canGetAndSetFMU" + "Ss"[not new] + "tate": True, "canSerializeFMU" + "Ss"[not new] + "tate": True}
+    derivatives, states = VERSIONS[version]
+    capabilities = {"canHandleVariableCommunicationStepSize": True}
+    capabilities |= dict.fromkeys(derivatives, entries["dof"] <= MAX_DERIVATIVES) | dict.fromkeys(states, True)
     simulation = xml.SubElement(root, "CoSimulation", modelIdentifier=entries["name"])
-    for key, value in able.items():
+    for key, value in capabilities.items():
         simulation.set(key, str(value).lower())
     if not new:
         xml.SubElement(xml.SubElement(simulation, "SourceFiles"), "File", name=source)
-    _units(root, has)
+    _units(root, listed)
     categories = xml.SubElement(root, "LogCategories")
     for name in ("logStatusWarning", "logStatusError"):
         xml.SubElement(categories, "Category", name=name)
     xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(entries["h"]))
-    (_fmi3 if new else _fmi2)(root, has)
+    (_fmi3 if new else _fmi2)(root, listed)
     return _written(root)
 
 
 def build_description(name: str, source: str) -> bytes:
-    """The file `buildDescription.xml` of FMI 3.0: how the sources are compiled."""
+    """The file `buildDescription.xml` of FMI 3.0, for compiling the sources."""
     root = xml.Element("fmiBuildDescription", fmiVersion="3.0")
     build = xml.SubElement(root, "BuildConfiguration", modelIdentifier=name)
     files = xml.SubElement(build, "SourceFileSet", language="C99")
@@ -91,7 +101,7 @@ def _units(root: xml.Element, has: list[Variable]) -> None:
 
 
 def _attributes(variable: Variable, reference: int) -> dict[str, str]:
-    """Of any version; an output can be set before the first step (`initial` is exact)."""
+    """Attributes of any version; an output can be set before the first step (`initial` is exact)."""
     found = {"name": variable.name, "valueReference": str(reference), "causality": variable.causality}
     found |= {"variability": "continuous", "description": variable.description}
     return found | ({"initial": "exact"} if variable.causality == "output" else {})
@@ -116,7 +126,8 @@ def _fmi2(root: xml.Element, has: list[Variable]) -> None:
     for reference, variable in enumerate(has):
         one = xml.SubElement(listed, "ScalarVariable", _attributes(variable, reference))
         xml.SubElement(one, "Real", _of_value(variable))
-        if variable.causality == "output":  # its place is counted from 1; an output follows no input without a step
+        if variable.causality == "output":
+            # FMI 2.0 counts variables from 1. Between steps an output depends on no input.
             xml.SubElement(outputs, "Unknown", index=str(reference + 1), dependencies="")
 
 

@@ -1,6 +1,9 @@
-"""Exporting around a traced graph: one operator while torch traces what is around it, then the graph itself.
+"""Traced graphs as single operators while torch.export traces the loops around them, and their insertion afterwards.
 
-torch.export evaluates every node with symbolic shapes, some milliseconds each; a traced graph knows its shapes already.
+torch.export evaluates every node with symbolic shapes, about 5 ms each, although a traced graph knows its shapes.
+Without this module files step the same and as fast, but an export takes two to three times as long. Measured with two
+joints: `.pt2`, level linear 6.6 s instead of 3.4 s, level full 26.6 s instead of 9.5 s; ONNX, level linear 7.2 s
+instead of 2.7 s.
 """
 
 from __future__ import annotations
@@ -19,13 +22,13 @@ from herglotz.codegen.trace import Example, Graph
 
 _library = torch.library.Library("herglotz", "DEF")
 _library.define("graph(Tensor[] arguments, int key) -> Tensor[]")
-# Those that an operator of a program stands for, as long as something holds them.
+# The graphs that operators stand for, by key, as long as a program keeps them alive.
 _graphs: WeakValueDictionary[int, Graph] = WeakValueDictionary()
 
 
 @torch.library.register_fake("herglotz::graph", lib=_library)
 def _fake(arguments: list[Tensor], key: int) -> list[Tensor]:
-    """Empty outputs of the right shapes."""
+    """Empty outputs with the shapes of the graph's results."""
     graph = _graphs[key]
     batch = next(x for x in arguments if x.ndim).shape[0]
     outputs = (x.meta["example"] for x in results_of(graph))
@@ -54,7 +57,8 @@ def inlined(program: ExportedProgram) -> ExportedProgram:
     for module in list(program.graph_module.modules()):
         if not isinstance(module, fx.GraphModule):
             continue
-        values: dict[Any, Any] = {}  # torch takes milliseconds to describe a tensor, and many nodes have equal ones
+        # Nodes with equal examples share a value, because torch takes milliseconds to make one.
+        values: dict[Any, Any] = {}
         for node in list(module.graph.nodes):
             if node.target == torch.ops.herglotz.graph.default:
                 _inline(module.graph, node, _graphs[node.args[1]], values)
@@ -89,12 +93,13 @@ def _inline(outer: fx.Graph, call: fx.Node, graph: Graph, values: dict[Any, Any]
         user.replace_all_uses_with(result)
         outer.erase_node(user)
         if any(x.op == "output" for x in result.users):
-            result.name = name  # the program's signature knows its outputs by name
+            # The signature of the program has its outputs by name.
+            result.name = name
     outer.erase_node(call)
 
 
 def _value(example: Any, graph: Graph, batch: Any, mode: Any) -> Any:
-    """What torch keeps of a node: empty tensors with symbolic shapes, or a size."""
+    """The value that torch notes on a node: an empty tensor with symbolic shape, a list of these, or a size."""
     if isinstance(example, Example):
         with mode:
             shape, strides = (_sized(x, graph, batch) for x in (example.shape, example.strides))
@@ -105,7 +110,7 @@ def _value(example: Any, graph: Graph, batch: Any, mode: Any) -> Any:
 
 
 def _sized(sizes: tuple[int, ...], graph: Graph, batch: Any) -> list[Any]:
-    """Sizes at another batch."""
+    """The sizes with `batch` in place of the example's batch."""
     return [batch * (x // graph.batch) if x and x % graph.batch == 0 else x for x in sizes]
 
 
@@ -115,5 +120,5 @@ def graph_of_key(key: int) -> Graph:
 
 
 def results_of(graph: Graph) -> tuple[fx.Node, ...]:
-    """The nodes that a graph gives."""
+    """The nodes of a graph's results."""
     return graph.code.output_node().args[0]  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""Readers of exported files: what a file can run, as functions of tensors, behind an `ExportedStepper`."""
+"""Readers of exported files: each gives the programs of a file, as functions of tensors, to an `ExportedStepper`."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ from herglotz.export.trusted import check_trusted
 from herglotz.models import ContactLagrangian
 
 WITH_HEADER = (".h", ".c", ".fmu")
-MODELS, EXTRA = "models/", f"extra/{METADATA}"  # in the archive that torch writes
+# Names in the archive that torch writes.
+MODELS, EXTRA = "models/", f"extra/{METADATA}"
 
 
 def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
-    """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or one with a C header: `.h`, `.c`, `.fmu`.
+    """Read an exported file by the end of its name: `.pt2`, `.onnx`, or a file with a C header (`.h`, `.c`, `.fmu`).
 
     Parameters
     ----------
     path
         The file.
     trust_code
-        As in `load_pt2`, also for a header. An ONNX file needs no trust: opening it runs nothing.
+        As in `load_pt2`, also for a header. Opening an ONNX file runs nothing and needs no trust.
 
     Returns
     -------
@@ -49,7 +50,7 @@ def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedSteppe
     Raises
     ------
     InputError
-        As the reader of that format.
+        As in the reader of that format.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".onnx":
@@ -58,14 +59,14 @@ def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedSteppe
 
 
 def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
-    """Read a file that `export_pt2` or `export_aoti` wrote; a program of a `.pt2` file is read at its first call.
+    """Read a file of `export_pt2` or `export_aoti`; each program of a `.pt2` file is read when it is first called.
 
     Parameters
     ----------
     path
         The file.
     trust_code
-        Open a file that was not written by this user on this machine: that runs what stands in it.
+        Open a file that this user did not write on this machine: opening the file runs the code in it.
 
     Returns
     -------
@@ -75,11 +76,12 @@ def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
     Raises
     ------
     InputError
-        If the file is missing, damaged, changed, not one of ours, of another format version, or not trusted.
+        If the file is missing, damaged, changed, not written by herglotz, of another format version, or not trusted.
     """
     content = _sealed(path)
     check_trusted(content, path, trust_code)
-    with _reading(path, ".pt2"), quiet():  # torch logs a traceback of its own for a damaged file; one line is enough
+    # Quiet, because torch logs a traceback for a damaged file besides the exception.
+    with _reading(path, ".pt2"), quiet():
         if _is_compiled(content):
             return _load_aoti(path)
         with _archive(content) as archive:
@@ -90,10 +92,10 @@ def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
 
 
 def load_onnx(path: PathLike) -> ExportedStepper:
-    """Read a file that `export_onnx` wrote; it runs on as many threads as torch does.
+    """Read a file of `export_onnx`; onnxruntime gets as many threads as torch has.
 
-    Raise InputError if onnxruntime is not installed, or the file is missing, damaged, not one of ours, or of another
-    version.
+    Raise InputError if onnxruntime is not installed, or the file is missing, damaged, not written by herglotz, or of
+    another format version.
     """
     content = _sealed(path)
     try:
@@ -103,8 +105,10 @@ def load_onnx(path: PathLike) -> ExportedStepper:
     options = ort.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.inter_op_num_threads = 1
-    options.enable_cpu_mem_arena = False  # a tenth faster for tensors of a few numbers, and no slower for others
-    options.log_severity_level = 4  # an exception says it; its log line would be a second
+    # Without the arena, tensors of a few numbers are a tenth faster and larger ones no slower.
+    options.enable_cpu_mem_arena = False
+    # Fatal errors only: every error is an exception too, and a log line would repeat the exception.
+    options.log_severity_level = 4
     session = lambda text: ort.InferenceSession(text, options, providers=["CPUExecutionProvider"])  # noqa: E731
     with _reading(path, ".onnx"):
         first = session(content)
@@ -112,22 +116,24 @@ def load_onnx(path: PathLike) -> ExportedStepper:
         metadata = from_json(entries.get(KEY), path)
         steps = _session_program(first)
         programs = {"rollout": _row_by_row(steps) if metadata.get("unrolled") else steps}
-        for name in (x for x in entries if x.startswith(f"{KEY}_")):  # further models, in base 64
+        # The metadata hold the further models in base 64.
+        for name in (x for x in entries if x.startswith(f"{KEY}_")):
             programs[name.removeprefix(f"{KEY}_")] = _session_program(session(base64.b64decode(entries[name])))
     return ExportedStepper(programs, metadata, str(path), "onnx")
 
 
 def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian | None = None) -> ExportedStepper:
-    """Compile a header that `export_c` wrote, and load it; also that in a file for CasADi or acados, or in an FMU.
+    """Compile and load a header of `export_c`, also the header in a file for CasADi or acados, or in an FMU.
 
     Parameters
     ----------
     path
         The header, or the file that holds it.
     trust_code
-        Compile a header that was not written by this user on this machine: that runs what stands in it.
+        Compile a header that this user did not write on this machine: loading the header runs the code in it.
     model
-        Of the run it was exported from: a header that is what this model gives, letter for letter, needs no trust.
+        The model of the run that the header was exported from. A header that equals this model's header letter for
+        letter needs no trust.
 
     Returns
     -------
@@ -137,7 +143,7 @@ def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian
     Raises
     ------
     InputError
-        If the file cannot be read, was changed, is no such header or not trusted, or there is no compiler.
+        If the file cannot be read, was changed, has no such header or is not trusted, or no compiler is installed.
     """
     content = _sealed(path, text=not _is_fmu(path))
     text = _header(content, path)
@@ -146,9 +152,9 @@ def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian
 
 
 def read_header(path: PathLike) -> tuple[str, dict[str, Any]]:
-    """The text of a header and its metadata; nothing of it is compiled.
+    """The text of a header and its metadata, without compiling the header.
 
-    Raise InputError if the file cannot be read, was changed or is no such header.
+    Raise InputError if the file cannot be read, was changed or has no such header.
     """
     text = _header(_sealed(path, text=not _is_fmu(path)), path)
     return text, read_metadata(text, path)
@@ -159,7 +165,7 @@ def _is_fmu(path: PathLike) -> bool:
 
 
 def _header(content: bytes, path: PathLike) -> str:
-    """The header, up to its own seal: what stands around it is not compiled here."""
+    """The header up to its own seal; code around the header is not compiled here."""
     if _is_fmu(path):
         return header_in(content, path)
     text = content.decode("utf-8", "replace").replace("\r\n", "\n")
@@ -168,7 +174,7 @@ def _header(content: bytes, path: PathLike) -> str:
 
 
 def _sealed(path: PathLike, text: bool = False) -> bytes:
-    """The content of a file that nobody has changed."""
+    """The content of a file; raise InputError if the file was changed since it was written."""
     content = read_bytes(path)
     check_seal(content, path, text=text)
     return content
@@ -176,7 +182,10 @@ def _sealed(path: PathLike, text: bool = False) -> bytes:
 
 @contextmanager
 def _reading(path: PathLike, kind: str) -> Iterator[None]:
-    """What another package's reader raises as an `InputError`: torch and onnxruntime have no common exception."""
+    """Turn any exception of another package's reader into an `InputError`.
+
+    The exceptions of torch and onnxruntime have no common class.
+    """
     try:
         yield
     except InputError:
@@ -188,14 +197,15 @@ def _reading(path: PathLike, kind: str) -> Iterator[None]:
 
 
 def _is_of(text: str, path: PathLike, model: ContactLagrangian) -> bool:
-    """Whether the header is what the model gives with the header's own metadata."""
+    """Whether the header equals the model's header with the same metadata."""
     entries = read_metadata(text, path)
     if entries.get("weights_sha256") != weights_digest(model):
         return False
     file = re.search(r'#include "([^"\n]*)"', text)
     try:
         return text == sealed_text(c_source(model, entries, file[1] if file else ""))
-    except (KeyError, ValueError, TypeError, AttributeError):  # metadata that this version would not have written
+    except (KeyError, ValueError, TypeError, AttributeError):
+        # This version would not have written such metadata.
         return False
 
 
@@ -211,7 +221,7 @@ def _archive(content: bytes) -> Any:
 
 
 def _program_when_called(content: bytes, name: str, path: PathLike) -> Program:
-    """One program of a `.pt2` file, read at its first call: that takes a second or more, and few uses need all."""
+    """One program of a `.pt2` file, read at its first call: reading takes a second or more, and few uses need all."""
 
     @cache
     def program() -> Program:

@@ -1,4 +1,4 @@
-"""What every exported file says of itself: one description, whatever the format."""
+"""The metadata of exported files: one description for all formats, written and checked."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from herglotz.errors import InputError, refuse
 from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.schema import check_entries
 
-FORMAT = 3  # 1 held a single step; 2 added rollouts and starts from positions, 3 the Jacobian of a step
-METADATA = "metadata.json"  # of our entries in a .pt2 archive
-KEY = "herglotz"  # of our entries among the metadata of an ONNX or compiled model
-AOTI = {
-    "rollout": "model",
-    "init": "init",
-    "legendre": "legendre",
-}  # our names of the programs in a compiled package, and the package's
+# The version of the format: 1 held a single step; 2 added rollouts and starts from positions, 3 a step's Jacobian.
+FORMAT = 3
+# The name of the metadata in a .pt2 archive.
+METADATA = "metadata.json"
+# The key of the metadata in an ONNX or AOTInductor model.
+KEY = "herglotz"
+# The programs of an AOTInductor package: our names → names in the package.
+AOTI = {"rollout": "model", "init": "init", "legendre": "legendre"}
 BOX_KEYS = tuple(f"{name}_{end}" for name in "qps" for end in ("low", "high"))
 REMEDY = "export the model again"
-EXTRAS = ("adjoint", "filter")  # what a C header may hold beside its steps: files of `export/runtime`
-TOLERANCE = 4  # machine epsilons, of Δ = q1 − q0: what is left of it goes into p divided by h, and adds up
+# Further functions that a C header may hold, from files of `export/runtime`.
+EXTRAS = ("adjoint", "filter")
+# Newton's tolerance in machine epsilons of Δ = q1 − q0. The error of Δ enters p divided by h, and adds up.
+TOLERANCE = 4
 
 
 class _Needed(TypedDict):
-    """What every file says of itself."""
+    """The entries of every file."""
 
     format: int
     model: dict[str, Any]
@@ -57,13 +59,13 @@ class _State(TypedDict):
 
 
 class _Start(_State, total=False):
-    """The same, and its time."""
+    """A state to start from and its time."""
 
     t: float
 
 
 class _Arrival(TypedDict, total=False):
-    """What happens to recorded inputs before they act (`data.holds.Arrival`)."""
+    """The hold, delay and lag of recorded inputs (`data.holds.Arrival`)."""
 
     hold: str
     delay: float | None
@@ -71,10 +73,19 @@ class _Arrival(TypedDict, total=False):
 
 
 class Metadata(_Needed, total=False):
-    """What the command line adds, and C."""
+    """The further entries of some files.
+
+    * input_low, input_high: the range of the inputs that the model was fitted to
+    * unrolled: the file is a single step whose iterations follow one another without a loop
+    * columns: name, role and unit of each
+    * extras: some of `EXTRAS`
+    * noise: of a filter, standard deviations of position, momentum and theta, and adaptation
+    * parameters: numbers that are set at run time, each with default, low and high
+    * between: parameters that move several numbers of the model, each with the values of these numbers at 1
+    """
 
     input_zero: list[float]
-    input_low: list[float]  # the range of the inputs that the model was fitted to
+    input_low: list[float]
     input_high: list[float]
     h_range: list[float] | None
     names: list[str]
@@ -84,13 +95,13 @@ class Metadata(_Needed, total=False):
     metrics: dict[str, Any]
     card: str
     arrival: _Arrival
-    unrolled: bool  # a single step whose iterations stand one after the other
-    columns: list[tuple[str, str, str]]  # name, role, unit
+    unrolled: bool
+    columns: list[tuple[str, str, str]]
     name: str
-    extras: list[str]  # of `EXTRAS`
-    noise: dict[str, Any]  # of a filter: standard deviations of position, momentum and theta, and adaptation
-    parameters: dict[str, tuple[float, float | None, float | None]]  # set at run time: default, low, high
-    between: dict[str, dict[str, float]]  # those of them that move several numbers: the values of these at 1
+    extras: list[str]
+    noise: dict[str, Any]
+    parameters: dict[str, tuple[float, float | None, float | None]]
+    between: dict[str, dict[str, float]]
 
 
 def describe(
@@ -143,7 +154,7 @@ def describe(
 
 
 def _input_zero(model: ContactLagrangian) -> list[float]:
-    """The inputs that do not act: what a sensor shows where there is no force."""
+    """The inputs at which no force acts."""
     zero = getattr(model.friction, "input_zero", None)
     return [0.0] * model.inputs if zero is None else zero.detach().double().tolist()
 
@@ -158,7 +169,7 @@ def weights_digest(model: torch.nn.Module) -> str:
 
 
 def to_json(entries: Mapping[str, Any]) -> str:
-    """The entries as text; raise InputError if one is not a plain finite number, text, list or dictionary."""
+    """The entries as text; raise InputError if an entry is not a plain finite number, text, list or dictionary."""
     try:
         return json.dumps(entries, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -168,11 +179,12 @@ def to_json(entries: Mapping[str, Any]) -> str:
 def from_json(text: str | None, path: PathLike) -> dict[str, Any]:
     """The entries of a file that one of the exporters wrote.
 
-    Raise InputError if it is not ours, or of another format version.
+    Raise InputError if the text is not such metadata, or of another format version.
     """
     try:
         entries = json.loads(text or "")
-    except (ValueError, RecursionError):  # no JSON, a number of thousands of digits, or brackets as deep
+    except (ValueError, RecursionError):
+        # No JSON, a number of thousands of digits, or brackets nested thousands deep.
         entries = None
     if not isinstance(entries, dict) or "format" not in entries:
         raise InputError(f"{path}: has no herglotz metadata; write it with herglotz.export")
@@ -181,7 +193,7 @@ def from_json(text: str | None, path: PathLike) -> dict[str, Any]:
 
 
 def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
-    """Refuse the metadata of another format version, and entries that cannot be."""
+    """Refuse the metadata of another format version, and impossible entries."""
     if entries["format"] != FORMAT:
         raise InputError(
             f"{path}: is of format {entries['format']}, this herglotz reads {FORMAT}; export the model again"
@@ -192,7 +204,8 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
     good = {
         "dof": n >= 1,
         "h": 0 < entries["h"] < float("inf"),
-        "inputs": 0 <= entries["inputs"] < 2**31,  # what an int of C holds
+        # An int of C holds the number of inputs.
+        "inputs": 0 <= entries["inputs"] < 2**31,
         "angles": len(entries["angles"]) == n,
         "units": len(entries["units"]) in (0, n),
         "names": len(entries.get("names") or ()) in (0, n),
@@ -211,7 +224,7 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
 
 
 def _box(box: Mapping[str, Sequence[float]], dof: int) -> dict[str, list[float]]:
-    """The box with plain numbers, checked: q and p have n entries, s has one, low ≤ high."""
+    """The box with plain numbers, checked: q and p have n entries each, s has 1, and low ≤ high."""
     if set(box) != set(BOX_KEYS):
         raise InputError(f"box needs exactly the keys {', '.join(BOX_KEYS)}; got {', '.join(sorted(box)) or 'none'}")
     plain = {key: [float(x) for x in torch.as_tensor(box[key], dtype=torch.float64).reshape(-1)] for key in BOX_KEYS}

@@ -1,4 +1,7 @@
-"""Steps, rollouts and starts of the flow Φ̃ as modules: the loops around the functions of `herglotz.export.step`."""
+"""Modules for `torch.export`: a step, K steps, the start from two positions, and the Legendre transform.
+
+The modules are the loops around the traced functions of `herglotz.export.step`.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,9 @@ from torch._higher_order_ops.scan import scan_op
 from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.export.equation import Equations, dense
-from herglotz.export.step import CARRIED, CONVERGED, STATE, Layout, StepGraphs, Values, unfinished
+from herglotz.export.step import CARRIED, STATE, Layout, StepGraphs, Values, unfinished
 from herglotz.mechanics.legendre import soft_threshold
+from herglotz.stepping import Status
 from herglotz.stepping.linearise import eliminate
 
 Call = Callable[..., Any]
@@ -23,37 +27,33 @@ def solved(
     begin: Call, iterate: Call, more: Values,
     layout: Layout, iterations: int, h: Tensor, u: Values, carry: Sequence[Tensor], unrolled: bool = False,
 ) -> Values:  # fmt: skip
-    """Newton's last carry: begin, then iterate to the end; `more` is what `iterate` takes last.
+    """Newton's last carry: `begin`, then `iterate` until every sample is done; `more` are the last arguments.
 
-    Where it is `unrolled`, the iterations stand one after the other, and those behind the end change nothing.
+    With `unrolled` the iterations follow one another without a loop; those after the last needed one change nothing.
     """
-    state, here, trail, _ = layout.split(carry)
+    state, field, trail, _ = layout.split(carry)
     begun = tuple(dense(x) for x in begin(*((*state, h, *u) if layout.sticks else (h, *trail))))
-    first, held = begun[:CARRIED], begun[CARRIED:]
-    fixed: Any = (*state, h, *here, *u, *held, *more)
+    first, bounds = begun[:CARRIED], begun[CARRIED:]
+    fixed: Any = (*state, h, *field, *u, *bounds, *more)
     ends = len(first), len(first) + STATE + 1
 
     def turn(*x: Tensor) -> Values:
         return iterate(*x[ends[0] : ends[1]], *x[: ends[0]], *x[ends[1] :])
 
+    found: Any = first
     if unrolled:
-        found = first
-        for _ in range(iterations + 1):  # the first one evaluates the guess
+        # Iteration 0 evaluates the guess.
+        for _ in range(iterations + 1):
             found = turn(*found, *fixed)
-        return _moved(found, held)
-    # The operator itself: its wrapper would have dynamo trace the loop, which takes longer than all else.
-    carried: Any = first
-    found = while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, carried, fixed)
-    return _moved(found, held)
-
-
-def _moved(found: Values, held: Values) -> Values:
-    """Newton's carry with Δ in its place: where friction can hold a coordinate, what is carried is z."""
-    return (*found[:2], soft_threshold(found[2], held[1]), *found[3:]) if held else found
+    else:
+        # The operator itself: its wrapper would have dynamo trace the loop, which takes longer than all else.
+        found = while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, found, fixed)
+    # Where friction can hold a coordinate, Newton's unknown is z, and Δ is the part of z beyond the bound.
+    return (*found[:2], soft_threshold(found[2], bounds[1]), *found[3:]) if bounds else found
 
 
 class RolloutModule(nn.Module):
-    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside, Newton's of at most `iterations`."""
+    """(q, p, s, h[, u]) → K steps, h of shape (K, B), with the loop over steps and Newton's loop inside."""
 
     def __init__(self, graphs: StepGraphs, iterations: int):
         super().__init__()
@@ -69,7 +69,7 @@ class RolloutModule(nn.Module):
     ) -> Values:
         """K steps from one state: q, p (K, B, n), s, c, residual (K, B), status (K, B) uint8 and, with a box, outside.
 
-        Entry k is what step k = 1 … K gives, and NaN from a failed step on.
+        Entry k is the result of step k = 1 … K; the state is NaN from a failed step on.
         """
         graphs, layout = self.graphs, self.graphs.layout
         carry = [dense(x) for x in graphs.start(q, p, s)]
@@ -99,8 +99,9 @@ class StepModule(nn.Module):
     """(q, p, s, h[, u]) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state.
 
     The solve is outside autograd; its derivative is that of the implicit-function theorem, dΔ = −J⁻¹ dF, with J at the
-    solution. A step in closed form is differentiated as it stands. With `linearised`, d(q, p, s)′ / d(q, p, s, h, u),
-    (B, 2n+1, 2n+2+m), is one more output instead. With `unrolled` there is no loop, and no derivative either.
+    solution. A step in closed form is differentiated directly. With `linearised` the derivative is a last output,
+    d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m), and autograd has none. With `unrolled` there is no loop, and no
+    derivative either.
     """
 
     def __init__(
@@ -144,11 +145,11 @@ class StepModule(nn.Module):
             if self.attaches:
                 found = self._attached((q, p, s, h), (*graphs.layout.split(carry)[1], *u), found)
         new = graphs.finish(h, *u, *carry, *found)
-        said = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
+        outputs = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
         if self.jacobian is None:
-            return said
+            return outputs
         (J,) = self.jacobian(q, p, s, h, found[2] if found else new[0] - q, *u)
-        return *said, torch.where((said[5] == CONVERGED)[:, None, None], J, torch.nan)
+        return *outputs, torch.where((outputs[5] == int(Status.CONVERGED))[:, None, None], J, torch.nan)
 
     def _attached(self, problem: Values, more: Values, found: Values) -> Values:
         """Newton's last carry, with Δ, p1, L and c as functions of the problem."""
@@ -156,7 +157,8 @@ class StepModule(nn.Module):
         fixed = (x.detach() for x in more)
         J = self.slopes(*(x.detach() for x in problem), delta, *fixed)[-1]
         F = self.first_order(*problem, delta, *more)[0]
-        delta = delta - eliminate(J, (F - F.detach())[..., None])[..., 0]  # the same value
+        # The same value, with the derivative −J⁻¹ dF.
+        delta = delta - eliminate(J, (F - F.detach())[..., None])[..., 0]
         _, *values = self.first_order(*problem, delta, *more)
         return (*found[:2], delta, *found[3:7], *values)
 
@@ -170,8 +172,8 @@ class InitModule(nn.Module):
 
     def forward(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, *u: Tensor) -> tuple[Tensor, Tensor]:
         """p1 (B, n) and s1 (B,)."""
-        here = () if self.field is None else self.field(q0)
-        _, p1, L, _ = self.first_order(q0, torch.zeros_like(q0), s0, h, q1 - q0, *here, *u)
+        field = () if self.field is None else self.field(q0)
+        _, p1, L, _ = self.first_order(q0, torch.zeros_like(q0), s0, h, q1 - q0, *field, *u)
         if self.field is not None:
             V, slope = self.field(q1)
             L, p1 = L - h / 2 * V, p1 - (h / 2)[..., None] * slope

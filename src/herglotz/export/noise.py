@@ -1,4 +1,4 @@
-"""The noise levels of a fit: those under which the filter finds its recording the likeliest."""
+"""The noise levels of a fit: those of the largest likelihood of the recording under the filter."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.smoother import process_noise
 
-# The scale of the noise is that of the last 50 samples. Windows of the measured UW double pendulum have a mean surprise
-# of 1.2 to 2.7 then, where 2 is right, and 0.6 to 3.5 with the same noise in all of them (`benchmarks/filter.py`).
+# The scale of the noise is learned from about the last 50 samples. Windows of the measured UW double pendulum then have
+# a mean surprise of 1.2 to 2.7, where 2 is right, and of 0.6 to 3.5 with a fixed scale (`benchmarks/filter.py`).
 ADAPTATION = 0.02
 
 
 def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
-    """The noise of positions and of unknown forces under which the filter finds the data of the fit the likeliest.
+    """The noise of positions and of unknown forces with the largest likelihood of the fit's data under the filter.
 
-    They minimise −2 log p = Σ (y_i − q_i)²/S_i + log S_i over the innovations of the run's own samples whose positions
-    were all read. Beyond 8 coordinates and where there is no C compiler they are what the fit itself assumes.
+    Both minimise −2 log p = Σ (y_i − q_i)²/S_i + log S_i over the innovations of the run's own samples whose positions
+    were all read. Beyond 8 coordinates and without a C compiler both are those that the fit itself assumes.
 
     Source: A. C. Harvey, Forecasting, structural time series models and the Kalman filter (1989), section 3.4.
 
@@ -46,12 +46,12 @@ def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
     run
         What `fit` returned.
     theta
-        Standard deviations of numbers that wander, as they shall be in the noise.
+        Standard deviations of the random walks of estimated numbers, for the result.
 
     Returns
     -------
     Noise
-        Standard deviations in the units of the data, with a scale that is learned (`adaptation`).
+        Standard deviations in the units of the data, and `adaptation`, by which the filter learns their scale.
 
     Raises
     ------
@@ -65,23 +65,24 @@ def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
         raise InputError("the run's metrics have no noise (sigma) > 0; give noise to the filter")
     levels = torch.cat([problem.deviations.expand(n), momentum.expand(n)]).double()
     if n <= MAX_DERIVATIVES and _compiles():
-        # From forces that make each momentum anew: the filter follows any motion there, and loses none on the way down.
+        # The descent starts at forces so large that the filter follows any motion.
         levels[n:] = problem.mass * problem.speed / math.sqrt(h)
         levels = _descended(_likelihood(run), levels.log()).exp()
     return Noise(levels[:n].tolist(), levels[n:].tolist(), theta, ADAPTATION)
 
 
 def input_at(model: ContactLagrangian, data: Trajectories, row: int, part: Tensor) -> Tensor | None:
-    """The input (m,) at this part of the recorded step that starts at a row."""
+    """The input (m,) at a part, 0 to 1, of the recorded step that starts at a row."""
     if not model.inputs:
         return None
     u = data.inputs_of_steps(torch.tensor([row]), part[None])
-    assert u is not None  # `step_inputs` has checked
+    # `step_inputs` has refused a recording without inputs.
+    assert u is not None
     return u[0]
 
 
 def momentum_at(model: ContactLagrangian, data: Trajectories, row: int) -> tuple[Tensor, Tensor]:
-    """The momentum (n,) that FL⁻ gives a sample and the next one, and its derivative (n, n) by the next one."""
+    """The momentum FL⁻ (n,) of a sample and the next sample, and its derivative (n, n) by the next sample."""
     q0, q1, h = data.q[row], data.q[row + 1], data.t[row + 1] - data.t[row]
     u = input_at(model, data, row, torch.tensor(0.5, dtype=torch.float64))
     zero = torch.zeros((), dtype=torch.float64)
@@ -93,9 +94,9 @@ def momentum_at(model: ContactLagrangian, data: Trajectories, row: int) -> tuple
         return momentum(q1), forward_slopes(momentum, q1)
 
 
-def parts_of(h: float, most: float) -> int:
-    """As few equal steps of a recorded one as are no longer than `most`."""
-    return max(1, math.ceil(h / most - 1e-6))
+def parts_of(h: float, longest: float) -> int:
+    """The number of equal steps in a recorded step h: the fewest that are no longer than `longest`."""
+    return max(1, math.ceil(h / longest - 1e-6))
 
 
 def _compiles() -> bool:
@@ -134,14 +135,14 @@ def _likelihood(run: FittedRun) -> Callable[[Tensor], float]:
     return found
 
 
-def _parts(data: Trajectories, most: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The steps of the model, as few equal ones of each recorded one as are no longer than `most`.
+def _parts(data: Trajectories, longest: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The model's steps: each recorded step is cut into the fewest equal steps that are no longer than `longest`.
 
-    How many of them lead to each sample (N,); of each, the row where its recorded step starts, where in that its middle
-    is, from 0 to 1, and its length, all (K,).
+    The number of model steps to each sample (N,); then of each model step the row at which its recorded step starts,
+    the place of its middle in the recorded step, from 0 to 1, and its length, all (K,).
     """
     recorded = data.steps()
-    counts = torch.tensor([parts_of(h, most) for h in recorded.h.tolist()])
+    counts = torch.tensor([parts_of(h, longest) for h in recorded.h.tolist()])
     parts = torch.zeros(data.samples, dtype=torch.int64).index_copy(0, recorded.index + 1, counts)
     rows, h, spread, before = (
         x.repeat_interleave(counts) for x in (recorded.index, recorded.h, counts, counts.cumsum(0) - counts)
@@ -151,7 +152,7 @@ def _parts(data: Trajectories, most: float) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 def _descended(cost: Callable[[Tensor], float], x: Tensor) -> Tensor:
-    """The least of a function, coordinate by coordinate; to a tenth, as a level needs no more digits."""
+    """The minimum of a function of logarithms by coordinate descent, to a step of 0.1: a tenth of a level is enough."""
     best, step = cost(x), 1.0
     while step > 0.1:
         moved = False
@@ -164,7 +165,7 @@ def _descended(cost: Callable[[Tensor], float], x: Tensor) -> Tensor:
 
 
 def _problem(run: FittedRun) -> SmoothingProblem:
-    """The smoothing of the run's own data, for the noise that it assumes."""
+    """The smoothing problem of the run's own data, which holds the noise that the fit assumes."""
     data, high = run.data.unwrapped(), run.h_range[1]
     process = run.metrics.get("process") or process_noise(run.model, run.h)
     sigma = run.metrics.get("sigma") or 0.0

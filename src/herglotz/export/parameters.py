@@ -1,4 +1,4 @@
-"""Numbers of a model that an exported header takes at run time: which, their defaults and bounds."""
+"""Numbers of a model that an exported header takes at run time: their names, defaults and bounds."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from herglotz.models.numbers import chosen, combined, lines, values_of, with_val
 from herglotz.training import Run
 
 Bounds = tuple[float | None, float | None]
-# By name, or by name with bounds; None: no bound on that side.
+# Names, or names with bounds; None: no bound on that side.
 Chosen = Sequence[str] | Mapping[str, Bounds | None]
 
 
 def parsed(words: Sequence[str]) -> dict[str, Bounds]:
-    """What `NAME` or `NAME=LOW:HIGH` of each word says; either bound may be left out.
+    """Names with bounds from words such as `NAME` or `NAME=LOW:HIGH`; either bound may be left out.
 
     Raise InputError if a bound is no number, or a name is given twice.
     """
@@ -38,7 +38,7 @@ def parsed(words: Sequence[str]) -> dict[str, Bounds]:
 def described_parameters(model: ContactLagrangian, parameters: Chosen) -> dict[str, list[float | None]]:
     """Entries of a file's metadata: the value (the default), low and high of each number, None without a bound.
 
-    Raise InputError if the model has no such number, one is named twice, or its value lies outside its bounds.
+    Raise InputError if the model has no such number, a name is given twice, or a value lies outside its bounds.
     """
     if isinstance(parameters, str):
         raise InputError(f"parameters takes a list of names, got the text '{parameters}'; write ['{parameters}']")
@@ -60,12 +60,12 @@ def described_parameters(model: ContactLagrangian, parameters: Chosen) -> dict[s
 
 
 def between(run: Run, name: str, other: Run) -> Run:
-    """The run with a number `name` that moves all numbers of its model: 0 is this run, and 1 another one.
+    """The run with a number `name` that moves all numbers of its model: at 0 to this run's, at 1 to the other's.
 
-    As of a payload: fits of the same terms without it and with it, and loads between and beyond them lie on this line
-    (`herglotz.models.numbers.combined`). The name goes into `parameters` of `export` and of `hz.filter`.
+    Example: fits of the same terms without a payload and with one. Smaller and larger payloads lie on the line through
+    both (`herglotz.models.numbers.combined`). `parameters` of `export` and of `hz.filter` take the name.
 
-    Raise InputError if the models have other numbers, or differ in a network's weights or not at all.
+    Raise InputError if the models have different numbers, differ in a network's weights, or do not differ at all.
     """
     own, theirs = numbers_of(run.model), numbers_of(other.model)
     if odd := sorted(set(own) ^ set(theirs)):
@@ -78,29 +78,30 @@ def between(run: Run, name: str, other: Run) -> Run:
 
 
 def moved_numbers(model: ContactLagrangian, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """An entry of a file's metadata where one of the parameters stands for several: these, and their values at 1."""
+    """The metadata entry `between`: parameters that move several numbers, with the values of these numbers at 1."""
     found = {}
     for name, line in lines(model).items():
-        if name in parameters:
-            if line.value:
-                raise InputError(f"{name} is {line.value:g} in the model; export the model at 0")
-            names = [x for x, (parameter, _) in numbers_of(model).items() if parameter in line.ends]
-            found[name] = dict(zip(names, values_of(with_values(model, {name: 1.0}), names), strict=True))
+        if name not in parameters:
+            continue
+        if line.value:
+            raise InputError(f"{name} is {line.value:g} in the model; export the model at 0")
+        names = [x for x, (parameter, _) in numbers_of(model).items() if parameter in line.ends]
+        found[name] = dict(zip(names, values_of(with_values(model, {name: 1.0}), names), strict=True))
     return {"between": found} if found else {}
 
 
 def with_moved_numbers(model: ContactLagrangian, entries: Mapping[str, Any]) -> ContactLagrangian:
-    """The model with the numbers of a file's metadata that stand for several, where it has not got them itself."""
+    """The model with the entry `between` of a file's metadata, where the model does not have it already."""
     for name, values in entries.get("between", {}).items():
         model = model if name in lines(model) else combined(model, name, values)
     return model
 
 
 def checked_values(entries: Mapping[str, Any], values: Mapping[str, float]) -> list[float]:
-    """The numbers of these entries, with `values` in place of the defaults.
+    """The values of all numbers in these entries, with `values` in place of the defaults.
 
-    Raise InputError if there is no such number, or a value is not finite or outside its bounds: what NAME_set_parameter
-    refuses.
+    Raise InputError if no entry has such a name, or a value is not finite or outside its bounds, as NAME_set_parameter
+    of the header does.
     """
     unknown = sorted(set(values) - set(entries))
     if unknown:

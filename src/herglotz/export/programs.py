@@ -1,4 +1,4 @@
-"""The programs of an exported file, traced once for every format: one step, K steps, and the start from positions."""
+"""The programs of an exported file for every format: a step, K steps, a start from positions, velocities."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
-from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.files import PathLike
 from herglotz.export.equation import Equations, example
 from herglotz.export.inline import inlined, opaque
 from herglotz.export.metadata import describe
 from herglotz.export.module import InitModule, LegendreModule, RolloutModule, StepModule
-from herglotz.export.step import ITERATIONS, StepGraphs
-from herglotz.export.trusted import remember
+from herglotz.export.step import MAX_ITERATIONS, StepGraphs
+from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
-EXAMPLE_STEPS = 13  # of the traced rollout; the number of steps stays free
+# Steps of the example rollout; the number of steps of the program stays free.
+EXAMPLE_STEPS = 13
 
 
 def programs_of(
     model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str], inlines: bool = True
 ) -> dict[str, ExportedProgram]:
-    """Those programs of `model` (a differentiable step), `rollout`, `linearise`, `init`, `legendre` that are named.
+    """The named programs: `model` (a differentiable step), `rollout`, `linearise`, `init` and `legendre`.
 
-    Each holds for any batch size; `entries` is the file's metadata. Without `inlines`, the traced graphs in a program
-    stay operators (`herglotz.export.inline.opaque`).
+    Each takes any batch size; `entries` is the file's metadata. Without `inlines`, the traced graphs in a program stay
+    operators (`herglotz.export.inline.opaque`).
     """
     equations = Equations.of(model)
     graphs = StepGraphs(equations.model, entries["box"], entries.get("h_range"))
@@ -53,21 +54,24 @@ def programs_of(
 
 def _program(module: nn.Module, arguments: tuple[Tensor, ...], stacked: bool, inlines: bool) -> ExportedProgram:
     """Export a module of (q, p, s, h, *u) for any batch size; if `stacked`, h and u have a free axis of steps first."""
-    one = {0: Dim.DYNAMIC}
-    late = {0: Dim.DYNAMIC, 1: Dim.DYNAMIC} if stacked else one
-    inputs = ((late,),) if len(arguments) > 4 else ()  # what arrives through *u is a tuple of its own
+    of_state = {0: Dim.DYNAMIC}
+    of_h = {0: Dim.DYNAMIC, 1: Dim.DYNAMIC} if stacked else of_state
+    # torch.export takes the arguments of *u as one tuple.
+    of_u = ((of_h,),) if len(arguments) > 4 else ()
     with torch.no_grad(), opaque(module):
-        program = torch.export.export(module, arguments, dynamic_shapes=(one, one, one, late, *inputs))
+        program = torch.export.export(module, arguments, dynamic_shapes=(of_state, of_state, of_state, of_h, *of_u))
     if inlines:
         return _slim(inlined(program))
-    program.graph_module.meta["holds"] = module  # and with it the graphs that the operators stand for
+    # The program keeps the module alive, and with it the graphs of the operators.
+    program.graph_module.meta["module"] = module
     return program
 
 
 def _slim(program: ExportedProgram) -> ExportedProgram:
-    """Drop stack traces (most of the file, and full of local paths) and give constants their own storage.
+    """Drop stack traces (most of the file, with local paths in them) and give constants their own storage.
 
-    Index tensors are views of one storage; torch saves such a group in one piece, and warns that it may be wrong.
+    Index tensors are views of one storage; torch saves such a group in one piece, and warns that the piece may be
+    wrong.
     """
     for module in program.graph_module.modules():
         for node in getattr(module, "graph", program.graph).nodes:
@@ -81,7 +85,7 @@ def _slim(program: ExportedProgram) -> ExportedProgram:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without the remarks that torch's exporters make on their own code."""
+    """Suppress warnings and logs of torch's exporters about torch's own code."""
     logs = [logging.getLogger(name) for name in ("torch.export", "torch.onnx", "torch._inductor")]
     levels = [log.level for log in logs]
     for log in logs:
@@ -96,7 +100,10 @@ def quiet() -> Iterator[None]:
 
 
 def writes(content: Callable[..., bytes]):
-    """Make of a function (model, metadata, **form) → content of a file, sealed, the function that writes the file."""
+    """Turn a function (model, metadata, **options) → sealed content of a file into the function that writes the file.
+
+    The new function has the arguments that all formats share, and those of the old one's options.
+    """
 
     def export(
         model: ContactLagrangian,
@@ -106,18 +113,17 @@ def writes(content: Callable[..., bytes]):
         box: Mapping[str, Sequence[float]] | None = None,
         units: Sequence[str] = (),
         metadata: Mapping[str, Any] | None = None,
-        newton_iterations: int = ITERATIONS,
-        **form: Any,
+        newton_iterations: int = MAX_ITERATIONS,
+        **options: Any,
     ) -> Path:
-        made = content(model, describe(model, h, box, units, newton_iterations, metadata or {}), **form)
-        write_atomically(path, made)
-        remember(made)
-        return Path(path)
+        entries = describe(model, h, box, units, newton_iterations, metadata or {})
+        return write_trusted(path, content(model, entries, **options))
 
     _, _, *own = inspect.signature(content).parameters.values()
     signature: Any = inspect.signature(export)
     known = [x for x in signature.parameters.values() if x.kind is not x.VAR_KEYWORD]
-    setattr(export, "__signature__", signature.replace(parameters=[*known, *own]))  # noqa: B010  pyright knows no such
+    # setattr, because pyright knows no such attribute of a function.
+    setattr(export, "__signature__", signature.replace(parameters=[*known, *own]))  # noqa: B010
     for name in ("__module__", "__name__", "__qualname__", "__doc__"):
         setattr(export, name, getattr(content, name))
     return export

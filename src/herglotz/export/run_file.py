@@ -1,4 +1,4 @@
-"""`export_run`: a run as one file, with its names, units, start and metrics inside."""
+"""`export_run`: a run as one file, with the run's names, units, start and metrics."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ IN_C: dict[str, Callable[..., Path]] = {
     "fmu2": partial(export_fmu, version="2.0"),
 }
 WRITERS = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx} | IN_C
-# What only some kinds take: these kinds, and words for the refusal.
+# Arguments of some kinds only: these kinds, and the words of the refusal.
 OF_KINDS: dict[str, tuple[Collection[str], str]] = {
     "name": (IN_C, "a prefix (name) is of C headers only"),
     "dtype": (IN_C, "dtype is of C headers only"),
@@ -38,7 +38,8 @@ OF_KINDS: dict[str, tuple[Collection[str], str]] = {
     "extras": (("c",), "extras are of C headers only"),
     "unroll": (("onnx",), "unroll is of ONNX only"),
 }
-KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c", ".c": "casadi", ".fmu": "fmu"}  # of a file, by the end of its name
+# The kind of a file by the end of its name.
+KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c", ".c": "casadi", ".fmu": "fmu"}
 
 
 def export_run(
@@ -64,25 +65,24 @@ def export_run(
     kind
         "pt2", "aoti", "onnx", "c", "casadi", "acados", "fmu" (FMI 3.0) or "fmu2" (2.0); None: by the end of the name.
     h_range
-        Steps that the file is for; None: those of the fit and of the recording, which a fit may cross in several of
-        its own. An end that agrees with the run's own step to six digits is taken for it: recorded times carry
-        rounding, and 0.2 means a step of 0.2000000000000002 too.
+        Shortest and longest step of the file; None: the steps of the fit and of the recording, which a fit may cross
+        in several steps. An end that equals the run's own step to six digits becomes the run's step: recorded times
+        are rounded, and 0.2 also means 0.2000000000000002.
     name
-        Prefix of every name in C, as of `export_c`, and the identifier of an FMU; None: that of the file.
+        Prefix of every name in C, as in `export_c`, and the identifier of an FMU; None: the file's name.
     dtype
-        Of the numbers in C, "float64" or "float32"; None: float64, or what `herglotz tune` chose.
+        Type of the numbers in C, "float64" or "float32"; None: float64, or the choice of `herglotz tune`.
     parameters
-        Numbers that a C header takes at run time, as of `export_c`.
+        Numbers that a C header takes at run time, as in `export_c`.
     extras
-        What else a C header holds, as of `export_c`; a filter has the noise of the fit as `NAME_noise_of_fit`.
+        Further functions of a C header, as in `export_c`; a filter has the noise of the fit as `NAME_noise_of_fit`.
     unroll
-        Of an ONNX file: a single step with so many of Newton's iterations and no loop, as of `export_onnx`.
+        Newton's iterations of an ONNX file of a single step without a loop, as in `export_onnx`.
 
     Raises
     ------
     InputError
-        If the name has another end, the format cannot hold the model, a prefix or a dtype is given for a format
-        without C, parameters for another one than a C header, or unroll for another one than ONNX.
+        If the name has another end, the format cannot hold the model, or an argument is not one of this format.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
@@ -106,19 +106,19 @@ def export_run(
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and kind in IN_C and dtype in (None, run.setting["dtype"]):
-        # A tolerance of tune is one of its own dtype.
+        # The tolerance of `herglotz tune` is for the dtype that tune chose.
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
     described |= asked
     if "filter" in extras:
-        still = (0.0,) * len(described_parameters(run.model, parameters))
-        noise = noise_of(run, still)._asdict()
+        constant = (0.0,) * len(described_parameters(run.model, parameters))
+        noise = noise_of(run, constant)._asdict()
         metadata["noise"] = {key: x if isinstance(x, float) else list(x) for key, x in noise.items()}
     WRITERS[kind](run.model, path, **described)
     return path
 
 
 def _of_inputs(run: Run) -> dict[str, Any]:
-    """How inputs are read and, where they were recorded, the lowest and highest of the training part."""
+    """How inputs arrive and, where the run has recorded inputs, their range in the training part."""
     if not run.model.inputs:
         return {}
     found: dict[str, Any] = {"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]}

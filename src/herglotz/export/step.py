@@ -1,4 +1,4 @@
-"""One step of a model as a few traced functions: what every rollout loop in a `.pt2` or ONNX file is made of.
+"""One step of a model as a few traced functions, from which the rollout loops of `.pt2` and ONNX files are made.
 
     start    (q, p, s) → carry
     begin    (h, carry) → Newton's first carry           only where a step iterates
@@ -7,10 +7,11 @@
     finish   (h, u, carry[, Newton's last carry]) → carry, then c[, residual, status]
     report   (h, q, p, s, q1, p1, s1, c[, residual, status]) → the file's outputs
 
-The carry is q, p, s; then V and V′ at q where the model's terms are known; then the last velocities where a guess
-continues them; then, in float32, what rounding took from q and s (Kahan's sum; without it a digit is lost every ten
-steps). Vectors are (B, n), numbers a sample (B,). Newton's unknown is Δ = q1 − q0, because the difference q1 − q0 would
-round a small step away; where dry friction can hold a coordinate it is the z of `herglotz.stepping.stick_slip`.
+The carry is q, p, s; then V and V′ at q where the model's terms are known; then the last velocities where the guess
+continues them; then, in float32, the rounding errors of q and s (Kahan's sum; without it a digit is lost every ten
+steps). Vectors are (B, n), scalars of a sample (B,). Newton's unknown is Δ = q1 − q0, because the difference q1 − q0
+would lose the digits of a small step; where dry friction can hold a coordinate, the unknown is the z of
+`herglotz.stepping.stick_slip`.
 """
 
 from __future__ import annotations
@@ -32,18 +33,20 @@ from herglotz.stepping.field import Field, FieldOf
 from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.stick_slip import at_rest
 
-# The guess of Δ/h continues the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear,
-# affine and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six; where steps differ
-# tenfold, 3.0 to 3.6 with three and 3.2 to 3.9 with six, which amplify the difference.
-CONTINUE = (3.0, -3.0, 1.0)
-STATE = 3  # q, p, s
-FLOOR = 1000  # machine epsilons of q: rounding in J⁻¹F that no further iteration removes
-ITERATIONS = 30  # default bound; a step from a good guess takes two to four
-DECREASE = 1e-4  # share of the predicted decrease of |F| that an accepted trial must reach (Armijo's rule)
-CARRIED = 10  # tensors between two iterations: count, done, x, delta, merit, fraction, scale, p1, L, c
-# Tracing takes plain numbers, not the enumeration.
-CONVERGED, MAX_ITERATIONS = int(Status.CONVERGED), int(Status.MAX_ITERATIONS)
-SINGULAR, DIVERGED, BAD_INPUT = int(Status.SINGULAR), int(Status.DIVERGED), int(Status.BAD_INPUT)
+# The guess of Δ/h extrapolates the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear,
+# affine and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six. Where step sizes differ
+# tenfold: 3.0 to 3.6 with three velocities and 3.2 to 3.9 with six, which amplify the difference.
+EXTRAPOLATION = (3.0, -3.0, 1.0)
+# The first tensors of every carry: q, p, s.
+STATE = 3
+# Rounding of J⁻¹F in machine epsilons of q; no further iteration makes J⁻¹F smaller.
+ROUNDING_EPSILONS = 1000
+# The default bound; a step from a good guess takes two to four iterations.
+MAX_ITERATIONS = 30
+# Armijo's rule: an accepted trial reaches at least this share of the predicted decrease of |F|.
+MIN_DECREASE = 1e-4
+# Tensors handed from one iteration to the next: count, done, x, delta, merit, fraction, scale, p1, L, c.
+CARRIED = 10
 
 Values = tuple[Tensor, ...]
 
@@ -52,35 +55,33 @@ class Layout:
     """Which tensors the carry of a model holds, and where."""
 
     def __init__(self, model: ContactLagrangian):
-        made_of = model.capabilities
-        self.field = 2 * made_of.by_terms  # V and V′
-        self.iterates = not made_of.explicit
-        self.sticks = made_of.sticking  # the iteration has a start of its own
+        capabilities = model.capabilities
+        # V and V′ are two tensors.
+        self.field = 2 * capabilities.by_terms
+        self.iterates = not capabilities.explicit
+        self.sticks = capabilities.sticking
+        # A sticking step starts from the equation at rest, not from the last velocities.
         self.trail = self.iterates and not self.sticks
         self.compensated = next(model.parameters()).dtype == torch.float32
         self.size = STATE + self.field + self.trail + 2 * self.compensated
 
     def split(self, carry: Sequence[Tensor]) -> tuple[Values, Values, Values, Values]:
-        """(q, p, s), (V, V′), (velocities,) and (lost of q, lost of s), each empty where the model has none."""
+        """(q, p, s), (V, V′), (velocities,) and (error of q, error of s), each empty where the carry has none."""
         ends = (STATE, STATE + self.field, STATE + self.field + self.trail, self.size)
         return tuple(tuple(carry[a:b]) for a, b in zip((0, *ends), ends, strict=False))  # pyright: ignore
 
 
 def first_carry(guess: Tensor) -> Values:
-    """The carry before iteration 0, which evaluates the guess of Δ, (B, n)."""
+    """The carry before iteration 0, which evaluates the guess of Δ, (B, n).
+
+    x is the accepted Δ, delta the Newton step from x, merit |F| at x, fraction the part of delta that is tried next,
+    scale the size that the tolerance is relative to; p1, L and c are those at x.
+    """
     zero = torch.zeros_like(guess[:, 0])
-    return (
-        torch.zeros((), dtype=torch.int64, device=guess.device),  # count
-        torch.zeros_like(zero, dtype=torch.bool),  # done
-        guess,  # x: the accepted Δ
-        torch.zeros_like(guess),  # delta: the Newton step from x
-        torch.full_like(zero, torch.inf),  # merit: |F| at x
-        torch.ones_like(zero),  # fraction of delta that is tried next
-        length(guess),  # scale: the size that the tolerance is relative to
-        torch.zeros_like(guess),  # p1
-        zero,  # L
-        torch.zeros_like(zero),  # c
-    )
+    count, done = torch.zeros((), dtype=torch.int64, device=guess.device), torch.zeros_like(zero, dtype=torch.bool)
+    delta, merit, fraction = torch.zeros_like(guess), torch.full_like(zero, torch.inf), torch.ones_like(zero)
+    p1, L, c = torch.zeros_like(guess), zero, torch.zeros_like(zero)
+    return count, done, guess, delta, merit, fraction, length(guess), p1, L, c
 
 
 def newton_iteration(model: ContactLagrangian, *arguments: Tensor) -> Values:
@@ -88,26 +89,29 @@ def newton_iteration(model: ContactLagrangian, *arguments: Tensor) -> Values:
 
     The arguments are q, p, s, h, the carry, then V, V′ at q, u, K and w/K as far as the model has them. The rules of
     acceptance are those of `herglotz.mechanics.newton`, whose loop a file cannot hold: that loop decides in Python, for
-    all samples at once, whether the last Jacobian still serves and whether a trial was refused at all. Without these
-    decisions it takes 1.3 to 1.6 times as long for 16 samples and 1.6 to 1.9 times for 1024 (n = 2, 16×2, levels
+    all samples at once, whether the last Jacobian is kept and whether a trial was refused at all. Without these
+    decisions a step takes 1.3 to 1.6 times as long for 16 samples and 1.6 to 1.9 times for 1024 (n = 2, 16×2, levels
     linear, affine and full).
     """
     (q, p, s, h), more = arguments[:4], arguments[4 + CARRIED :]
     count, done, x, delta, merit, fraction, scale, *values = arguments[4 : 4 + CARRIED]
-    held = 2 * model.capabilities.sticking  # K and w/K
+    # K and w/K are two tensors.
+    bounds = 2 * model.capabilities.sticking
     eps = torch.finfo(q.dtype).eps
     first = count == 0
     trial = x + torch.where(done[:, None], 0.0, fraction[:, None] * delta)
-    delta_trial, size, merit_trial, *values_trial, _ = step_equation(model, held, q, p, s, h, trial, *more)
-    left = length(delta_trial)
-    scale = torch.where(first, torch.nan_to_num(torch.maximum(scale + size, left), nan=1.0, posinf=1.0), scale)
-    better = first | (merit_trial <= (1 - DECREASE * fraction) * merit)
-    settled = left <= TOLERANCE * eps * scale
+    delta_trial, size, merit_trial, *values_trial, _ = step_equation(model, bounds, q, p, s, h, trial, *more)
+    residual = length(delta_trial)
+    scale = torch.where(first, torch.nan_to_num(torch.maximum(scale + size, residual), nan=1.0, posinf=1.0), scale)
+    better = first | (merit_trial <= (1 - MIN_DECREASE * fraction) * merit)
+    settled = residual <= TOLERANCE * eps * scale
     # The networks' rounding is relative to h times the top speed, even at rest.
-    rounding = FLOOR * eps * torch.maximum(torch.maximum(scale, length(q)), max(model.config.speed) * h)
-    stalled = ~better & (length(delta) <= rounding)  # rounding, not a wrong direction
-    # No direction to follow; as in `status_of`, for a sum of two large numbers may overflow where neither does.
-    hopeless = first & ~(torch.isfinite(merit_trial) & torch.isfinite(left))
+    rounding = ROUNDING_EPSILONS * eps * torch.maximum(torch.maximum(scale, length(q)), max(model.config.speed) * h)
+    # A refused trial this near to x was refused by rounding, not by a wrong direction.
+    stalled = ~better & (length(delta) <= rounding)
+    # At a guess that is not finite no direction exists. Two tests, as in `status_of`: a sum of two large finite numbers
+    # may overflow.
+    hopeless = first & ~(torch.isfinite(merit_trial) & torch.isfinite(residual))
     accept = ~done & (better | settled)
     pairs = zip((trial, delta_trial, merit_trial, *values_trial), (x, delta, merit, *values), strict=True)
     x, delta, merit, *values = (torch.where(accept[:, None] if a.ndim > 1 else accept, a, b) for a, b in pairs)
@@ -122,27 +126,28 @@ def unfinished(count: Tensor, done: Tensor, iterations: int) -> Tensor:
 
 
 def status_of(h: Tensor, merit: Tensor, residual: Tensor, done: Tensor, L: Tensor, c: Tensor) -> Tensor:
-    """The status of each sample by the rules of the eager solver, uint8; BAD_INPUT where h is no step."""
-    status = torch.where(done, CONVERGED, MAX_ITERATIONS)
-    status = torch.where(torch.isfinite(residual) & (c != 0), status, SINGULAR)
-    status = torch.where(torch.isfinite(merit) & torch.isfinite(L), status, DIVERGED)
-    return torch.where((h > 0) & torch.isfinite(h), status, BAD_INPUT).to(torch.uint8)
+    """The status of each sample by the rules of the eager solver, uint8; BAD_INPUT where h is not a finite h > 0."""
+    # Tracing takes plain numbers, not the enumeration.
+    status = torch.where(done, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
+    status = torch.where(torch.isfinite(residual) & (c != 0), status, int(Status.SINGULAR))
+    status = torch.where(torch.isfinite(merit) & torch.isfinite(L), status, int(Status.DIVERGED))
+    return torch.where((h > 0) & torch.isfinite(h), status, int(Status.BAD_INPUT)).to(torch.uint8)
 
 
 def start(model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor) -> Values:
-    """The carry before the first step; the velocities are NaN until there is a step."""
+    """The carry before the first step; the velocities are NaN until a step was made."""
     layout = Layout(model)
-    here = FieldOf(model.potential)(q) if layout.field else ()
-    trail = (torch.full_like(q, torch.nan).repeat(1, len(CONTINUE)),) if layout.trail else ()
-    lost = (torch.zeros_like(q), torch.zeros_like(s)) if layout.compensated else ()
-    return tuple(dense(x) for x in (q, p, s, *here, *trail, *lost))
+    field = FieldOf(model.potential)(q) if layout.field else ()
+    trail = (torch.full_like(q, torch.nan).repeat(1, len(EXTRAPOLATION)),) if layout.trail else ()
+    errors = (torch.zeros_like(q), torch.zeros_like(s)) if layout.compensated else ()
+    return tuple(dense(x) for x in (q, p, s, *field, *trail, *errors))
 
 
 def begin(h: Tensor, trail: Tensor) -> Values:
     """Newton's first carry from h (B,) and the last velocities side by side, the latest first, (B, 3n)."""
-    n = trail.shape[1] // len(CONTINUE)
+    n = trail.shape[1] // len(EXTRAPOLATION)
     eye = torch.eye(n, dtype=trail.dtype, device=trail.device)
-    guess = h[:, None] * (trail @ torch.cat([weight * eye for weight in CONTINUE]))
+    guess = h[:, None] * (trail @ torch.cat([weight * eye for weight in EXTRAPOLATION]))
     return first_carry(torch.where(torch.isfinite(guess), guess, 0.0))
 
 
@@ -150,8 +155,8 @@ def begin_sticking(model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor, h:
     """Newton's first carry in z, K and w/K: `herglotz.stepping.stick_slip`."""
     equation = Terms(model, State(q, p, s), h, u).equation
     assert isinstance(equation, PartialsEquation)
-    z, *held = at_rest(equation)
-    return *first_carry(z), *(dense(x) for x in held)
+    z, *bounds = at_rest(equation)
+    return *first_carry(z), *(dense(x) for x in bounds)
 
 
 def finish(model: ContactLagrangian, h: Tensor, *rest: Tensor) -> Values:
@@ -160,60 +165,61 @@ def finish(model: ContactLagrangian, h: Tensor, *rest: Tensor) -> Values:
     `rest` is u where the model takes inputs, the carry, and Newton's carry where the step iterates.
     """
     layout = Layout(model)
-    ends = len(rest) - layout.size - CARRIED * layout.iterates
-    u, rest = rest[:ends], rest[ends:]
-    state, here, trail, lost = layout.split(rest)
+    split = len(rest) - layout.size - CARRIED * layout.iterates
+    u, rest = rest[:split], rest[split:]
+    state, field, trail, errors = layout.split(rest)
     if layout.iterates:
-        return _solved(model, h, (state, trail, lost), rest[layout.size :])
-    return _explicit(model, h, (state, here, lost), u)
+        return _solved(model, h, (state, trail, errors), rest[layout.size :])
+    return _explicit(model, h, (state, field, errors), u)
 
 
 def _explicit(model: ContactLagrangian, h: Tensor, carry: tuple[Values, ...], u: Values) -> Values:
-    """`herglotz.stepping.explicit`; NaN where h is no step or c = e^{−γh} rounds to 0."""
-    state, here, lost = carry
-    move = Leapfrog(model, inverse)(State(*state), h, Field(*here), u[0] if u else None)
+    """A step of `herglotz.stepping.explicit`; NaN where h is not a finite h > 0 or c = e^{−γh} rounds to 0."""
+    state, field, errors = carry
+    move = Leapfrog(model, inverse)(State(*state), h, Field(*field), u[0] if u else None)
     good = (h > 0) & torch.isfinite(h) & (move.c != 0)
-    q1, *lost_q = _added(state[0], torch.where(good[:, None], move.delta, torch.nan), lost[:1])
-    s1, *lost_s = _added(state[2], move.L, lost[1:])
-    return tuple(dense(x) for x in (q1, move.p1, s1, *move.there, *lost_q, *lost_s, move.c))
+    q1, *error_q = _added(state[0], torch.where(good[:, None], move.delta, torch.nan), errors[:1])
+    s1, *error_s = _added(state[2], move.L, errors[1:])
+    return tuple(dense(x) for x in (q1, move.p1, s1, *move.there, *error_q, *error_s, move.c))
 
 
 def _solved(model: ContactLagrangian, h: Tensor, carry: tuple[Values, ...], found: Values) -> Values:
     """The end of a step that iterates: NaN where it failed."""
-    ((q, _, s), trail, lost), (_, done, x, left, merit, _, _, p1, L, c) = carry, found
-    residual = length(left)
+    ((q, _, s), trail, errors), (_, done, x, newton_step, merit, _, _, p1, L, c) = carry, found
+    residual = length(newton_step)
     status = status_of(h, merit, residual, done, L, c)
-    x = torch.where((status == CONVERGED)[:, None], x, torch.nan)
-    q1, *lost_q = _added(q, x, lost[:1])
-    there: Values = ()
-    if model.capabilities.by_terms:  # what the potential at q1 adds to p1 and L
-        V, slope = there = FieldOf(model.potential)(q1)
+    x = torch.where((status == int(Status.CONVERGED))[:, None], x, torch.nan)
+    q1, *error_q = _added(q, x, errors[:1])
+    field: Values = ()
+    if model.capabilities.by_terms:
+        # The share of the potential at q1 in p1 and L.
+        V, slope = field = FieldOf(model.potential)(q1)
         p1, L = p1 - (h / 2)[:, None] * slope, L - h / 2 * V
-    s1, *lost_s = _added(s, L, lost[1:])
-    followed = (_followed(trail[0], x / h[:, None]),) if trail else ()
-    new = (q1, p1, s1, *there, *followed, *lost_q, *lost_s)
+    s1, *error_s = _added(s, L, errors[1:])
+    velocities = (_appended(trail[0], x / h[:, None]),) if trail else ()
+    new = (q1, p1, s1, *field, *velocities, *error_q, *error_s)
     return tuple(dense(y) for y in (*new, c, residual, status))
 
 
-def _added(x: Tensor, change: Tensor, lost: Values) -> Values:
-    """X + change and, where the sum is compensated, what rounding took from it."""
-    if not lost:
+def _added(x: Tensor, change: Tensor, error: Values) -> Values:
+    """The sum x + change and, where the sum is compensated, its new rounding error."""
+    if not error:
         return (x + change,)
-    wanted = change + lost[0]
+    wanted = change + error[0]
     new = x + wanted
     return new, wanted - (new - x)
 
 
-def _followed(trail: Tensor, v: Tensor) -> Tensor:
-    """The last velocities after another; the first one fills all places."""
+def _appended(trail: Tensor, v: Tensor) -> Tensor:
+    """The last velocities with v in front; the velocity of the first step fills all places."""
     shifted = torch.cat([v, trail[:, : -v.shape[1]]], -1)
-    return torch.where(torch.isnan(trail), v.repeat(1, len(CONTINUE)), shifted)
+    return torch.where(torch.isnan(trail), v.repeat(1, len(EXTRAPOLATION)), shifted)
 
 
 class StepGraphs(nn.Module):
-    """The functions of a step, traced, of a model that is not to be trained any more.
+    """The traced functions of a step, of a model that is not trained any more.
 
-    `box` and `h_range` say where it was fitted, for the output `outside` (`herglotz.export.box`).
+    `box` and `h_range` are those that the model was fitted in, for the output `outside` (`herglotz.export.box`).
     """
 
     def __init__(
@@ -228,17 +234,17 @@ class StepGraphs(nn.Module):
         self.inputs = len(u)
         self.start = traced(partial(start, model), (q, p, s))
         carry = [y + 0.1 * i for i, y in enumerate(self.start(q, p, s))]
-        here = carry[STATE : STATE + layout.field]
+        field = carry[STATE : STATE + layout.field]
         found: list[Tensor] = []
         if layout.iterates:
             found = [y.clone() for y in first_carry(0.1 * p)]
-            held: list[Tensor] = []
+            bounds: list[Tensor] = []
             if layout.sticks:
                 self.begin = traced(partial(begin_sticking, model), (q, p, s, h, *u))
-                held = [y + 0.1 * (i + 1) for i, y in enumerate((q, p))]
+                bounds = [y + 0.1 * (i + 1) for i, y in enumerate((q, p))]
             else:
                 self.begin = traced(begin, (h, carry[STATE + layout.field]))
-            self.iterate = traced(partial(newton_iteration, model), (q, p, s, h, *found, *here, *u, *held))
+            self.iterate = traced(partial(newton_iteration, model), (q, p, s, h, *found, *field, *u, *bounds))
         self.finish = traced(partial(finish, model), (h, *u, *carry, *found))
         rows = [y + 1 for y in (q, p, s, s + 1)]
         solved = (s + 3, (s > 0).to(torch.uint8)) if layout.iterates else ()

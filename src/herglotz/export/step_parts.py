@@ -1,4 +1,4 @@
-"""What C is made of: one traced step, with the potential's values at its ends as inputs, for the lowering to cut."""
+"""One traced step for C, with the potential at both ends as inputs; `herglotz.export.lower.c` cuts it into pieces."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip, at_rest
 
-Ends = tuple[Field, Field]  # the potential at q0 and q1
-Parts = tuple[Tensor, ...]  # what `StepParts` gives
+# The potential at q0 and q1.
+Ends = tuple[Field, Field]
+# The results of `StepParts`.
+Parts = tuple[Tensor, ...]
 
 
 def step_parts(equations: Equations) -> Graph:
-    """`StepParts`, traced."""
+    """`StepParts` as a graph."""
     q, p, s, h, *u = example(equations.model, 0.1)
     V, slope = field_like(q)
     more = (V, slope, 0.1 * p, 0.2 * p, V + 1, slope + 1)
@@ -40,7 +42,7 @@ def step_parts(equations: Equations) -> Graph:
 
 
 def pushed(model: ContactLagrangian) -> ContactLagrangian:
-    """The model with the forces of its inputs as its inputs: G is the unit matrix, u₀ is 0. Changed in place."""
+    """The model with generalised forces as inputs: G becomes the unit matrix, u₀ becomes 0. Changed in place."""
     friction, n = model.friction, model.config.dof
     if model.config.inputs and friction is not None:
         model.config = replace(model.config, inputs=n, input_map=())
@@ -52,9 +54,9 @@ def pushed(model: ContactLagrangian) -> ContactLagrangian:
 
 
 class GivenPotential(nn.Module):
-    """Stands in for a model's potential where its values at q0 and q1 are inputs: no second derivative is asked for."""
+    """A potential whose values and slopes at q0 and q1 are given; its second derivatives are 0 and never read."""
 
-    def __init__(self, potential: Potential, ends: tuple[Field, Field]):
+    def __init__(self, potential: Potential, ends: Ends):
         super().__init__()
         self.features = potential.features
         self.ends = ends
@@ -70,9 +72,9 @@ class GivenPotential(nn.Module):
 
 
 class StepParts:
-    """Everything that a step is made of, for a format that cuts it into pieces itself (`herglotz.export.lower.c`).
+    """The terms of a step, for `herglotz.export.lower.c`.
 
-    Where the step is explicit, the guess is the solution, and J is not known.
+    Where the step is explicit, the guess is the solution, and J is 0.
     """
 
     def __init__(self, model: ContactLagrangian):
@@ -81,15 +83,15 @@ class StepParts:
     def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
         """The guess of Δ, F and J at the trial, and p1 − p0, s1 − s0 and c − 1.
 
-        The arguments are q, p (B, n), s, h (B,), V0 (B,) and V′ (B, n) at q0, a trial Δ = q1 − q0 and the exact one
-        near by (B, n), V1 and V′ at q1, and the inputs u (B, m) where the model takes some. Where dry friction can hold
-        a coordinate, Δ stands for the z of `herglotz.stepping.stick_slip`, and w/K follows.
+        The arguments are q, p (B, n), s, h (B,), V0 (B,) and V′ (B, n) at q0, a trial Δ = q1 − q0 and the exact Δ near
+        the trial (B, n), V1 and V′ at q1, and u (B, m) where the model takes inputs. Where dry friction can hold a
+        coordinate, Δ stands for the z of `herglotz.stepping.stick_slip`, and w/K is a last result.
         """
         (q, p, s, h, V0, slope0, delta, x, V1, slope1), u = arguments[:10], arguments[10:]
         ends = Field(V0, slope0), Field(V1, slope1)
-        made_of = self.model.capabilities
-        form = self._explicit if made_of.explicit else self._by_terms if made_of.by_terms else self._by_jets
-        if made_of.sticking:
+        known = self.model.capabilities
+        form = self._explicit if known.explicit else self._by_terms if known.by_terms else self._by_jets
+        if known.sticking:
             form = self._by_sticking
         guess, F, J, dp, L, E, *bound = form(State(q, p, s), h, ends, delta, x, u[0] if u else None)
         return *(y.clone() for y in (guess, F, J, dp, L)), E.expand(s.shape).clone(), *bound
@@ -100,7 +102,8 @@ class StepParts:
         assert move.dp is not None
         maker = model_equation(self.model, fold=False)
         assert maker is not None
-        F = maker.at(state, h, u, True, ends[0])(delta, False).F  # for FL⁺, not for the step
+        # FL⁺ needs F; the step itself does not.
+        F = maker.at(state, h, u, True, ends[0])(delta, False).F
         J = F[..., None] * torch.zeros_like(F)[..., None, :]
         return move.delta, F, J, move.dp, move.L, frog.constants(h).c_minus_1
 
@@ -111,12 +114,14 @@ class StepParts:
         form = maker.at(state, h, u, True, ends[0])
         point = form(delta, True)
         v, mv, N, damping, force = form.at(x, point).rest
-        if self.model.friction is not None:  # dry friction near rest is steep: it is taken at the exact velocity
+        if self.model.friction is not None:
+            # Dry friction is steep near rest, so it is evaluated at the exact velocity.
             force = self.model.friction.value_and_slope(v, u)[0]
         end = form.end(x, Point(point.F, point.J, (v, mv, N, damping, force)))
         E = form.constants.c_minus_1 if damping is None else damping[1]
         dp = end.dp
-        if dp is None:  # F is not quite 0: what x adds to p1 is what it takes from F
+        if dp is None:
+            # F at the trial is not quite 0: the move from the trial to x adds F to p1.
             dp = (form.end(delta, point).p1 + point.F) - state.p
         assert point.J is not None
         return form.leap(), point.F, point.J, dp, end.L, E
@@ -126,7 +131,8 @@ class StepParts:
             form = PartialsEquation(driven_by(self.model, u), state, h, 1, increments=True)
             point = form(delta, True)
         end = form.end(delta, point)
-        dp = (end.p1 + point.F) - state.p  # as F is not quite 0
+        # F at the trial is not quite 0, as in `_by_terms`.
+        dp = (end.p1 + point.F) - state.p
         assert point.J is not None
         guess = self._leap(state, h, ends[0])
         return guess, point.F, point.J, dp, end.L + (end.p1 * (x - delta)).sum(-1), point.rest.D3
@@ -138,16 +144,17 @@ class StepParts:
             form = StickSlip(equation, stiffness, bound)
             point = form(delta, True)
         end, moved = equation.end(delta, point), soft_threshold(x, bound) - soft_threshold(delta, bound)
-        left = point.F - torch.where(form.slides(delta), 0.0, stiffness * (x - delta))  # −J (Δ(x) − Δ)
+        # −J (Δ(x) − Δ): F changes with Δ alone, not with the part of z inside the bound.
+        left = point.F - torch.where(form.slides(delta), 0.0, stiffness * (x - delta))
         assert point.J is not None
         L = end.L + (end.p1 * moved).sum(-1)
         return guess, point.F, point.J, (end.p1 + left) - state.p, L, point.rest.D3, bound.clone()
 
     @contextmanager
     def _given(self, ends: Ends) -> Iterator[None]:
-        """The model with its potential known at q0 and q1."""
+        """The model with a `GivenPotential`; an L_d of the user's own has no potential."""
         potential = self.model.potential
-        if isinstance(self.model, OwnLagrangian):  # it has none
+        if isinstance(self.model, OwnLagrangian):
             yield
             return
         self.model.potential = GivenPotential(potential, ends)  # pyright: ignore[reportAttributeAccessIssue]
@@ -157,7 +164,7 @@ class StepParts:
             self.model.potential = potential
 
     def _leap(self, state: State, h: Tensor, here: Field) -> Tensor:
-        """The step with the mass at q = 0 and no network of (q̄, v): a guess."""
+        """A guess of Δ: the leapfrog step with the mass at q = 0 and without the correction network."""
         model = self.model
         if not model.config.baseline:
             return torch.zeros_like(state.q)

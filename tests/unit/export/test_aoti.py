@@ -25,7 +25,7 @@ def test_a_missing_compiler_is_one_line(tmp_path, monkeypatch):
 
 
 def test_only_what_the_code_can_read_reaches_it():
-    # fails if a stride, a dtype or h <= 0 is passed on: compiled code reads memory as it comes
+    # fails if a stride is passed on: compiled code ignores strides (test_bad_input.py has wrong states and steps)
     seen = []
 
     def rollout(*x):
@@ -44,10 +44,4 @@ def test_only_what_the_code_can_read_reaches_it():
         assert len({x.data_ptr() for x in arguments}) == 4
     assert seen[0][0].stride() == (2, 1)
     assert seen[1][3].shape == (3, 1)
-    for bad in (State(q.float(), p, s), State(q, p[:2], s), State(q, p, s[:, None])):
-        with pytest.raises(InputError):
-            exported.step(bad, 0.1)
-    for h in (0.0, -1.0, float("nan"), torch.tensor([0.1, 0.1])):
-        with pytest.raises(InputError):
-            exported.step(State(q, p, s), h)
     assert len(seen) == 2

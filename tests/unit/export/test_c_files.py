@@ -54,8 +54,8 @@ def built(tmp_path, code, *flags):
 def test_another_process_of_the_same_user_knows_what_was_written(monkeypatch, tmp_path):
     # fails if the record of written files is lost with the process, or what stands in it is never looked up
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    trusted.remember(b"mine")
-    monkeypatch.setattr(trusted, "_here", set())  # as in another process
+    trusted.write_trusted(tmp_path / "a.h", b"mine")
+    monkeypatch.setattr(trusted, "_written", set())  # as in another process
     trusted.check_trusted(b"mine", "a.h", trust_code=False)
     with pytest.raises(InputError, match=r"a\.h: opening it runs code that it holds"):
         trusted.check_trusted(b"other", "a.h", trust_code=False)

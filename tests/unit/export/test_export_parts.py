@@ -13,7 +13,7 @@ from herglotz.export import export_run
 from herglotz.export.compare import draw
 from herglotz.export.exported import check_range
 from herglotz.export.load import read_header
-from herglotz.export.step import FLOOR, _added, first_carry, newton_iteration
+from herglotz.export.step import ROUNDING_EPSILONS, _added, first_carry, newton_iteration
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.training import fit
@@ -129,7 +129,7 @@ def test_what_rounding_leaves_ends_the_iteration(scale, size, h, monkeypatch):
     monkeypatch.setattr("herglotz.export.step.step_equation", no_decrease)
     model = ContactLagrangian(ModelConfig(speed=(1.0,)))
     one = torch.ones(1, 1, dtype=torch.float64)
-    move = 0.5 * FLOOR * torch.finfo(torch.float64).eps * one
+    move = 0.5 * ROUNDING_EPSILONS * torch.finfo(torch.float64).eps * one
     _, _, x, _, _, fraction, _, *values = first_carry(move)
     carry = (torch.tensor(1), torch.tensor([False]), x, move, one[0], fraction, scale * one[0], *values)
     done = newton_iteration(model, size * one, one, one[0], h * one[0], *carry)[1]

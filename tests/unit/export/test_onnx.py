@@ -56,7 +56,7 @@ good = roll([[0.25, 0.5]], [[-0.125, 0.25]], [0.0], [[0.1]] * 50)
 assert not good["status"].any() and good["q_out"].shape == (50, 1, 2)
 print(*good["q_out"][-1, 0], *good["p_out"][-1, 0], good["s_out"][-1, 0])
 # Bad values: a status in that sample, NaN behind it, and nothing in its neighbour.
-for h in (0.0, np.nan, np.inf):
+for h in (0.0, -0.1, np.nan, np.inf):
     found = roll([[0.1, 0.1]] * 2, [[0.1, 0.1]] * 2, [0, 0], [[h, 0.1]])
     assert found["status"][0, 0] != 0 and found["status"][0, 1] == 0, h
     assert np.isnan(found["q_out"][0, 0]).all() and np.isfinite(found["q_out"][0, 1]).all()
@@ -85,17 +85,6 @@ raise SystemExit("accepted float32")
     with torch.no_grad():
         final = Stepper(written[0]).rollout(*start, h=0.1, steps=50).final
     torch.testing.assert_close(alone, torch.cat([x.reshape(-1) for x in final]), rtol=1e-12, atol=1e-12)
-
-
-def test_a_negative_step_has_no_status_of_success(written):
-    # fails if h < 0, for which the graph could find a solution, counts as a step
-    import onnxruntime as ort
-
-    session = ort.InferenceSession(str(written[1]), providers=["CPUExecutionProvider"])
-    one = {"q": [[0.1, 0.1]], "p": [[0.1, 0.1]], "s": [0.0], "h": [[-0.1]]}
-    feeds = {name: torch.tensor(x, dtype=torch.float64).numpy() for name, x in one.items()}
-    (status,) = session.run(["status"], feeds)
-    assert int(status.item()) != Status.CONVERGED  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_the_file_is_small_and_says_what_it_is(written):

@@ -22,7 +22,7 @@ def elsewhere(monkeypatch, tmp_path):
     """Call it, and the machine is another one: it has written nothing."""
 
     def move() -> None:
-        monkeypatch.setattr(trusted, "_here", set())
+        monkeypatch.setattr(trusted, "_written", set())
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "another"))
 
     return move

@@ -1,1 +1,1 @@
-"""From a traced function to one format each: tables of operations."""
+"""The translation of traced functions to each format: C, ONNX, `.pt2` and AOTInductor."""

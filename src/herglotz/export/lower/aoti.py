@@ -25,14 +25,15 @@ def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     """Compile K steps (q, p, s, h) → (q, p, s, c, residual, status[, outside]) of the model's flow to machine code.
 
     h has the shape (K, B), and so have the outputs (q and p: (K, B, n)); K = 1 is one step. The compiled code checks
-    nothing and takes contiguous tensors of the model's dtype only: call it through `load_aoti`, which does check. It
-    runs on the kind of processor it was compiled on, without derivatives.
+    nothing and takes contiguous tensors of the model's dtype only; `load_pt2` adds checks. It runs on the kind of
+    processor it was compiled on, without derivatives.
 
-    The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`. Raise
-    InputError if there is no C++ compiler, an argument is not usable, what was compiled does not step like the model,
-    or the file cannot be written.
+    The arguments, the returned path and the output `outside` are those of `export_pt2`. Raise InputError if no C++
+    compiler is installed, an argument is not usable, the compiled code does not step like the model, or the file
+    cannot be written.
     """
-    from torch._inductor.package.package import package_aoti  # seconds, which only this format costs
+    # Imported here: the import takes seconds, which no other format needs.
+    from torch._inductor.package.package import package_aoti
 
     settings = {"aot_inductor.metadata": {KEY: to_json(entries)}}
     compiler("CXX")
@@ -51,16 +52,17 @@ def _compiled(program: ExportedProgram, settings: dict[str, Any]) -> Any:
     import torch._inductor
 
     options = settings | {"aot_inductor.package": True}
-    arguments, _ = program.example_inputs  # pyright: ignore[reportGeneralTypeIssues]  it has some
+    arguments, _ = program.example_inputs  # pyright: ignore[reportGeneralTypeIssues]
     return torch._inductor.aot_compile(program.module(check_guards=False), arguments, options=options)  # pyright: ignore
 
 
 def _check(package: str, model: ContactLagrangian) -> None:
-    """Step the new file beside the model: compilers have been seen to put values where others belong.
+    """Compare the new file with the model: compilers have been seen to exchange values.
 
-    Raise InputError if they disagree.
+    Raise InputError if the file and the model disagree.
     """
     found = compare(load_pt2(package, trust_code=True), Stepper(model), batches=(1, 7), steps=20)
-    worst = max(found[key] for key in ("q", "p", "s"))  # NaN, which is not larger, where every start fails
+    # NaN where every start fails; NaN is not larger than the bound.
+    worst = max(found[key] for key in ("q", "p", "s"))
     if worst > (1e-6 if next(model.parameters()).dtype == torch.float64 else 1e-2):
         raise InputError(f"the compiled code differs from the model by {worst:.1e}; export to --format c or onnx")

@@ -1,10 +1,10 @@
-"""A traced step as C: the pieces that the runtime calls, cut by what each number depends on.
+"""A traced step as C: the functions that the runtime calls, cut by the variables that each number depends on.
 
-The step of a model is one traced function (`herglotz.export.step_parts.StepParts`). Its numbers fall into pieces that
-run at different times, and hand on what a later piece reads as members of two structures:
+The step of a model is one traced function (`herglotz.export.step_parts.StepParts`). Its numbers are computed by
+functions that run at different times. Members of two structures hand numbers on to later functions:
 
-    prepare    what depends on h alone               members of NAME_problem, kept while h stays
-    begin      what depends on the start of a step   members of NAME_problem, and the guess of Δ
+    prepare    numbers of h alone                    members of NAME_problem, kept while h stays
+    begin      numbers of the start of a step        members of NAME_problem, and the guess of Δ
     evaluate   F and, on demand, J at a trial Δ      members of NAME_terms
     gains      p1 − p0, s1 − s0 and c − 1 at the end
 """
@@ -20,10 +20,12 @@ import numpy as np
 from herglotz.codegen.c_function import function, needed_by, row_of, whole
 from herglotz.codegen.interpret import interpret
 from herglotz.codegen.program import Program, Ref, literal
+from herglotz.codegen.trace import Graph
 from herglotz.export.equation import Equations
 from herglotz.export.step_parts import step_parts
 
 PREPARE, BEGIN, EVALUATE, GAINS = range(4)
+Tables = dict[tuple[float, ...], str]
 
 
 class StepInC:
@@ -33,13 +35,12 @@ class StepInC:
         self.explicit = equations.model.capabilities.explicit
         self.program = Program()
         self.n, self.m = n, m = equations.model.dof, equations.model.inputs
-        names = {
-            "P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "P->V0.value": 0, "P->V0.slope": n, "t->move": n, "x": n,
-            "V1->value": 0, "V1->slope": n, **({"P->push": m} if m else {}), **equations_theta(equations),
-        }  # fmt: skip
-        given = {name: self.program.given(name, size) for name, size in names.items()}
-        graph = step_parts(equations)
-        arrays = interpret(self.program, graph, list(given.values()))
+        # The sizes of the arguments of traced functions; 0 is a scalar.
+        self.start = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0}
+        self.more = {name: size for name, size in (("P->push", m), ("P->theta", len(equations.numbers or ()))) if size}
+        field = {"P->V0.value": 0, "P->V0.slope": n, "t->move": n, "x": n, "V1->value": 0, "V1->slope": n}
+        given = {name: self.program.given(name, size) for name, size in (self.start | field | self.more).items()}
+        arrays = interpret(self.program, step_parts(equations), list(given.values()))
         guess, F, J, dp, ds, E, *bound = (list(x.ravel()) for x in arrays)
         self.sticks = bool(bound)
         self.earliest = self._earliest({name: given[name][0].statement for name in given})
@@ -51,15 +52,9 @@ class StepInC:
         }
 
     def _earliest(self, given: Mapping[str, int]) -> list[int]:
-        """The first piece in which each statement could run."""
-        of_input = {
-            "P->h": PREPARE,
-            "P->theta": PREPARE,
-            "t->move": EVALUATE,
-            "x": GAINS,
-            "V1->value": GAINS,
-            "V1->slope": GAINS,
-        }
+        """The first function in which each statement could run."""
+        of_input = {"P->h": PREPARE, "P->theta": PREPARE, "t->move": EVALUATE}
+        of_input |= dict.fromkeys(("x", "V1->value", "V1->slope"), GAINS)
         known = {number: of_input.get(name, BEGIN) for name, number in given.items()}
         earliest: list[int] = []
         for i, statement in enumerate(self.program.statements):
@@ -68,17 +63,15 @@ class StepInC:
 
     @cached_property
     def runs(self) -> dict[str, set[int]]:
-        """The statements of each function: as early as they can run, but what only the end of a step needs at the end.
+        """The statements of each function: each as early as possible, but in `gains` those that only `gains` needs.
 
-        Between `evaluate_first` and `gains` only what the former computes is handed on, as it may be the last to run.
+        `gains` reads results of `evaluate_first` but none of `evaluate`, because either may be the last to run.
         """
         needed = {name: needed_by(self.program, outputs) for name, outputs in self.outputs.items()}
-        every = set().union(*needed.values())
         first, second = needed["evaluate_first"], needed.get("evaluate", set())
-        starting = needed["begin"] | first | second
         runs = {
-            "prepare": {i for i in every if self.earliest[i] == PREPARE},
-            "begin": {i for i in starting if self.earliest[i] == BEGIN},
+            "prepare": {i for i in set().union(*needed.values()) if self.earliest[i] == PREPARE},
+            "begin": {i for i in needed["begin"] | first | second if self.earliest[i] == BEGIN},
             "evaluate_first": {i for i in first if self.earliest[i] == EVALUATE},
             "evaluate": {i for i in second if self.earliest[i] == EVALUATE},
         }
@@ -87,7 +80,7 @@ class StepInC:
 
     @cached_property
     def handed_on(self) -> dict[int, str]:
-        """The statements whose results another function reads, and the member each is kept in."""
+        """The statements whose results another function reads, and the member that keeps each result."""
         read: dict[str, set[int]] = {}
         for name, run in self.runs.items():
             read[name] = set().union(*(self.program.statements[i].reads for i in run))
@@ -106,7 +99,7 @@ class StepInC:
         return kept
 
     def members(self, holder: str) -> str:
-        """The declarations of what is handed on in one structure."""
+        """The declarations of the members of one structure."""
         lines = []
         for i, place in self.handed_on.items():
             size = self.program.statements[i].size
@@ -115,7 +108,7 @@ class StepInC:
         return "".join(lines)
 
     def source(self) -> str:
-        """The functions, as a text of `REAL` and `FN_`, which stand for one sample or for a register of them."""
+        """The functions as a text of `REAL` and `FN_`, which become those of one sample or of a register of samples."""
         parts = []
         for name, (comment, arguments) in FUNCTIONS.items():
             if name == "evaluate" and self.explicit:
@@ -126,9 +119,9 @@ class StepInC:
 
 
 FUNCTIONS = {
-    "prepare": ("What depends on h alone.", "FN_problem *P"),
+    "prepare": ("Numbers of h alone.", "FN_problem *P"),
     "begin": (
-        "What depends on the start of the step, and the step without what couples q1, as a guess.",
+        "Numbers of the start of the step, and the uncoupled leapfrog step as a guess.",
         "FN_problem *P, REAL move[hz_N]",
     ),
     "evaluate_first": ("F at q1 = q0 + t->move.", "const FN_problem *P, FN_terms *t"),
@@ -142,31 +135,26 @@ FUNCTIONS = {
 
 
 class Emitted(NamedTuple):
-    """What of a header depends on the model."""
+    """The parts of a header that depend on the model; `step` is a text of `REAL` and `FN_`.
+
+    momentum is the Legendre transform and slopes the derivative of a step; either is "" where it was not asked for.
+    """
 
     tables: str
-    step: str  # types and functions of `REAL` and `FN_`
-    momentum: str  # the Legendre transform, "" unless asked for
-    slopes: str  # the derivative of a step
+    step: str
+    momentum: str
+    slopes: str
 
 
 def model_source(
     step: StepInC, equations: Equations, derivatives: bool, velocities: bool = True, adjoint: bool = False
 ) -> Emitted:
     """The emitted parts of a header, with constants as `R(0.5)`."""
-    program, K = Program(tables=step.program.tables), len(equations.numbers or ())
-    given = [program.given("q", step.n), *([program.given("theta", K)] if K else [])]
-    V, slope = (np.full(n, 0.0, object) for n in (1, step.n))
-    if equations.model.config.baseline:
-        V, slope = interpret(program, equations.potential, given)
-    outputs = {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())}
-    by = "const REAL theta[hz_P], " if K else ""
-    head = f"\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], {by}FN_potential_t *V)"
     push = "  REAL push[hz_INPUTS];\n" if step.m else ""
-    push += "  REAL theta[hz_P];\n" if K else ""
-    push += "  REAL bound[hz_N]; /* up to which dry friction holds the move */\n" if step.sticks else ""
-    texts = TYPES.format(push=push, problem=step.members("P"),
-                         terms=step.members("t")) + whole(program, head, outputs) + step.source()  # fmt: skip
+    push += "  REAL theta[hz_P];\n" if equations.numbers else ""
+    push += "  REAL bound[hz_N]; /* dry friction holds moves up to this */\n" if step.sticks else ""
+    types = TYPES.format(push=push, problem=step.members("P"), terms=step.members("t"))
+    texts = types + _potential_source(equations, step) + step.source()
     slopes = _slopes_source(equations, step) if derivatives else ""
     slopes += _pull_source(equations, step) if adjoint else ""
     momentum = _momentum_source(equations, step) if velocities else ""
@@ -183,37 +171,50 @@ typedef struct {{
   REAL value, slope[hz_N];
 }} FN_potential_t;
 
-/* The start of a step, and what does not change while it is solved. */
+/* The start of a step, and numbers that do not change while it is solved. */
 typedef struct {{
   REAL q0[hz_N], p0[hz_N], s0, h;
 {push}  FN_potential_t V0;
 {problem}}} FN_problem;
 
-/* The step equation at one q1 = q0 + move. Once it is solved, `rest` is the last, tiny correction:
-   q1 = q0 + move + rest. */
+/* The step equation at one q1 = q0 + move. After the solve, q1 = q0 + move + rest with the last, tiny correction. */
 typedef struct {{
   REAL move[hz_N], rest[hz_N], F[hz_N], J[hz_N * hz_N];
 {terms}}} FN_terms;
 """
 
 
-def equations_theta(equations: Equations) -> dict[str, int]:
-    """The input θ of the traced functions, where they have it."""
-    return {"P->theta": len(equations.numbers)} if equations.numbers else {}
-
-
 def as_lanes(text: str) -> str:
-    """The same for a register of samples."""
+    """A text of `REAL` and `FN_` as that of a register of samples."""
     return text.replace("SPREAD(", "hz_spread(").replace("FN_", "hz_wide_").replace("REAL", "hz_lanes")
+
+
+def interpreted(graph: Graph, sizes: Mapping[str, int], tables: Tables) -> tuple[Program, list[np.ndarray]]:
+    """A graph as a program of arguments with these names and sizes, which shares the tables, and its results."""
+    program = Program(tables=tables)
+    return program, interpret(program, graph, [program.given(name, size) for name, size in sizes.items()])
+
+
+def _theta(equations: Equations) -> tuple[dict[str, int], str]:
+    """The size and the declaration of the argument θ of a C function, where the header has parameters."""
+    K = len(equations.numbers or ())
+    return ({"theta": K}, "const REAL theta[hz_P], ") if K else ({}, "")
+
+
+def _potential_source(equations: Equations, step: StepInC) -> str:
+    """The potential and its slope as a C function."""
+    theta, declared = _theta(equations)
+    program, V, slope = Program(tables=step.program.tables), np.full(1, 0.0, object), np.full(step.n, 0.0, object)
+    if equations.model.config.baseline:
+        program, (V, slope) = interpreted(equations.potential, {"q": step.n} | theta, step.program.tables)
+    head = f"\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], {declared}FN_potential_t *V)"
+    return whole(program, head, {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())})
 
 
 def _slopes_source(equations: Equations, step: StepInC) -> str:
     """The derivative of a solved step as a C function."""
-    program = Program(tables=step.program.tables)
-    n, m = step.n, step.m
-    sizes = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "move": n, **({"P->push": m} if m else {})}
-    sizes |= equations_theta(equations)
-    (slopes,) = interpret(program, equations.jacobian, [program.given(name, size) for name, size in sizes.items()])
+    sizes = step.start | {"move": step.n} | step.more
+    program, (slopes,) = interpreted(equations.jacobian, sizes, step.program.tables)
     head = "\n/* d(q, p, s)' / d(q, p, s, h, push) at the solution q1 = q0 + move, row by row. */\n"
     head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
     return whole(program, head, {"slopes": list(slopes.ravel())})
@@ -221,25 +222,21 @@ def _slopes_source(equations: Equations, step: StepInC) -> str:
 
 def _momentum_source(equations: Equations, step: StepInC) -> str:
     """The Legendre transform p = L_v as a C function: `herglotz.stepping.velocity`."""
-    program, n = Program(tables=step.program.tables), step.n
-    sizes = {"q": n, "v": n, "s": 0, "h": 0, **({"theta": len(equations.numbers)} if equations.numbers else {})}
-    arrays = interpret(program, equations.momentum, [program.given(name, size) for name, size in sizes.items()])
+    theta, declared = _theta(equations)
+    sizes = {"q": step.n, "v": step.n, "s": 0, "h": 0} | theta
+    program, arrays = interpreted(equations.momentum, sizes, step.program.tables)
     named = zip(("p", "by_v", "grip", "grip_by_v"), arrays, strict=False)
     outputs = {name: list(x.ravel()) for name, x in named}
     head = "\n/* L_v and L_vv at (q, v, s); of set-valued friction (h/2) r(q, v) and its slope by v. */\n"
     head += "static inline void FN_momentum(const REAL q[hz_N], const REAL v[hz_N], REAL s, REAL h,\n    "
-    head += "const REAL theta[hz_P], " if equations.numbers else ""
-    head += ", ".join(f"REAL {name}[{'hz_N * hz_N' if name == 'by_v' else 'hz_N'}]" for name in outputs)
+    head += declared + ", ".join(f"REAL {name}[{'hz_N * hz_N' if name == 'by_v' else 'hz_N'}]" for name in outputs)
     return whole(program, f"{head})", outputs)
 
 
 def _pull_source(equations: Equations, step: StepInC) -> str:
     """The derivative of a solved step, transposed and times a vector, as a C function."""
-    program = Program(tables=step.program.tables)
-    n, m = step.n, step.m
-    sizes = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "move": n, "of": 2 * n + 1, **({"P->push": m} if m else {})}
-    sizes |= equations_theta(equations)
-    rows = interpret(program, equations.pull, [program.given(name, size) for name, size in sizes.items()])
+    sizes = step.start | {"move": step.n, "of": 2 * step.n + 1} | step.more
+    program, rows = interpreted(equations.pull, sizes, step.program.tables)
     head = "\n/* The derivatives by (q, p, s, h, push) before a solved step from those `of` (q, p, s)' after it. */\n"
     head += "static inline void FN_pull(const FN_problem *P, const REAL move[hz_N], const REAL *of, REAL *pulled)"
     return whole(program, head, {"pulled": [x for row in rows for x in row.ravel()]})

@@ -1,4 +1,4 @@
-"""Numbers of a model that are set at run time, in C: their structure, and what depends on them beside the step."""
+"""Numbers of a model that are set at run time, in C: their structure, and the forces of inputs as functions of them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from herglotz.codegen.c_function import as_scalars, whole
-from herglotz.codegen.interpret import interpret
-from herglotz.codegen.program import Program
 from herglotz.codegen.trace import traced
 from herglotz.export.c_numbers import numbers, text_constant
 from herglotz.export.equation import Equations, dense, example
+from herglotz.export.lower.c import interpreted
 from herglotz.models import ContactLagrangian, refuse_own
 from herglotz.stepping.linearise import forward_slopes
 
@@ -22,12 +21,12 @@ TOKENS = re.compile(r"hz_TAKES_THETA |hz_WITH_THETA\([^()]*\) | \+ hz_P\b")
 
 
 def without_parameters(text: str) -> str:
-    """A text of the runtime for a header without parameters: not a trace of them is left."""
+    """A text of the runtime for a header without parameters, with no trace of parameters left."""
     return TOKENS.sub("", MARKED.sub(lambda m: m[1] or "", text))
 
 
 def constants(entries: Mapping[str, Sequence[float | None]], dtype: str) -> str:
-    """The structure, its indices, and names, defaults and bounds."""
+    """The structure of the parameters, their indices, names, defaults and bounds."""
     largest = torch.finfo(getattr(torch, dtype)).max
     missing = {"defaults": 0.0, "lowest": -largest, "highest": largest}
     columns = zip(missing.items(), zip(*entries.values(), strict=True), strict=True)
@@ -35,7 +34,7 @@ def constants(entries: Mapping[str, Sequence[float | None]], dtype: str) -> str:
     indices = ", ".join(f"hz_{identifier(name)} = {i}" for i, name in enumerate(entries))
     names = ", ".join(map(text_constant, entries))
     lines = [f"#define hz_P {len(entries)} /* numbers that are set at run time */"]
-    lines += ["/* One of these numbers is theta.value[i], with i of this list. */", f"enum {{ {indices} }};"]
+    lines += ["/* theta.value[i] is the number with index i of this list. */", f"enum {{ {indices} }};"]
     lines += [f"typedef struct {{\n  hz_real value[{len(entries)}];\n}} hz_parameters;"]
     lines += [f"static const hz_parameters hz_{key} = {{{{{numbers(row, dtype)}}}}};" for key, row in rows.items()]
     lines += [f"static const char *const hz_parameter_names[hz_P] = {{{names}}};"]
@@ -48,7 +47,7 @@ def identifier(name: str) -> str:
 
 
 def inputs_constants(model: ContactLagrangian, dtype: str) -> str:
-    """The matrix G of the inputs and −G u₀, where the model takes some; 1 and 0 of an L_d that takes u itself."""
+    """The matrix G of the inputs and −G u₀; 1 and 0 for an L_d that takes u itself; empty without inputs."""
     if not (m := model.config.inputs):
         return ""
     friction = model.friction
@@ -63,10 +62,11 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
     """The matrix G of the inputs and −G u₀, and the derivative of G (u − u₀) by θ, as functions of θ."""
     if not model.inputs:
         return ""
-    equations, program = Equations.of(model, values), Program(tables=tables)
+    equations = Equations.of(model, values)
     refuse_own(model, "a header whose numbers are set at run time, with inputs,", "leave parameters out")
     friction = equations.model.friction
-    assert friction is not None  # a model with inputs is a forced one
+    # A model with inputs is a forced one.
+    assert friction is not None
 
     def forces(u: Tensor) -> tuple[Tensor, ...]:
         shared = (friction.input_map, friction.offset())
@@ -79,7 +79,7 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
         return tuple(map(dense, (*at(u, theta)[:2], by_theta)))
 
     graph = traced(parts, (example(equations.model, 0.1)[-1], *equations.theta))
-    arrays = interpret(program, graph, [program.given("u", model.inputs), program.given("theta", len(values))])
+    program, arrays = interpreted(graph, {"u": model.inputs, "theta": len(values)}, tables)
     G, offset, by_theta = (list(x.ravel()) for x in arrays)
     return as_scalars(
         whole(program, INPUTS_AT, {"map": G, "offset": offset}) + whole(program, PUSH_SLOPES, {"slopes": by_theta})

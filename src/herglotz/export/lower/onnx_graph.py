@@ -1,4 +1,4 @@
-"""A traced graph as nodes of ONNX, written by the functions that torch.onnx itself takes and by those of our own."""
+"""A traced graph as nodes of ONNX, written by torch.onnx's own functions and by those of `OPERATIONS`."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from herglotz.export.inline import graph_of_key, results_of
 from herglotz.export.lower.onnx_operations import OPERATIONS, op
 
 Values = dict[fx.Node, Any]
-OF_STORAGE = (torch.device, torch.layout, torch.memory_format)  # options that ONNX has no need of
+# Types of options about memory, which ONNX does not have.
+OF_STORAGE = (torch.device, torch.layout, torch.memory_format)
 
 
 def translated(arguments: Sequence[Any], key: int) -> list[Any]:
-    """The results of the graph that an operator stands for (`herglotz.export.inline`), in the ONNX graph being made."""
+    """Write the graph of an operator (`herglotz.export.inline`) into the present ONNX graph; return its results."""
     graph = graph_of_key(key)
     values: Values = {}
     places = iter(arguments)
@@ -37,14 +38,14 @@ def translated(arguments: Sequence[Any], key: int) -> list[Any]:
             options = {k: x for k, x in node.kwargs.items() if x is not None and not isinstance(x, OF_STORAGE)}
             values[node] = function_of(node.target)(*_given(node.args, values), **_given(options, values))
             _describe(values[node], node.meta["example"], graph.batch)
-    # Names of their own: a graph may give one of its arguments back.
+    # Each result has a name of its own, also where the graph returns one of its arguments.
     return [op.Identity(values[x]) for x in results_of(graph)]
 
 
 def function_of(target: Any) -> Callable[..., Any]:
-    """What writes an operation of torch.
+    """The function that writes an operation of torch.
 
-    Raise InputError where neither torch.onnx nor we know the operation.
+    Raise InputError where neither torch.onnx nor `OPERATIONS` has the operation.
     """
     if target in OPERATIONS:
         return OPERATIONS[target]
@@ -55,7 +56,7 @@ def function_of(target: Any) -> Callable[..., Any]:
 
 
 def _given(x: Any, values: Values) -> Any:
-    """An argument, with values in place of nodes."""
+    """An argument with values in place of nodes."""
     if isinstance(x, fx.Node):
         return values[x]
     if isinstance(x, dict):
@@ -66,7 +67,7 @@ def _given(x: Any, values: Values) -> Any:
 
 
 def _describe(value: Any, example: Any, batch: int) -> None:
-    """Note dtype and shape of a result, which the functions that read it ask for."""
+    """Note the dtype and shape of a result, which the functions that take the result read."""
     if isinstance(example, (list, tuple)) and not isinstance(example, Example):
         for x, y in zip(value, example, strict=True):
             _describe(x, y, batch)

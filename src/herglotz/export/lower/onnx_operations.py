@@ -1,7 +1,7 @@
-"""Operations of a traced graph in ONNX that torch.onnx has not, or writes with numbers of 32 bits or as slow nodes.
+"""Operations in ONNX that torch.onnx does not have, or writes with numbers of 32 bits or as slow nodes.
 
-An entry of `OPERATIONS` takes the arguments of the operation of torch, tensors as values of the ONNX graph, and gives
-its result, or a list of its results.
+An entry of `OPERATIONS` takes the arguments of the operation of torch, tensors as values of the ONNX graph, and returns
+the result, or a list of results.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from herglotz.errors import InputError
 
 aten = torch.ops.aten
 op: Any = opset20
-Value = Any  # an `onnx_ir.Value`, whose operators onnxscript writes down
+# An `onnx_ir.Value`; onnxscript records operators on values.
+Value = Any
 
 
 def constant(value: Any, dtype: ir.DataType) -> Value:
-    """A number or an array of this dtype. torch.onnx would make a number of Python one of 32 bits first."""
+    """A number or an array of this dtype. torch.onnx would round a Python number to 32 bits first."""
     return op.Constant(value=ir.tensor(value, dtype=dtype))
 
 
 def integers(*values: int) -> Value:
-    """Axes, indices, a shape."""
+    """A list of integers: axes, indices or a shape."""
     return op.Constant(value_ints=list(values))
 
 
@@ -61,7 +62,7 @@ def filled_like(x: Value, number: float, dtype: int = -1, **_: Any) -> Value:
 
 
 def finite(x: Value) -> Value:
-    """Whether |x| < ∞, which is false of NaN too."""
+    """Whether |x| < ∞, which is false for NaN too."""
     return op.Less(op.Abs(x), constant(math.inf, x.dtype))
 
 
@@ -91,19 +92,19 @@ def expm1(x: Value) -> Value:
 
 
 def atanh(x: Value) -> Value:
-    """Artanh x = log(1 + 2x/(1 − x))/2: onnxruntime has it in float32 only."""
+    """Artanh x = log(1 + 2x/(1 − x))/2: onnxruntime has Atanh in float32 only."""
     ratio = op.Div(op.Mul(constant(2.0, x.dtype), x), subtracted_from(x, 1.0))
     return op.Mul(constant(0.5, x.dtype), log1p(ratio, x.dtype))
 
 
 def log_sigmoid(x: Value) -> list[Value]:
-    """`log_sigmoid_forward`: log σ(x) = min(x, 0) − log(1 + d), d = e^{−|x|}, and d, which torch keeps."""
+    """`log_sigmoid_forward`: log σ(x) = min(x, 0) − log(1 + d), d = e^{−|x|}, and d, the second result of torch."""
     decay = op.Exp(op.Neg(op.Abs(x)))
     return [op.Sub(op.Min(x, constant(0.0, x.dtype)), log1p(decay, x.dtype)), decay]
 
 
 def log_sigmoid_backward(g: Value, x: Value, _: Value) -> Value:
-    """Its derivative g σ(−x)."""
+    """The derivative g σ(−x) of log σ(x)."""
     return op.Mul(g, op.Sigmoid(op.Neg(x)))
 
 
@@ -123,12 +124,12 @@ def threshold_backward(g: Value, x: Value, threshold: float) -> Value:
 
 
 def product(a: Value, b: Value) -> Value:
-    """`mm`. onnxruntime turns a number beside a MatMul into an attribute of 32 bits, and beside a Gemm it does not."""
+    """`mm` as a Gemm, because onnxruntime turns a number beside a MatMul into an attribute of 32 bits."""
     return op.Gemm(a, b)
 
 
 def products(a: Value, b: Value) -> Value:
-    """`bmm`, for which there is no Gemm."""
+    """`bmm`, as an Einsum: a Gemm has no batch."""
     return op.Einsum(a, b, equation="bij,bjk->bik")
 
 
@@ -138,7 +139,7 @@ def product_with_vector(a: Value, b: Value) -> Value:
 
 
 def split(x: Value, sizes: Sequence[int], dim: int = 0) -> list[Value]:
-    """`split_with_sizes`: torch.onnx makes a sequence of it, which onnxruntime copies."""
+    """`split_with_sizes` as slices: torch.onnx writes a sequence, which onnxruntime copies."""
     ends = np.cumsum(sizes).tolist()
     return [
         op.Slice(x, integers(end - size), integers(end), integers(dim)) for size, end in zip(sizes, ends, strict=True)
@@ -171,7 +172,7 @@ def diagonal_matrix(x: Value, *places: int) -> Value:
 
 
 def inverse(A: Value, **_: Any) -> list[Value]:
-    """`linalg_inv_ex` of mass matrices (..., n, n) by Gauss and Jordan, without row exchanges, and its status, 0."""
+    """`linalg_inv_ex` of mass matrices (..., n, n) by Gauss-Jordan elimination without row exchanges, and status 0."""
     n = A.shape[-1]
     eye, rows, columns, J = np.eye(n), integers(-2), integers(-1), A
     for k in range(n):

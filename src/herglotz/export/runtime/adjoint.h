@@ -1,6 +1,6 @@
 
-/* Vector-Jacobian products: of a number that depends on what a step or a rollout leads to, with known derivatives by
-   that, the derivatives by what it starts from. Rows are (q, p, s). */
+/* Vector-Jacobian products: from the derivatives of a number by the states after a step or a rollout, its derivatives by
+   the state before. Rows are (q, p, s). */
 
 /* Of one step from `before` to `after`, which hz_step has made with the same h and so on: from the derivatives `of` the
    state after it, (2 hz_N + 1),

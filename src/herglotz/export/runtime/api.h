@@ -7,8 +7,8 @@ static inline int hz_outside_box(const hz_state *state) {
   return flags[0];
 }
 
-/* One step of a run: hz_step without its checks of the input, faster by what `track` carries. Start the track again
-   whenever anything but this function has changed the state. */
+/* One step of a run: hz_step without its checks of the input, faster because `track` keeps numbers of the last steps.
+   Start the track again whenever anything but this function has changed the state. */
 static inline int hz_advance(hz_state *state, hz_track *track, hz_real h, hz_TAKES_U hz_real *residual) {
   int status[1] = {hz_CONVERGED};
   hz_take(state, track, &h, hz_WITH_U(&u) status, residual);
@@ -86,9 +86,9 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
   return hz_outside_box(out) | hz_outside_h(h);
 }
 
-/* One step of h > 0. The state changes on success only. `residual` (may be null) receives what is left of the step
+/* One step of h > 0. The state changes on success only. `residual` (may be null) receives the residual of the step
    equation, |J^-1 F| in units of q. Returns a status, with hz_OUTSIDE_BOX added where the step starts or ends outside
-   the box and hz_OUTSIDE_H where h is not one of the range the model was fitted for. */
+   the box and hz_OUTSIDE_H where h is outside the range that the model was fitted for. */
 static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual) {
   hz_real left = hz_R(0.0);
   int status = hz_before(state, h);
@@ -171,7 +171,7 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_TAK
 }
 #endif
 
-/* Samples b, b + 1, ... of `count`, as many side by side as the processor takes; returns how many. */
+/* Step samples b, b + 1, ... of `count`, as many at once as registers hold; returns their number. */
 static inline int hz_run_some(hz_state *states, long b, long count, const hz_job *job, int status[hz_SIDE],
     int *flags) {
 #ifdef hz_BATCHED
@@ -186,7 +186,7 @@ static inline int hz_run_some(hz_state *states, long b, long count, const hz_job
   return 1;
 }
 
-/* A job of `count` samples, all with the step *job->h; statuses and what is returned are those of hz_rollout_batch. */
+/* A job of `count` samples, all with the step *job->h; statuses and the returned status are those of hz_rollout_batch. */
 static inline int hz_run_batch(long count, hz_state *states, const hz_job *job, int *statuses) {
 #if hz_P
   const int possible = job->steps >= 0 && job->every > 0 && (!job->theta || hz_in_bounds(job->theta));
@@ -210,7 +210,7 @@ static inline int hz_run_batch(long count, hz_state *states, const hz_job *job, 
   return worst | flagged;
 }
 
-/* hz_rollout of `count` samples, each as it would go by itself up to rounding: registers of them are stepped at once.
+/* hz_rollout of `count` samples, in registers of samples; each result equals hz_rollout of one sample up to rounding.
    Inputs u are (count, steps, hz_M). The outputs hold one sample after the other; statuses[b] receives what hz_rollout
    would return. Any but `states` may be null. Returns the status of the first sample that failed, or 0, with the flags
    of any. */
@@ -224,8 +224,8 @@ static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_T
 /* `steps` equal steps. Inputs u are (steps, hz_M), where the model takes some; none act where u is null.
    Entry 0 of each output is the start, entry k the state after k * every steps; the outputs hold
    1 + steps / every entries (q, p: hz_N numbers each) and may be null. Stops at the first failed step and returns its
-   status: `state` is then the last good one and the entries not reached are NaN. Leaving the box stops nothing:
-   hz_OUTSIDE_BOX is added to what is returned. */
+   status: `state` is then the last good one and the entries not reached are NaN. Leaving the box does not
+   stop the rollout: hz_OUTSIDE_BOX is added to the returned status. */
 static inline int hz_rollout(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA long steps, long every, hz_real *q_out,
     hz_real *p_out, hz_real *s_out) {
   return hz_rollout_batch(1, state, h, hz_WITH_U(u) hz_WITH_THETA(theta) steps, every, q_out, p_out, s_out, 0);

@@ -1,9 +1,9 @@
 
 /* CasADi's external functions with x = (q, p, s): x1 = NAME_step(x, u, h) is one step, x1 = NAME_hold(x, u, h) a time h
-   of as few equal steps as are no longer than the typical one; jac_NAME_step and jac_NAME_hold are their Jacobians by
+   of the fewest equal steps that are no longer than the typical one; jac_NAME_step and jac_NAME_hold are their Jacobians by
    the implicit-function theorem. Compiled with -DNAME_HORIZON=50, NAME_shoot is NAME_hold of 50 columns x and u at once:
-   registers of them go side by side, and its Jacobian has a block for each. Matrices are column by column. All return 0,
-   or 1 where there is no step: CasADi raises an error then, and a line search of an optimiser steps back. */
+   registers of columns are stepped at once, and the Jacobian has a block for each. Matrices are column by column. All
+   functions return 0, or 1 where a step has no solution: CasADi then raises an error, and a line search steps back. */
 
 #ifndef casadi_real
 #define casadi_real double

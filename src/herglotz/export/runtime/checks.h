@@ -1,13 +1,14 @@
-/* What is checked of states, steps and inputs, and the forces of inputs. */
+/* Checks of states, steps and inputs; the forces of inputs; the description of a run. */
 
-/* The status of a state before a step h: hz_BAD_INPUT where h is no step, hz_DIVERGED where the state is not finite. */
+/* The status of a state before a step h: hz_BAD_INPUT unless h is finite and > 0, hz_DIVERGED where the state is not
+   finite. */
 static inline int hz_before(const hz_state *state, hz_real h) {
   if (!(hz_finite(h) && h > hz_R(0.0))) return hz_BAD_INPUT;
   return hz_all_finite(state->q) && hz_all_finite(state->p) && hz_finite(state->s) && hz_finite(state->sigma)
       ? hz_CONVERGED : hz_DIVERGED;
 }
 
-/* A state that there is none of. */
+/* Mark a state as lost: all its numbers become NaN. */
 static inline void hz_lose(hz_state *state) {
   int i;
   for (i = 0; i < hz_N; i++) state->q[i] = state->p[i] = hz_nan();
@@ -18,7 +19,7 @@ static inline void hz_lose(hz_state *state) {
 #define hz_TAKES_U const hz_real *u,
 #define hz_WITH_U(argument) argument,
 
-/* What inputs are to the step: forces G (u - u0), or themselves where L_d takes them; 0 where u is null. */
+/* The step's own inputs: forces G (u - u0), or u where L_d takes u itself; 0 where u is null. */
 static inline void hz_push(const hz_real *u, hz_TAKES_THETA hz_real push[hz_INPUTS]) {
   int i, j;
 #if hz_P
@@ -45,7 +46,7 @@ static inline int hz_inputs_finite(const hz_real *u) {
 
 static inline int hz_outside_h(hz_real h) { return h >= hz_h_low && h <= hz_h_high ? 0 : hz_OUTSIDE_H; }
 
-/* How many samples of a batch go side by side. */
+/* The number of samples of a batch that are stepped at once. */
 #if hz_WIDE && defined(hz_LANE_BYTES)
 #define hz_BATCHED /* registers of samples */
 enum { hz_SIDE = hz_LANES };
@@ -53,11 +54,11 @@ enum { hz_SIDE = hz_LANES };
 enum { hz_SIDE = 1 };
 #endif
 
-/* One step of a state by itself, with its checks done. */
+/* One step of a single state, without the checks of hz_step. */
 static inline int hz_alone(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual);
 
-/* A run of steps: h of sample b and step k is h[b * h_sample + k * h_step], and u likewise. What is stored after every
-   so many steps, and status and residual after each; any may be null. */
+/* A run of steps: h of sample b and step k is h[b * h_sample + k * h_step], and u likewise. q, p, s and sigma are stored
+   after each `every` steps, status and residual after each step; any of these may be null. */
 typedef struct {
   long steps, every;
   const hz_real *h;

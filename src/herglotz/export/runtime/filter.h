@@ -2,7 +2,7 @@
 /* An extended Kalman filter on the model's step: positions in; (q, p, s), velocities and their covariance out, and the
    numbers of hz_parameters as slow states. Nothing is allocated, and nothing is kept but hz_filter. */
 
-/* What the covariance is of: q, p, s where the motion depends on it, and theta. */
+/* The size of the covariance, of q, p, s where the motion depends on s, and theta. */
 #define hz_F (2 * hz_N + hz_CARRIES_S + hz_P)
 
 typedef struct {
@@ -11,14 +11,14 @@ typedef struct {
   hz_parameters theta;
 #endif /* hz_P */
   hz_real P[hz_F][hz_F]; /* the covariance is scale * P */
-  hz_real scale, weight; /* of all variances, and how many updates have told it; 1 at the start */
+  hz_real scale, weight; /* the learned factor of all variances and its weight in updates; 1 at the start */
 } hz_filter;
 
 /* Standard deviations: of a measured position; of the momentum that unknown forces add in a unit of time, growing with
-   its root; and, in the same way, of how far each number of theta wanders. What a model misses is seldom as large in
-   one motion as in another: of all variances the common scale is learned, which does not change an estimate. It is the
-   mean of the squared innovations over their variance in all updates, where each later one lessens the weight of the
-   earlier ones by the share `adaptation`, and what is given counts as one (West and Harrison, Bayesian forecasting and
+   its root; and, in the same way, of how far each number of theta wanders. The error of a model differs between motions, so
+   a common scale of all variances is learned; it does not change an estimate. The scale is the mean of the squared
+   innovations over their variance in all updates. Each update lessens the weight of earlier updates by the share
+   `adaptation`; the given deviations count as one update (West and Harrison, Bayesian forecasting and
    dynamic models, 1997, section 10.8). Adaptation 0: deviations are as given; 0.02: as the last 50 updates have them. */
 typedef struct {
   hz_real position[hz_N], momentum[hz_N];
@@ -61,7 +61,7 @@ static inline int hz_noise_usable(const hz_noise *noise) {
   return good;
 }
 
-/* Half of what unknown forces add in a step h: before it and after it, so that q and p get their share of each other. */
+/* Half of the noise of unknown forces in a step h. It is added before the step and after it, which correlates q and p. */
 static inline void hz_filter_spread(hz_real P[hz_F][hz_F], hz_real h, const hz_noise *noise) {
   int i;
   for (i = 0; i < hz_N; i++) P[hz_N + i][hz_N + i] += noise->momentum[i] * noise->momentum[i] * h / hz_R(2.0);
@@ -71,7 +71,7 @@ static inline void hz_filter_spread(hz_real P[hz_F][hz_F], hz_real h, const hz_n
 #endif /* hz_P */
 }
 
-/* hz_filter_predict, which gives A too. */
+/* hz_filter_predict, which also returns A. */
 static inline int hz_filter_move(hz_filter *filter, hz_real h, hz_TAKES_U const hz_noise *noise, hz_real A[hz_F][hz_F]) {
   enum { SIZE = 2 * hz_N + 1, KEPT = 2 * hz_N + hz_CARRIES_S };
   hz_real by_state[SIZE * SIZE], P[hz_F][hz_F], half[hz_F][hz_F];
@@ -112,14 +112,14 @@ static inline int hz_filter_move(hz_filter *filter, hz_real h, hz_TAKES_U const 
   return status;
 }
 
-/* One step of h > 0: P becomes A P A' with A the derivative of the step, and what unknown forces add. Returns the status
-   of hz_step_jacobian, or hz_BAD_INPUT for noise that is none; the filter changes on success only. */
+/* One step of h > 0: P becomes A P A' with A the derivative of the step, plus the noise of unknown forces. Returns the
+   status of hz_step_jacobian, or hz_BAD_INPUT for unusable noise; the filter changes on success only. */
 static inline int hz_filter_predict(hz_filter *filter, hz_real h, hz_TAKES_U const hz_noise *noise) {
   hz_real A[hz_F][hz_F];
   return hz_filter_move(filter, h, hz_WITH_U(u) noise, A);
 }
 
-/* Add gain * miss to what is estimated. */
+/* Add gain * miss to the estimates. */
 static inline void hz_filter_shift(hz_filter *filter, const hz_real gain[hz_F], hz_real miss) {
   int j;
   for (j = 0; j < hz_N; j++) {
@@ -151,7 +151,7 @@ typedef struct {
   hz_real miss, variance, own, gain[hz_F];
 } hz_innovation;
 
-/* Take measured position i in. */
+/* Update the filter by measured position i. */
 static inline void hz_filter_take(hz_filter *filter, int i, hz_real y, const hz_noise *noise, hz_innovation *found) {
   int j, k;
   found->own = noise->position[i] * noise->position[i];
@@ -182,7 +182,7 @@ static inline hz_real hz_filter_scale(hz_filter *filter, hz_real total, const hz
   return surprise;
 }
 
-/* Take measured positions y in, one after the other, as their noise is independent; angles count modulo a turn.
+/* Update the filter by measured positions y one by one, as their noise is independent; angles count modulo a turn.
    `surprise` (may be null) receives the squared innovation over its variance, summed: hz_N on average. Numbers of theta
    stay within their bounds. hz_BAD_INPUT where y or the noise is not finite; the filter changes on success only. */
 static inline int hz_filter_update(hz_filter *filter, const hz_real y[hz_N], const hz_noise *noise, hz_real *surprise) {

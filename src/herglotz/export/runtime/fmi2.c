@@ -36,9 +36,6 @@ fmu_API fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String
     const fmi2CallbackFunctions *calls, fmi2Boolean visible, fmi2Boolean logging) {
   const size_t length = name ? strlen(name) : 0;
   fmu_component *made;
-  (void)resources;
-  (void)visible;
-  (void)logging;
   if (type != 1 || !length || !guid || strcmp(guid, fmu_TOKEN) || !calls || !calls->allocate || !calls->release) {
     if (calls && calls->logger)
       calls->logger(calls->environment, name ? name : "", fmu_ERROR, "logStatusError",
@@ -61,10 +58,6 @@ fmu_API void fmi2FreeInstance(fmi2Component c) {
 
 fmu_API fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean with_tolerance, fmi2Real tolerance, fmi2Real start,
     fmi2Boolean with_stop, fmi2Real stop) {
-  (void)with_tolerance;
-  (void)tolerance;
-  (void)with_stop;
-  (void)stop;
   if (!fmu_allowed((fmu_instance *)c, fmu_INSTANTIATED, fmu_INSTANTIATED)) return fmu_ERROR;
   ((fmu_component *)c)->start = start;
   return fmu_OK;
@@ -82,14 +75,10 @@ fmu_API fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], s
 
 #define fmu_NO_VARIABLES(name, type) \
   fmu_API fmi2Status fmi2Get##name(fmi2Component c, const fmi2ValueReference vr[], size_t count, type values[]) { \
-    (void)vr; \
-    (void)values; \
     return fmu_none(c, count); \
   } \
   fmu_API fmi2Status fmi2Set##name(fmi2Component c, const fmi2ValueReference vr[], size_t count, \
       const type values[]) { \
-    (void)vr; \
-    (void)values; \
     return fmu_none(c, count); \
   }
 fmu_NO_VARIABLES(Integer, fmi2Integer)
@@ -102,27 +91,19 @@ fmu_API fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2Value
 }
 
 fmu_API fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2Boolean no_way_back) {
-  (void)no_way_back;
   return fmu_communicate((fmu_instance *)c, time, step);
 }
 
 /* Inputs are held over a step, outputs have no derivatives by time, and steps are over when fmi2DoStep returns. */
 fmu_API fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t count,
     const fmi2Integer order[], const fmi2Real values[]) {
-  (void)vr;
-  (void)order;
-  (void)values;
   return fmu_none(c, count);
 }
 fmu_API fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t count,
     const fmi2Integer order[], fmi2Real values[]) {
-  (void)vr;
-  (void)order;
-  (void)values;
   return fmu_none(c, count);
 }
 fmu_API fmi2Status fmi2CancelStep(fmi2Component c) {
-  (void)c;
   return fmu_ERROR;
 }
 fmu_API fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value) {
@@ -137,9 +118,6 @@ fmu_API fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind ki
 }
 #define fmu_NO_STATUS(name, type) \
   fmu_API fmi2Status fmi2Get##name(fmi2Component c, const fmi2StatusKind kind, type *value) { \
-    (void)c; \
-    (void)kind; \
-    (void)value; \
     return fmu_DISCARD; \
   }
 fmu_NO_STATUS(Status, fmi2Status)

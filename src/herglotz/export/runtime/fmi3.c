@@ -32,12 +32,6 @@ fmu_API fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String tok
     const fmi3ValueReference intermediate[], size_t count, void *environment, fmi3LogMessageCallback log,
     fmi3IntermediateUpdateCallback update) {
   fmu_component *made = 0;
-  (void)resources;
-  (void)visible;
-  (void)logging;
-  (void)early_return;
-  (void)intermediate;
-  (void)update;
   if (name && *name && token && !strcmp(token, fmu_TOKEN) && !events && !count)
     made = (fmu_component *)calloc(1, sizeof *made);
   if (!made) {
@@ -54,30 +48,18 @@ fmu_API fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String tok
 }
 fmu_API fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources,
     fmi3Boolean visible, fmi3Boolean logging, void *environment, fmi3LogMessageCallback log) {
-  (void)name;
-  (void)token;
-  (void)resources;
-  (void)visible;
-  (void)logging;
   if (log) log(environment, fmu_ERROR, "logStatusError", "This FMU is for co-simulation.");
   return 0;
 }
 fmu_API fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String resources,
     fmi3Boolean visible, fmi3Boolean logging, void *environment, fmi3LogMessageCallback log, void (*clock)(void *),
     void (*lock)(void), void (*unlock)(void)) {
-  (void)clock;
-  (void)lock;
-  (void)unlock;
   return fmi3InstantiateModelExchange(name, token, resources, visible, logging, environment, log);
 }
 fmu_API void fmi3FreeInstance(fmi3Instance it) { free(it); }
 
 fmu_API fmi3Status fmi3EnterInitializationMode(fmi3Instance it, fmi3Boolean with_tolerance, fmi3Float64 tolerance,
     fmi3Float64 start, fmi3Boolean with_stop, fmi3Float64 stop) {
-  (void)with_tolerance;
-  (void)tolerance;
-  (void)with_stop;
-  (void)stop;
   return fmu_initialize((fmu_instance *)it, start);
 }
 fmu_API fmi3Status fmi3GetFloat64(fmi3Instance it, const fmi3ValueReference vr[], size_t count, fmi3Float64 values[],
@@ -89,21 +71,14 @@ fmu_API fmi3Status fmi3SetFloat64(fmi3Instance it, const fmi3ValueReference vr[]
   return size == count ? fmu_set((fmu_instance *)it, vr, count, values) : fmu_ERROR;
 }
 
-#define fmu_NO_VARIABLES(name, type) \
-  fmu_API fmi3Status fmi3Get##name(fmi3Instance it, const fmi3ValueReference vr[], size_t count, type values[], \
-      size_t size) { \
-    (void)vr; \
-    (void)values; \
-    (void)size; \
-    return fmu_none(it, count); \
-  } \
-  fmu_API fmi3Status fmi3Set##name(fmi3Instance it, const fmi3ValueReference vr[], size_t count, const type values[], \
-      size_t size) { \
-    (void)vr; \
-    (void)values; \
-    (void)size; \
+/* Calls on `count` variables of which this FMU has none: other types, clocks and derivatives by time. */
+#define fmu_NOTHING(name, ...) \
+  fmu_API fmi3Status fmi3##name(fmi3Instance it, const fmi3ValueReference vr[], size_t count, __VA_ARGS__) { \
     return fmu_none(it, count); \
   }
+#define fmu_NO_VARIABLES(name, type) \
+  fmu_NOTHING(Get##name, type values[], size_t size) \
+  fmu_NOTHING(Set##name, const type values[], size_t size)
 fmu_NO_VARIABLES(Float32, float)
 fmu_NO_VARIABLES(Int8, int8_t)
 fmu_NO_VARIABLES(UInt8, uint8_t)
@@ -115,59 +90,38 @@ fmu_NO_VARIABLES(Int64, int64_t)
 fmu_NO_VARIABLES(UInt64, uint64_t)
 fmu_NO_VARIABLES(Boolean, fmi3Boolean)
 fmu_NO_VARIABLES(String, fmi3String)
+fmu_NOTHING(GetBinary, size_t *sizes, const uint8_t **values, size_t size)
+fmu_NOTHING(SetBinary, const size_t *sizes, const uint8_t *const *values, size_t size)
+fmu_NOTHING(GetIntervalFraction, uint64_t *counters, uint64_t *resolutions, fmi3IntervalQualifier *qualifiers)
+fmu_NOTHING(GetOutputDerivatives, const int32_t *orders, fmi3Float64 *values, size_t size)
+fmu_NOTHING(GetIntervalDecimal, fmi3Float64 *intervals, fmi3IntervalQualifier *qualifiers)
+fmu_NOTHING(GetShiftFraction, uint64_t *counters, uint64_t *resolutions)
+fmu_NOTHING(SetIntervalFraction, const uint64_t *counters, const uint64_t *resolutions)
+fmu_NOTHING(SetShiftFraction, const uint64_t *counters, const uint64_t *resolutions)
+fmu_NOTHING(GetClock, bool *values)
+fmu_NOTHING(SetClock, const bool *values)
+fmu_NOTHING(GetShiftDecimal, fmi3Float64 *shifts)
+fmu_NOTHING(SetIntervalDecimal, const fmi3Float64 *intervals)
+fmu_NOTHING(SetShiftDecimal, const fmi3Float64 *shifts)
 
-/* Calls on value references, with one to three arrays beside them. */
-#define fmu_NOTHING(name, first, second, third) \
-  fmu_API fmi3Status fmi3##name(fmi3Instance it, const fmi3ValueReference vr[], size_t count, first one, second two, \
-      third three) { \
-    (void)vr; \
-    (void)one; \
-    (void)two; \
-    (void)three; \
-    return fmu_none(it, count); \
-  }
-#define fmu_NOTHING_2(name, first, second) \
-  fmu_API fmi3Status fmi3##name(fmi3Instance it, const fmi3ValueReference vr[], size_t count, first one, second two) { \
-    (void)vr; \
-    (void)one; \
-    (void)two; \
-    return fmu_none(it, count); \
-  }
-#define fmu_NOTHING_1(name, first) \
-  fmu_API fmi3Status fmi3##name(fmi3Instance it, const fmi3ValueReference vr[], size_t count, first one) { \
-    (void)vr; \
-    (void)one; \
-    return fmu_none(it, count); \
-  }
-fmu_NOTHING(GetBinary, size_t *, const uint8_t **, size_t)
-fmu_NOTHING(SetBinary, const size_t *, const uint8_t *const *, size_t)
-fmu_NOTHING(GetIntervalFraction, uint64_t *, uint64_t *, fmi3IntervalQualifier *)
-fmu_NOTHING(GetOutputDerivatives, const int32_t *, fmi3Float64 *, size_t)
-fmu_NOTHING_2(GetIntervalDecimal, fmi3Float64 *, fmi3IntervalQualifier *)
-fmu_NOTHING_2(GetShiftFraction, uint64_t *, uint64_t *)
-fmu_NOTHING_2(SetIntervalFraction, const uint64_t *, const uint64_t *)
-fmu_NOTHING_2(SetShiftFraction, const uint64_t *, const uint64_t *)
-fmu_NOTHING_1(GetClock, bool *)
-fmu_NOTHING_1(SetClock, const bool *)
-fmu_NOTHING_1(GetShiftDecimal, fmi3Float64 *)
-fmu_NOTHING_1(SetIntervalDecimal, const fmi3Float64 *)
-fmu_NOTHING_1(SetShiftDecimal, const fmi3Float64 *)
-
-/* Modes that a co-simulation without events does not have, and arrays of continuous states. */
-#define fmu_NO_MODE(name) \
-  fmu_API fmi3Status fmi3##name(fmi3Instance it) { return fmu_none(it, 1); }
-fmu_NO_MODE(EnterEventMode)
-fmu_NO_MODE(EnterStepMode)
-fmu_NO_MODE(EnterConfigurationMode)
-fmu_NO_MODE(ExitConfigurationMode)
-fmu_NO_MODE(EvaluateDiscreteStates)
-fmu_NO_MODE(EnterContinuousTimeMode)
+/* Modes and calls that a co-simulation without events and continuous states does not have. */
+#define fmu_NO_MODE(name, ...) \
+  fmu_API fmi3Status fmi3##name(__VA_ARGS__) { return fmu_none(it, 1); }
+fmu_NO_MODE(EnterEventMode, fmi3Instance it)
+fmu_NO_MODE(EnterStepMode, fmi3Instance it)
+fmu_NO_MODE(EnterConfigurationMode, fmi3Instance it)
+fmu_NO_MODE(ExitConfigurationMode, fmi3Instance it)
+fmu_NO_MODE(EvaluateDiscreteStates, fmi3Instance it)
+fmu_NO_MODE(EnterContinuousTimeMode, fmi3Instance it)
+fmu_NO_MODE(UpdateDiscreteStates, fmi3Instance it, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals,
+    fmi3Boolean *states, fmi3Boolean *next, fmi3Float64 *time)
+fmu_NO_MODE(CompletedIntegratorStep, fmi3Instance it, fmi3Boolean no_way_back, fmi3Boolean *events,
+    fmi3Boolean *terminate)
+fmu_NO_MODE(SetTime, fmi3Instance it, fmi3Float64 time)
+fmu_NO_MODE(ActivateModelPartition, fmi3Instance it, fmi3ValueReference clock, fmi3Float64 time)
 
 #define fmu_NO_STATES(name, type) \
-  fmu_API fmi3Status fmi3##name(fmi3Instance it, type values, size_t count) { \
-    (void)values; \
-    return fmu_none(it, count); \
-  }
+  fmu_API fmi3Status fmi3##name(fmi3Instance it, type values, size_t count) { return fmu_none(it, count); }
 fmu_NO_STATES(SetContinuousStates, const fmi3Float64 *)
 fmu_NO_STATES(GetContinuousStates, fmi3Float64 *)
 fmu_NO_STATES(GetContinuousStateDerivatives, fmi3Float64 *)
@@ -182,45 +136,12 @@ static fmi3Status fmu_zero(fmi3Instance it, size_t *count) {
 fmu_API fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance it, size_t *count) { return fmu_zero(it, count); }
 fmu_API fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance it, size_t *count) { return fmu_zero(it, count); }
 fmu_API fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance it, fmi3ValueReference vr, size_t *count) {
-  (void)vr;
   return fmu_zero(it, count);
 }
 fmu_API fmi3Status fmi3GetVariableDependencies(fmi3Instance it, fmi3ValueReference vr, size_t places[],
     fmi3ValueReference independents[], size_t their_places[], fmi3DependencyKind kinds[], size_t count) {
-  (void)vr;
-  (void)places;
-  (void)independents;
-  (void)their_places;
-  (void)kinds;
   return fmu_none(it, count);
 }
-fmu_API fmi3Status fmi3UpdateDiscreteStates(fmi3Instance it, fmi3Boolean *again, fmi3Boolean *terminate,
-    fmi3Boolean *nominals, fmi3Boolean *states, fmi3Boolean *next, fmi3Float64 *time) {
-  (void)again;
-  (void)terminate;
-  (void)nominals;
-  (void)states;
-  (void)next;
-  (void)time;
-  return fmu_none(it, 1);
-}
-fmu_API fmi3Status fmi3CompletedIntegratorStep(fmi3Instance it, fmi3Boolean no_way_back, fmi3Boolean *events,
-    fmi3Boolean *terminate) {
-  (void)no_way_back;
-  (void)events;
-  (void)terminate;
-  return fmu_none(it, 1);
-}
-fmu_API fmi3Status fmi3SetTime(fmi3Instance it, fmi3Float64 time) {
-  (void)time;
-  return fmu_none(it, 1);
-}
-fmu_API fmi3Status fmi3ActivateModelPartition(fmi3Instance it, fmi3ValueReference clock, fmi3Float64 time) {
-  (void)clock;
-  (void)time;
-  return fmu_none(it, 1);
-}
-
 fmu_API fmi3Status fmi3GetDirectionalDerivative(fmi3Instance it, const fmi3ValueReference unknowns[], size_t rows,
     const fmi3ValueReference knowns[], size_t columns, const fmi3Float64 seed[], size_t seeds, fmi3Float64 result[],
     size_t results) {
@@ -237,7 +158,6 @@ fmu_API fmi3Status fmi3GetAdjointDerivative(fmi3Instance it, const fmi3ValueRefe
 fmu_API fmi3Status fmi3DoStep(fmi3Instance it, fmi3Float64 time, fmi3Float64 step, fmi3Boolean no_way_back,
     fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *last) {
   const fmi3Status status = fmu_communicate((fmu_instance *)it, time, step);
-  (void)no_way_back;
   if (event) *event = false;
   if (terminate) *terminate = false;
   if (early) *early = false;

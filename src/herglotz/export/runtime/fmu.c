@@ -6,6 +6,9 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter" /* functions of the standard have arguments that no FMU has to read */
+#endif
 @HOLD@
 #define fmu_TOKEN "@TOKEN@"
 
@@ -13,7 +16,7 @@ enum { fmu_STATE = 2 * hz_N + 1, fmu_FIRST_STATE = 1 + hz_M, fmu_VARIABLES = 1 +
 enum { fmu_OK, fmu_WARNING, fmu_DISCARD, fmu_ERROR }; /* as fmi2Status and fmi3Status */
 typedef enum { fmu_INSTANTIATED, fmu_INITIALIZING, fmu_RUNNING, fmu_TERMINATED } fmu_phase;
 
-/* What is saved and restored. The last communication step was made of `steps` steps h from `before` under `acted`. */
+/* The values that are saved and restored. The last communication step had `steps` steps h from `before` under `acted`. */
 typedef struct {
   fmu_phase phase;
   hz_state x, before;
@@ -53,7 +56,7 @@ static void fmu_restart(fmu_instance *it) {
   memcpy(it->now.u, u, sizeof u);
 }
 
-/* Where a variable but time stands; null where there is none. */
+/* The place of a variable other than time; null for an unknown reference. */
 static hz_real *fmu_place(fmu_values *now, unsigned int reference) {
   int i;
   if (reference == 0 || reference >= fmu_VARIABLES) return 0;
@@ -109,7 +112,7 @@ static int fmu_terminate(fmu_instance *it) {
   return fmu_OK;
 }
 
-/* A communication step H is one step, or as few equal ones as the steps that the model was fitted for allow. */
+/* A communication step H is one step, or the fewest equal steps that are not longer than those of the fit. */
 static int fmu_communicate(fmu_instance *it, double time, double H) {
   const double slack = 1e-6; /* as of hz_steps_of */
   fmu_values *now, then;
@@ -180,13 +183,6 @@ static int fmu_differentiate(fmu_instance *it, const unsigned int *unknowns, siz
     }
   return fmu_OK;
 #else
-  (void)unknowns;
-  (void)rows;
-  (void)knowns;
-  (void)columns;
-  (void)seed;
-  (void)result;
-  (void)adjoint;
   return fmu_said(it, fmu_ERROR, "The model has too many coordinates for derivatives.");
 #endif
 }
@@ -235,7 +231,8 @@ static int fmu_from_bytes(fmu_instance *it, const void *bytes, size_t size, void
   return fmu_OK;
 }
 
-/* What this FMU has nothing of: other types of variables, clocks, events, continuous states, derivatives by time. */
+/* A call on `count` things that this FMU lacks: variables of other types, clocks, events, continuous states,
+   derivatives by time. */
 static int fmu_none(void *it, size_t count) {
   if (!it) return fmu_ERROR;
   return count ? fmu_said((fmu_instance *)it, fmu_ERROR, "This FMU has real variables alone, without derivatives by "

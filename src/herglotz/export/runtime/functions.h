@@ -1,4 +1,4 @@
-/* Functions that compilers vectorise, and rows of them. */
+/* Elementary functions without branches, which compilers vectorise, for numbers, registers and rows. */
 
 /* The exponential series (e^r - 1 - r) / r^2 and the series of artanh(r) / r, (sin r - r) / r^3 and (cos r - 1 + r^2 / 2)
    / r^4 in z = r^2; in double precision even and odd powers of the first two apart, which are computed side by side. pi / 2
@@ -59,7 +59,7 @@
 #endif
 
 /* exp(r) - 1 and 2^k where y = k ln 2 + r with |r| <= ln(2)/2, for |y| <= hz_FAR: a few units in the last place, without
-   branches or calls. Needs IEEE 754 numbers. NaN stays. */
+   branches or calls. Needs IEEE 754 numbers. NaN gives NaN. */
 static inline hz_real hz_reduced(hz_real y, hz_real *power) {
   hz_pun two;
   hz_real r = y == y ? y * hz_R(1.44269504088896340736) : hz_R(0.0);
@@ -112,9 +112,9 @@ static inline hz_real hz_choose(hz_real a, hz_real b, hz_real x, hz_real y) { re
 
 static inline hz_real hz_nearest(hz_real x) { return hz_floor_of(x + hz_R(0.5)); }
 
-/* Registers of numbers, as wide as the processor's, with GCC and clang: what they hold side by side is the units of a
-   layer or, in batches, the samples. Another compiler goes number by number, and so does a processor without such
-   registers (Cortex-M): there they would only take stack. */
+/* Registers of numbers, as wide as the processor's, with GCC and clang. A register holds the units of a layer or, in
+   batches, the samples. Other compilers go number by number, and so do processors without such registers (Cortex-M),
+   where they would only take stack. */
 #ifdef __GNUC__
 #if defined(__AVX512F__)
 #define hz_LANE_BYTES 64
@@ -172,7 +172,8 @@ static inline hz_lanes hz_wide_cut(hz_lanes y, hz_real limit) {
   return hz_select((hz_masks)(y < -most), -most, y);
 }
 
-/* The nearest whole number; what is beyond the whole numbers of a processor is one itself, and of no use as an angle. */
+/* The nearest whole number. Numbers beyond the integers of the processor are cut off: as angles they have no digits
+   left. */
 static inline hz_lanes hz_wide_nearest(hz_lanes x) {
   const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
   x = hz_wide_cut(hz_select((hz_masks)(x == x), x, zero), hz_R(hz_SINGLE ? 1e9 : 1e18));
@@ -200,7 +201,7 @@ static inline hz_lanes hz_wide_softplus(hz_lanes x) {
   return hz_select((hz_masks)(x > zero), x, zero) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
 }
 
-/* Without a branch for each: GCC makes a tree of it. */
+/* One sum without branches: of a branch for each lane GCC makes a tree. */
 static inline int hz_any(hz_masks where) {
   hz_signed_t any = 0;
   int w;
@@ -208,7 +209,7 @@ static inline int hz_any(hz_masks where) {
   return any != 0;
 }
 
-/* y_w = f(x_w) by <math.h> where the other formula does not hold. */
+/* y_w = f(x_w) by <math.h> where the formula before does not hold. */
 #define hz_ELSE(holds, function)                                                          \
   do {                                                                                    \
     const hz_masks where = ~(hz_masks)(holds);                                            \
@@ -292,7 +293,7 @@ static inline hz_lanes hz_wide_pow(hz_lanes x, hz_real power) {
 #define hz_WIDE_ROW_OF(function)
 #endif
 
-/* y_k = f(x_k) of a whole row. */
+/* y_k = f(x_k) for a whole row. */
 #define hz_ROW_OF(function)                                                              \
   static inline void hz_##function##_row(int count, const hz_real *x, hz_real *y) {      \
     int k = 0;                                                                           \

@@ -1,5 +1,5 @@
 
-/* A time H under an input that is held: as few equal steps as are no longer than `longest`, at least one. */
+/* The number of equal steps in a time H under a held input: the fewest that are no longer than `longest`. */
 static inline double hz_steps_of(double H, double longest) {
   const double slack = 1e-6; /* recorded times carry rounding */
   const double steps = ceil(H / longest * (1.0 - slack));

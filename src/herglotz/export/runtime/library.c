@@ -95,7 +95,7 @@ void herglotz_momenta(long batch, const hz_real *q, const hz_real *v, const hz_r
   }
 }
 
-/* And back. */
+/* Velocities of positions and momenta; h is one a sample. */
 void herglotz_velocities(long batch, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
     hz_TAKES_THETA hz_real *v_out, unsigned char *status_out) {
   long b;

@@ -1,4 +1,4 @@
-/* Numbers: finite or not by their bits. */
+/* The number type, and tests of bits for numbers that are not finite. */
 
 #if hz_SINGLE
 typedef unsigned int hz_bits_t;
@@ -13,8 +13,8 @@ typedef unsigned long long hz_bits_t;
 #endif
 #define hz_R(x) ((hz_real)(x)) /* a constant of the number type */
 
-/* Inspected as integers: under -ffast-math compilers delete x != x. `volatile` hides that x came from arithmetic that
-   they may assume to be finite. */
+/* Bits, because compilers delete x != x under -ffast-math. `volatile` hides that x is a result of arithmetic, which
+   compilers may assume to be finite. */
 #if (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__ > 0) || defined(_M_FP_FAST)
 #define hz_HIDDEN volatile
 #else
@@ -44,6 +44,6 @@ static inline int hz_all_finite(const hz_real x[hz_N]) {
   return good;
 }
 
-/* Functions whose names begin so hold one sample; hz_wide_ ones a register of them. */
+/* Functions named hz_ work on one sample, functions named hz_wide_ on a register of samples. */
 #define hz_LANE(x, w) (x)
 enum { hz_WIDTH = 1 };

@@ -1,5 +1,5 @@
-/* Numbers of the model that are set at run time, `theta` of the functions below; null means hz_defaults. A run that
-   hz_advance steps keeps those that its track was started with. by_theta of hz_step_jacobian, the derivatives by these
+/* Numbers of the model that are set at run time, `theta` of the functions below; null means hz_defaults. hz_advance
+   steps with the numbers that its track was started with. by_theta of hz_step_jacobian, the derivatives by these
    numbers, is (2 hz_N + 1, hz_P). */
 
 #define hz_TAKES_THETA const hz_parameters *theta,

@@ -1,8 +1,8 @@
 /* Matrix products and sums of long rows. */
 
 /* y_k += sum_j w_jk x_j, where w is (inputs, outputs) and t its transpose. Long rows of outputs are summed side by
-   side, without sums across lanes; a few outputs of many inputs are dot products. With vector types
-   sums stay in registers: left alone, some compilers vectorise the wrong loop and lose a factor of ten. */
+   side, without sums across lanes; a few outputs of many inputs are dot products. Vector types
+   keep sums in registers: without them some compilers vectorise the wrong loop and lose a factor of ten. */
 static inline void hz_product(int inputs, int outputs, const hz_real *w, const hz_real *t, const hz_real *x,
     hz_real *hz_RESTRICT y) {
   int j, k = 0;
@@ -86,7 +86,8 @@ static inline hz_real hz_sum(int count, const hz_real *x) {
   return sum;
 }
 
-/* The inverse X of a matrix A (n, n), n <= hz_N, by elimination with exchanged rows; not finite where there is none. */
+/* The inverse X of a matrix A (n, n), n <= hz_N, by elimination with exchanged rows; not finite where A has no
+   inverse. */
 static inline void hz_inverse(int n, const hz_real *A, hz_real *X) {
   hz_real rows[hz_N][2 * hz_N], pivot;
   int i, j, k, best;
@@ -115,7 +116,7 @@ static inline void hz_inverse(int n, const hz_real *A, hz_real *X) {
 }
 
 #if defined(hz_LANE_BYTES) && hz_WIDE
-/* The same for a register of samples: eight sums at a time stay in registers. */
+/* hz_product for a register of samples, eight sums at a time. */
 static inline void hz_wide_product(int inputs, int outputs, const hz_real *w, const hz_real *t, const hz_lanes *x,
     hz_lanes *hz_RESTRICT y) {
   int j, k = 0;

@@ -1,8 +1,8 @@
-/* The loop over steps, for FN_WIDTH samples side by side. */
+/* The loop over steps of FN_WIDTH samples at once. */
 
-/* The samples b .. b + count of a batch, count <= FN_WIDTH, from `states` (those of these samples only) and on to the
-   end. One whose status is not 0 on entry is not stepped. `flags` receive hz_OUTSIDE_BOX where a sample was there; null:
-   neither that nor the inputs are checked. */
+/* Step samples b .. b + count of a batch, count <= FN_WIDTH, to the end of the job; `states` has these samples only. A
+   sample whose status is not 0 on entry is not stepped. `flags` receive hz_OUTSIDE_BOX where a sample has been outside
+   the box; with null neither the box nor the inputs are checked. */
 static inline void FN_run(hz_state *states, long b, int count, const hz_job *job, int status[FN_WIDTH], int *flags) {
   const long entries = 1 + job->steps / job->every;
   const int kept = job->q || job->p || job->s || job->sigma;

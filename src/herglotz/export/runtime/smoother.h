@@ -1,5 +1,5 @@
 
-/* A fixed-lag smoother: hz_filter, and what it knows of the last samples from the positions measured since. The samples
+/* A fixed-lag smoother: hz_filter, with estimates of the last samples that use the positions measured since. The samples
    lie in an array of the caller, so that nothing is allocated:
 
      hz_past past[20];
@@ -41,7 +41,7 @@ static inline int hz_smoother_start(hz_smoother *smoother, const hz_filter *filt
   return hz_CONVERGED;
 }
 
-/* What is known of the sample before the last `back` ones, 0 to lag; null where that is no sample that is kept. */
+/* The estimate of the sample `back` samples ago, 0 to lag; null where that sample is not kept. */
 static inline const hz_filter *hz_smoothed(const hz_smoother *smoother, int back) {
   if (back < 0 || back > smoother->count) return 0;
   return back ? &smoother->past[(smoother->newest + smoother->lag + 1 - back) % smoother->lag].then : &smoother->now;
@@ -75,7 +75,7 @@ static inline int hz_smoother_predict(hz_smoother *smoother, hz_real h, hz_TAKES
   return status;
 }
 
-/* hz_filter_update, of all samples that are kept. */
+/* hz_filter_update of all kept samples. */
 static inline int hz_smoother_update(hz_smoother *smoother, const hz_real y[hz_N], const hz_noise *noise,
     hz_real *surprise) {
   hz_innovation found;

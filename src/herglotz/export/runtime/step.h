@@ -1,9 +1,9 @@
-/* One step of FN_WIDTH samples side by side: elimination, Newton with backtracking, the guess, and what a run carries
-   along. REAL holds a number of each sample, FN_LANE is that of one of them. Samples do not influence one another. This
-   file is in a header twice: for one sample, and for a register of samples. */
+/* One step of FN_WIDTH samples at once: elimination, Newton's method with backtracking, the guess, and the track of a
+   run. A REAL holds a number of each sample, FN_LANE is the number of one sample. Samples do not influence one another.
+   A header holds this file twice: for one sample, and for a register of samples. */
 
-/* What a run of steps carries along: V(q) and what depends on h alone, both in P; what rounding took from q, p, s and
-   sigma in the additions so far; and, for the guess, the last moves. */
+/* The track of a run of steps: V(q) and the numbers of h alone, both in P; the rounding errors of q, p, s and sigma from
+   the additions so far; and, for the guess, the last moves. */
 typedef struct {
   FN_problem P;
   REAL low_q[hz_N], low_p[hz_N], low_s, low_sigma;
@@ -33,17 +33,16 @@ static inline void FN_track_start(const FN_state *state, hz_TAKES_THETA FN_track
 #endif
 }
 
-/* x + change, with what its rounding loses kept in `low` for the next time. Zero where the sum is so small that its
-   square and its products are not normal numbers any more: a motion that has come to rest would otherwise step many
-   times slower. */
+/* x + change, with the rounding error kept in `low` for the next addition. Zero where the sum is so small that its
+   square and its products are subnormal: a motion at rest would otherwise step many times slower. */
 static inline REAL FN_add(REAL x, REAL change, REAL *low) {
   const REAL add = change + *low, sum = x + add, back = sum - x;
   *low = (x - (sum - back)) + (add - back);
   return FN_choose(SPREAD(hz_R(hz_TINY)), FN_fabs(sum), SPREAD(hz_R(0.0)), sum);
 }
 
-/* J and its factors. One sample exchanges rows by partial pivoting; several do not, and none converges where that
-   fails. */
+/* J and its factors. A single sample exchanges rows by partial pivoting. Samples in registers do not; where J needs an
+   exchange, they do not converge. */
 typedef struct {
   REAL lu[hz_N][hz_N];
   int row[hz_N];
@@ -100,9 +99,9 @@ static inline void FN_length(const REAL x[hz_N], hz_real size[FN_WIDTH]) {
 }
 
 #if !hz_EXPLICIT
-/* Solve F(q1) = 0 from the guess in t->move, where the status is 0. A point close to the last one keeps J (its
-   contraction is checked), and rounding ends the iteration. A move that does not lessen |F| is taken back, to get J
-   where it was an old one, and else halved; of several samples side by side, one that needs this is not solved. */
+/* Solve F(q1) = 0 from the guess in t->move, where the status is 0. A point close to the last point keeps J, as long as
+   the moves shrink; rounding ends the iteration. A move that does not lessen |F| is taken back: then J is evaluated again
+   if it was an old one, else the move is halved. In registers a sample that needs this is left unsolved. */
 static inline void FN_solve(const FN_problem *P, FN_terms *t, int status[FN_WIDTH], hz_real residual[FN_WIDTH]) {
   const int most = FN_WIDTH == 1 ? hz_max_iterations : 7;
   FN_factors A, now;
@@ -195,8 +194,8 @@ static inline void FN_solve(const FN_problem *P, FN_terms *t, int status[FN_WIDT
 }
 
 #if hz_CONTINUES
-/* The solution from the better of two guesses: t->move arrives as the step without what couples q1, and the other is
-   the cubic through the last four positions. */
+/* The solution from the better of two guesses: the uncoupled leapfrog step, which t->move holds on entry, and the cubic
+   through the last four positions. */
 static inline void FN_solve_from_guess(FN_track *track, FN_terms *t, int status[FN_WIDTH], hz_real residual[FN_WIDTH]) {
   REAL guess[2][hz_N];
   int i, w;
@@ -222,8 +221,8 @@ static inline void FN_solve_from_guess(FN_track *track, FN_terms *t, int status[
 #endif
 #endif
 
-/* The move of what Newton has solved for: the move itself or, where dry friction can hold a coordinate, a number z of
-   which the move is what lies beyond the bound. */
+/* The move of Newton's unknown: the unknown itself or, where dry friction can hold a coordinate, the part of it beyond
+   the bound. */
 static inline REAL FN_moved(const FN_problem *P, int i, REAL z) {
 #if hz_STICKING
   const REAL below = FN_choose(z, P->bound[i], P->bound[i], z);
@@ -235,7 +234,7 @@ static inline REAL FN_moved(const FN_problem *P, int i, REAL z) {
 #endif
 }
 
-/* Sample w of several, and back. */
+/* Read sample w of a state, and write it. */
 static inline void FN_get(const FN_state *x, int w, hz_state *one) {
   int i;
   (void)w;
@@ -258,8 +257,8 @@ static inline void FN_set(FN_state *x, int w, const hz_state *one) {
   FN_LANE(x->sigma, w) = one->sigma;
 }
 
-/* hz_OUTSIDE_BOX for each finite state that lies outside the box the model was fitted in. Angles count modulo a turn, and
-   s only where the motion depends on it: it grows without bound. */
+/* Set hz_OUTSIDE_BOX for each finite state outside the box that the model was fitted in. Angles count modulo a turn. The
+   action s grows without bound, and counts only where the motion depends on it. */
 static inline void FN_mark_outside(const FN_state *x, int flags[FN_WIDTH]) {
 #if hz_BOXED
   const REAL one = SPREAD(hz_R(1.0));
@@ -296,8 +295,8 @@ static inline hz_parameters FN_theta(const FN_problem *P, int w) {
 }
 
 #endif /* hz_P */
-/* One step of every sample whose status is 0; one that fails gets its status and keeps its state. What several samples
-   side by side cannot solve is solved alone. */
+/* One step of every sample whose status is 0; a sample that fails gets its status and keeps its state. Samples that
+   registers leave unsolved are solved one by one. */
 static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_WIDTH],
     hz_WITH_U(const hz_real *const u[FN_WIDTH]) int status[FN_WIDTH], hz_real residual[FN_WIDTH]) {
   FN_problem *P = &track->P;

@@ -4,8 +4,8 @@
 #define hz_RESTRICT restrict
 #endif
 
-/* Whether the last moves, continued, are a guess. Where dry friction can hold a coordinate the equation at rest says
-   more, and an explicit step needs none. */
+/* Whether the guess extrapolates the last moves. Where dry friction can hold a coordinate, the equation at rest is a
+   better guess; an explicit step needs no guess. */
 #define hz_CONTINUES (!hz_EXPLICIT && !hz_STICKING)
 
 #if hz_SINGLE
@@ -30,11 +30,11 @@
 #define hz_floor_of floor
 #endif
 
-/* What a step returns: `status & 15` is 0 where it succeeded; the bits above are flags. */
+/* The status of a step: `status & 15` is 0 where the step succeeded; the bits above are flags. */
 enum {
   hz_CONVERGED = 0,
   hz_MAX_ITERATIONS = 1,
-  hz_SINGULAR = 2,     /* det J = 0 or c = 0: the step is not defined there */
+  hz_SINGULAR = 2,     /* det J = 0 or c = 0: the step is not defined */
   hz_DIVERGED = 3,     /* an input, or a number of the state before the step or after it, is not finite */
   hz_BAD_INPUT = 5,    /* h is no finite number > 0, or hz_init is given a number that is not finite */
   hz_OUTSIDE_BOX = 16, /* a separate bit: a state outside the box of the fitted data; the step is done */

@@ -1,5 +1,5 @@
 
-/* Constants of the header that nothing below reads: compilers warn of those in a source file. */
+/* Constants of the header that nothing below reads: compilers warn of such constants in a source file. */
 static inline void hz_unread(void) {
   (void)hz_weights_sha256;
   (void)hz_level;

@@ -1,7 +1,7 @@
-/* Velocities of several states side by side. */
+/* Velocities of several states at once. */
 
 #if defined(hz_BATCHED) && !hz_STICKING
-/* Of FN_WIDTH states, by Newton from rest; `found` says of each whether it ended, as that of hz_velocity would. */
+/* Velocities of FN_WIDTH states by Newton's method from rest; `found` is 1 for each that converged as in hz_velocity. */
 static inline void FN_velocity(const FN_state *x, hz_real h, hz_TAKES_THETA REAL v[hz_N], int found[FN_WIDTH]) {
   FN_factors A;
   REAL p[hz_N], by_v[hz_N * hz_N], move[hz_N], sum;
@@ -29,8 +29,8 @@ static inline void FN_velocity(const FN_state *x, hz_real h, hz_TAKES_THETA REAL
 }
 #endif
 
-/* hz_velocity of the first of `count` states, as many side by side as the processor takes; returns how many. `statuses`
-   are without flags. */
+/* hz_velocity of the first of `count` states, as many at once as registers hold; returns their number. `statuses` have
+   no flags. */
 static inline int hz_velocity_some(const hz_state *states, long count, hz_real h, hz_TAKES_THETA hz_real v[hz_SIDE][hz_N],
     int statuses[hz_SIDE]) {
   const int some = count < hz_SIDE ? (int)count : hz_SIDE;

@@ -1,10 +1,10 @@
-/* Velocities in and out: p = L_v(q, v, s) and its inverse. Where dry friction can hold a coordinate, p has half of its
-   impulse besides, +-(h/2) r(q, v), and the inverse asks for a number z of which v is what lies beyond a bound, as the
-   move of a step does. */
+/* Momenta of velocities, p = L_v(q, v, s), and the inverse. Where dry friction can hold a coordinate, p also has half of
+   the friction's impulse, +-(h/2) r(q, v), and Newton's unknown of the inverse is a z whose part beyond a bound is v, as
+   in a step. */
 
 #define hz_VELOCITIES
 
-/* What hz_momentum gives, with zeros where nothing is set-valued. */
+/* The results of hz_momentum; grip is 0 without set-valued friction. */
 typedef struct {
   hz_real p[hz_N], by_v[hz_N * hz_N], grip[hz_N], grip_by_v[hz_N];
 } hz_legendre;
