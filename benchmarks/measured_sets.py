@@ -39,7 +39,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.peers.rollouts import rk4
-from benchmarks.schmidt_lipson import read_schmidt_lipson
 from herglotz.data import Trajectories, load, simulate
 from herglotz.least_squares import least_squares
 from herglotz.models import ContactLagrangian
@@ -126,9 +125,7 @@ def disturbed(seed: int, _folder: Path) -> dict[str, float]:
 
 def extrapolation(name: str, objective: str = "auto") -> Callable[[int, Path], dict[str, float]]:
     def measure(seed: int, folder: Path) -> dict[str, float]:
-        metrics = fit(
-            read_schmidt_lipson(folder / name), FitConfig(seed=seed, objective=objective), progress=False
-        ).metrics
+        metrics = fit(load(folder / name), FitConfig(seed=seed, objective=objective), progress=False).metrics
         return {k: metrics[k] for k in ("extrapolation_rms", "train_rms", "rate")}
 
     return measure
@@ -243,7 +240,7 @@ def coverage_simulated(seed: int, _folder: Path) -> dict[str, Any]:
 
 
 def coverage_real(seed: int, folder: Path) -> dict[str, Any]:
-    run = fit(read_schmidt_lipson(folder / PENDULUM), FitConfig(seed=seed), progress=False)
+    run = fit(load(folder / PENDULUM), FitConfig(seed=seed), progress=False)
     q, rows = run.data.unwrapped().q, torch.arange(run.data.samples) >= run.train_lengths[0]
     return curves_row(
         {

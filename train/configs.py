@@ -46,4 +46,12 @@ def collapse() -> Experiment:
     )
 
 
-CONFIGS: dict[str, Callable[[], Experiment]] = {f.__name__: f for f in (demo, pendulum, collapse)}
+def real_pendulum() -> Experiment:
+    return Experiment(
+        lambda: load(ROOT.parent / "shared" / "data" / "schmidt_lipson_2009" / "real_pend_h_1.txt"),
+        FitConfig(),
+        "a pendulum somebody measured (Schmidt & Lipson 2009); see data/README.md for where to get the file",
+    )
+
+
+CONFIGS: dict[str, Callable[[], Experiment]] = {f.__name__: f for f in (demo, pendulum, collapse, real_pendulum)}

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from benchmarks.harness import DATA
 from benchmarks.ibm_double_pendulum import read_ibm_double_pendulum
-from benchmarks.schmidt_lipson import read_schmidt_lipson
-from herglotz.data import simulate
+from herglotz.data import load, simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit
@@ -221,7 +220,7 @@ def real_pendulum(history: int = 40) -> Problem:
     def parts() -> tuple[Tensor, Tensor, int]:
         if not path.is_file():
             raise InputError(f"{path}: not here; data/README.md says where to get it, or leave real_pendulum out")
-        data = read_schmidt_lipson(path)
+        data = load(path).unwrapped()
         index = ((data.t - data.t[0]) / h).round().long()
         return index, data.q, round(0.667 * len(index))
 
@@ -243,7 +242,7 @@ def real_pendulum(history: int = 40) -> Problem:
     title = "measured pendulum (Schmidt & Lipson), first 2/3 → last 1/3; one free run"
 
     def own(seed: int) -> tuple[Metrics, int]:
-        run = fit(read_schmidt_lipson(path), FitConfig(seed=seed), progress=False)
+        run = fit(load(path), FitConfig(seed=seed), progress=False)
         cut = run.train_lengths[0]
         return free_run(run.prediction[cut:], run.data.q[cut:]), run.metrics["parameters"]
 

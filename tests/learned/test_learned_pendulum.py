@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.schmidt_lipson import read_schmidt_lipson
 from herglotz.data import load, simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
@@ -156,7 +155,7 @@ def test_adam_trains_too(exact_data, told):
 @pytest.mark.slow  # 138 s: named terms, networks, and both again for the held-out free runs
 def test_measured_pendulum_one_seed():
     # fails if the measured pendulum is predicted worse than by the fitted ODE of mathematics (0.0199 rad)
-    run = fit(read_schmidt_lipson(REAL), FitConfig(departures=(2e-4, 6e-4, 2e-3)))
+    run = fit(load(REAL), FitConfig(departures=(2e-4, 6e-4, 2e-3)))
     assert run.metrics["extrapolation_rms"] < 0.0199
 
 
@@ -164,9 +163,7 @@ def test_measured_pendulum_one_seed():
 @pytest.mark.slow
 def test_measured_pendulum_median_of_five_seeds():
     # fails if the claim of the README does not hold
-    errors = sorted(
-        fit(read_schmidt_lipson(REAL), FitConfig(seed=seed)).metrics["extrapolation_rms"] for seed in range(5)
-    )
+    errors = sorted(fit(load(REAL), FitConfig(seed=seed)).metrics["extrapolation_rms"] for seed in range(5))
     assert errors[2] < 0.0199, errors
 
 

@@ -21,6 +21,7 @@ from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
 from herglotz.data.rows import Unusable
+from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import usable
 from herglotz.data.trajectories import Trajectories
@@ -31,16 +32,21 @@ from herglotz.telling import tell
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file: its name in messages, its ending, its reader, and whether columns can be chosen."""
+    """A kind of file: its name in messages, its ending, its reader, and whether columns can be chosen.
+
+    `begins` is how the first line begins where another format has the same ending.
+    """
 
     name: str
     suffix: str
     read: Callable[..., Trajectories]
     is_table: bool = False
+    begins: str = ""
 
 
 FORMATS = (
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
+    Format("Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, begins="%"),
     *(Format(f"t[s],q[rad],... ({end})", end, read_csv, True) for end in (".csv", ".txt", ".tsv", ".dat")),
     Format("columns as in csv (.parquet)", ".parquet", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_packed, True),
@@ -237,8 +243,8 @@ def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories
 def _read(path: Path, wanted: Wanted) -> Trajectories:
     """The recording of a file, by the format of its ending, in rad and s."""
     suffix = path.suffix.lower()
-    one = next((one for one in FORMATS if one.suffix == suffix), None)
-    if one is None:
+    formats = [one for one in FORMATS if one.suffix == suffix]
+    if not formats:
         spreadsheet = (
             f"{path}: is a spreadsheet; save the sheet as .csv (in Excel: Save as, CSV UTF-8), or hand over its "
             "table in Python: fit(pandas.read_excel(...))"
@@ -247,7 +253,8 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
         known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
         raise InputError(f"{path}: cannot read {suffix or 'a file without extension'}; known formats: {known}")
     # An absent or empty file, a folder or a pipe is refused here for all readers.
-    read_bytes(path, 1)
+    begin = read_bytes(path, 1).decode("latin-1")
+    one = next(one for one in formats if begin.startswith(one.begins))
     if one.is_table:
         return in_radians_and_seconds(one.read(path, wanted))
     refuse({f"{path}: columns are chosen in a table, such as a csv file; this is {one.name}": wanted})
