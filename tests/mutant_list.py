@@ -285,7 +285,7 @@ MUTANTS = [
     ("mechanics/partials.py", 'if L.numel() < 2:', 'if L.numel() < 99:'),
     ("models/translations.py", 'config.mass_width > 0', 'False'),
     ("models/translations.py", 'any("q" in text for text in config.drag)', 'False'),
-    ("models/translations.py", 'product.function == "radius" or', ''),
+    ("models/translations.py", 'any(p.function == "radius" and p.power for p in products)', 'any(())'),
     ("models/translations.py", 'return _complement(torch.tensor(moved, dtype=torch.float64)) if', 'return torch.eye(len(angles), dtype=torch.float64) if'),
     ("models/translations.py", 'for i in at] if angle else [row]', 'for i in at[:1]] if angle else [row]'),
     ("models/terms.py", 'network.blind = blind(config, config.dof)', 'network.blind = None'),

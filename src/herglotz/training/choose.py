@@ -93,6 +93,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         absent=c.absent, turning=seen.turning, spreads=dict(base.spreads),
         start={"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,), **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
+        longest=seen.found.length if named and seen.found is not None else 0,
         departures=c.departures, dissipation=c.dissipation,
         input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros, drifts=seen.drifts,
         reasons=_reasons(seen, user_settings, named, objective) | {
@@ -120,7 +121,8 @@ def _reasons(seen: Look, user_settings: FitConfig, named: bool, objective: str) 
         "forces": seen.structure or AS_SET,
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),
-        "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
+        "fitted_before": "the search for terms fitted the same model" if named else "a first fit",
+        "longest": "over longer ones the search followed or foretold nothing",
         "departures": "there is no network" if named else PRIORS.get(objective, "one-step fits use the last"),
     }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -70,7 +70,7 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     model, sigma = (task.build(plan.network), plan.sigma or 0.0) if plan.fitted_before else _one_step_start(task, plan)
     if task.config.sticking:
         model = with_sticking(model, excess=not plan.fitted_before)
-    found = fit_trajectories(task, model, sigma, known=plan.fitted_before)
+    found = fit_trajectories(replace(task, longest=plan.longest), model, sigma, known=plan.fitted_before)
     # A model that is lost keeps the parameters of the one-step fit.
     if found is None:
         return _lost(task, model, "trajectory", sigma, "the model cannot follow the data over 20 steps")

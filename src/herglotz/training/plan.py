@@ -38,6 +38,8 @@ class Plan:
         Settings of masses and friction by name: coulomb, sticking, coupled, diagonal, alike.
     start, fitted_before
         Starting values of parameters by name; whether these and `sigma` come from an earlier fit of the same model.
+    longest
+        Recorded steps of the longest segments that the earlier fit followed; 0: whole trajectories.
     sigma
         Noise of q that the first stage assumes, in its unit; None: a one-step fit measures it.
     outliers, continues_probe, restarts
@@ -72,6 +74,7 @@ class Plan:
     fitted_before: bool
     restarts: int
     departures: tuple[float, ...]
+    longest: int = 0
     turning: bool = True
     absent: tuple[str, ...] = ()
     spreads: dict[str, float] = field(default_factory=dict)
@@ -161,13 +164,14 @@ WORDS = {
     "continues_probe": "starts from the fit that measured the noise",
     "sigma": "noise assumed",
     "fitted_before": "starts from an earlier fit",
+    "longest": "steps of the longest segments",
     "restarts": "random initialisations",
     "departures": "strengths of the prior that are compared",
 }
 DECISIONS = tuple(WORDS)
 # Decisions that are listed only if they are not empty, 0 or False.
 IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drifts", "drag", "absent", "dissipation",
-          "continues_probe", "fitted_before")  # fmt: skip
+          "continues_probe", "fitted_before", "longest")  # fmt: skip
 MEANINGS = {
     "level": {
         "conservative": "no damping",

@@ -32,7 +32,7 @@ from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import clear, differing_zeros
 from herglotz.training.strengths import likeliest, needed
 from herglotz.training.task import LEAST_GRIP, build_model
-from herglotz.training.trials import ALIKE, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
+from herglotz.training.trials import ALIKE, ASTRAY, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
 
 PART = 2000  # samples that a search is made of, where there are more than twice as many
 FEW = 5  # iterations of a trial's fit, in the place of `ITERATIONS`, on more samples than a search is made of
@@ -211,7 +211,8 @@ class Search:
                 continue
             values, states = moves.start(taken)
             other = trial.fitter.fit(taken, values, trial.length, trial, 2 * self.most, states)
-            if other is None or not set(other.pushing) <= set(trial.pushing):
+            astray = other is not None and other.rms > max(trial.rms, ASTRAY * trial.fitter.spread)
+            if other is None or astray or not set(other.pushing) <= set(trial.pushing):
                 continue
             if self.better(trial, other) is other:
                 return other

@@ -74,16 +74,18 @@ class Structure(NamedTuple):
     """The terms and starting values that were found, and how the recording is to be read for them.
 
     `config` are the settings with the features, the order and the objective that the data call for, `base` has starting
-    values, and `reason` says so in words and numbers. `sigma` is the misfit of whole trajectories, where these were
-    fitted. For these terms inputs have another `hold` ("": the same) and further `input_terms`, sensors have `zeros`
-    that differ between recordings, and `drifts`, and angles are `turning` or positions on a line; `why` has pairs of a
-    name of these five and its reason. `compared` are the models that a search compared (`compared_models`).
+    values, and `reason` says so in words and numbers. `sigma` is the misfit of whole trajectories, or of segments of
+    `length` recorded steps if that is not 0; None: these were not fitted. For these terms inputs have another `hold`
+    ("": the same) and further `input_terms`, sensors have `zeros` that differ between recordings, and `drifts`, and
+    angles are `turning` or positions on a line; `why` has pairs of a name of these five and its reason. `compared` are
+    the models that a search compared (`compared_models`).
     """
 
     config: FitConfig
     base: Baseline
     reason: str
     sigma: float | None = None
+    length: int = 0
     hold: str = ""
     input_terms: tuple[str, ...] = ()
     zeros: tuple[float, ...] = ()  # (B · n)
@@ -193,7 +195,8 @@ def search(
     if differ is not None:
         zeros, why["zeros"] = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     return Structure(
-        settings, base, _told(found, data), found.rms, asked.hold, asked.input_terms, zeros, rates,
+        settings, base, _told(found, data), found.rms, 0 if found.whole else found.length, asked.hold,
+        asked.input_terms, zeros, rates,
         why=tuple(why.items()), compared=compared_models(asked.read.fitters.values(), found),
     )  # fmt: skip
 

@@ -30,7 +30,8 @@ AS_SET = ("level", "seed", "activation", "mass_width", "action_width", "dissipat
 class Task:
     """The data of a fit (the training part without spikes), their baseline, the settings, and the record of stages.
 
-    A `hurried` fit only compares models, and ends when an iteration gains less than 1 %.
+    A `hurried` fit only compares models, and ends when an iteration gains less than 1 %. Segments have at most
+    `longest` recorded steps (0: no limit).
     """
 
     data: Trajectories
@@ -38,6 +39,7 @@ class Task:
     config: FitConfig
     stages: Stages
     hurried: bool = False
+    longest: int = 0
 
     @property
     def size(self) -> float:

@@ -102,7 +102,8 @@ class SegmentStages:
         self, task: Task, model: ContactLagrangian, *, frozen: bool = False, s: Tensor | None = None, label: str = ""
     ):
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
-        self.lengths = segment_lengths(task.data)
+        lengths = segment_lengths(task.data)
+        self.lengths = [length for length in lengths if not task.longest or length <= task.longest] or lengths[:1]
         # If no path is known, a patient fit steps through the trajectory for every trial.
         self.patient, self.many = True, task.data.dof > MANY_COORDINATES
         # A hurried stage that is not the last, or that fits only states, ends when an iteration gains less than 1 %.

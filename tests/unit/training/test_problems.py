@@ -210,8 +210,8 @@ def test_position_metric_does_not_see_the_scale_of_the_lagrangian():
     class Scaled(ContactLagrangian):
         factor = 1.0
 
-        def partials(self, q0, q1, s0, h, order=1):
-            P = super().partials(q0, q1, s0 / self.factor, h, order)
+        def partials(self, q0, q1, s0, h, order=1, u=None):
+            P = super().partials(q0, q1, s0 / self.factor, h, order, u)
             f = self.factor  # ε L_d(·, ·, s/ε): the scale gauge of trap 2
             power = {"L": f, "D1": f, "D2": f, "D3": 1, "D11": f, "D12": f, "D22": f, "D13": 1, "D23": 1, "D33": 1 / f}
             return type(P)(**{k: v * power[k] for k, v in vars(P).items() if v is not None})
