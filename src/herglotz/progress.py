@@ -10,6 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+# A bar that is redrawn more often takes time from the fit.
 REDRAW_SECONDS = 0.2
 # Share of a fit's time that has passed when a part begins and when it ends: medians over 19 systems of `zoo.py --draw
 # 9301`. The second line has shares of FINDING.

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -105,32 +105,49 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     if plain == AIR:
         refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
         return DragFeature(0, 0, 0, 1, 1, air=True)
+    found = _parts(text, plain)
+    of_speed, dry = "of_speed" in found, "dry" in found
+    speed = found["v"] or found["pair"]
+    on, *of = map(int, re.findall(r"\d+", speed or found["dry"] or found["load"] or found["even"]))
+    at = int(found["angle"] or found["q"] or on)
+    a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
+    rate, b, second = float(found["rate"] or 1), int(bool(found["size"] or found["even"])), of[0] - 1 if of else None
+    refuse({
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
+        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
+        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in ("", speed),
+    })  # fmt: skip
+    feature = DragFeature(on - 1, at - 1, a, b, c, second, dry=dry, wave=found["wave"], rate=rate, of_speed=of_speed)
+    _check_periods(text, feature, angles[at - 1])
+    _check_powers(text, feature, of_a_speed=bool(speed))
+    return feature
+
+
+def _parts(text: str, plain: str) -> Mapping[str, str]:
+    """The named parts of a friction text, "" for those that it does not have."""
     match = next(filter(None, (pattern.fullmatch(plain) for pattern in _TEXTS)), None)
     if match is None:
         raise InputError(
             f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1' or "
             "'cos(q1) sgn(v1)'"
         )
-    found = defaultdict(str, {name: part for name, part in match.groupdict().items() if part is not None})
-    of_speed, dry = "of_speed" in found, "dry" in found
-    speed = found["v"] or found["pair"]
-    on, *of = map(int, re.findall(r"\d+", speed or found["dry"] or found["load"] or found["even"]))
-    at = int(found["angle"] or found["q"] or on)
-    wave, rate = found["wave"], float(found["rate"] or 1)
-    a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
-    powers_fit = a <= MAX_POWER and (a >= 1 or bool(wave) if dry else 1 <= c <= MAX_POWER or not speed or of_speed)
-    angle = any(angles[at - 1 : at])
+    return defaultdict(str, {name: part for name, part in match.groupdict().items() if part is not None})
+
+
+def _check_periods(text: str, f: DragFeature, angle: bool) -> None:
+    """Raise InputError if the friction of an angle does not repeat with every turn."""
     refuse({
-        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{at})' instead": a and angle,
-        f"drag '{text}': a wave of an angle is periodic; write a whole number before q{at}":
-            angle and rate % 1 and not of_speed,
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
-        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
-        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in ("", speed),
-        f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not powers_fit,
+        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{f.at + 1})' instead": f.a and angle,
+        f"drag '{text}': a wave of an angle is periodic; write a whole number before q{f.at + 1}":
+            angle and f.rate % 1 and not f.of_speed,
     })  # fmt: skip
-    b, second = int(bool(found["size"] or found["even"])), of[0] - 1 if of else None
-    return DragFeature(on - 1, at - 1, a, b, c, second, dry=dry, wave=wave, rate=rate, of_speed=of_speed)
+
+
+def _check_powers(text: str, f: DragFeature, *, of_a_speed: bool) -> None:
+    """Raise InputError if a power of a position or of a speed is too high, or 0."""
+    of_the_speed = 1 <= f.c <= MAX_POWER or not of_a_speed or f.of_speed
+    fit = f.a <= MAX_POWER and (f.a >= 1 or bool(f.wave) if f.dry else of_the_speed)
+    refuse({f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not fit})
 
 
 class Drag(nn.Module):

@@ -94,7 +94,7 @@ def lengths(angles: Sequence[bool]) -> list[str]:
     return names
 
 
-def polar(angles: Sequence[bool]) -> list[str]:
+def slides(angles: Sequence[bool]) -> list[str]:
     """Slides q_i that joints q_j turn: weight, the mass of the joint, and masses between the joint and other speeds.
 
     A mass m at the distance q_i on a link with the angle q_j adds m q_i² v_j²/2 to K and m g q_i cos q_j to V; terms of
@@ -133,6 +133,6 @@ LIBRARIES: dict[str, Callable[..., list[str]]] = {
     "pendulums": pendulums,
     "harmonics": harmonics,
     "revolute": revolute,
-    "polar": polar,
+    "slides": slides,
     "lengths": lengths,
 }

@@ -25,6 +25,7 @@ MAX_PANELS, DATA = 4, "#B5B5B5"
 # The RMS is written if its part takes more than this part of the axis. The text itself takes 0.15 of the axis in a
 # figure of one panel.
 MIN_WIDTH_OF_RMS = 0.2
+# Shares of a recording that are called by a word.
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 LINES, MAX_PANELS = 13, 3
 # Length of a rollout from the grid, in the typical time (range of q) / (range of p), and its largest number of steps.
 DURATION, MAX_STEPS = 0.35, 400
+# Width of the head of an arrow.
 HEAD_INCHES = 0.05
 # The panel of an angle that exceeds this reaches to ±π. [rad]
 NEAR_PI = 1.6

@@ -34,8 +34,7 @@ from herglotz.stepping.partials_equation import End
 from herglotz.stepping.state import State, Status
 
 # Tolerance in machine epsilons of v, and bound on Newton iterations, both as those of a step.
-TOL = 4
-MAX_ITERATIONS = 30
+TOL, MAX_ITERATIONS = 4, 30
 # Number of samples solved together: second derivatives of many coordinates fill the memory.
 CHUNK = 4096
 

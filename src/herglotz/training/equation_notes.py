@@ -32,6 +32,7 @@ RULE = (
     "step it as the model does: c p + ∂L_d/∂q + c (h/2) f = 0, p₊ = ∂L_d/∂q₊ + (h/2) f, s₊ = s + L_d with {parts}, "
     "c = exp(h ∂L/∂s) and L_d = {L_d}; K, ∂L/∂s and f are taken at q̄ = (q + q₊)/2 and v = (q₊ − q)/h{dry}"
 )
+# L_d of the rules of order 2 and 4.
 OF_ORDER = {
     2: "(c − 1)(s − (h/2) V(q)) + √c h K − (h/2)(V(q) + V(q₊))",
     4: "(c − 1) s + √c (h K + (h³/24)(K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e)) − (h/6)(c V(q) + 4 √c V(q̄) + V(q₊)), "

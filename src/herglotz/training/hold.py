@@ -41,6 +41,7 @@ MIN_LATENESS = 0.3
 FINEST = 2e-3
 # Directions of the search in (delay, lag); the data determine the sum best.
 DELAY, LAG = (1, 0), (0, 1)
+# Steps of a descent, along each axis and along both at once.
 MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
 # Most triples in a window.
 LONGEST = 64
