@@ -17,6 +17,8 @@ from herglotz.stepping import Stepper
 from herglotz.training.problems.one_step import MANY, ResidualProblem
 
 ANGLES, LENGTHS = (True, True), (False, False)
+# Settings of a length and an angle.
+OF_TWO: dict[str, Any] = {"angles": (False, True), **dict.fromkeys(("scale", "speed", "stiffness", "tilt"), (1.0, 1.0))}
 
 
 def built(angles, **settings) -> Any:
@@ -143,6 +145,24 @@ def test_mistakes_in_texts_are_named():
     for words, settings in wrong_at_4.items():
         with pytest.raises(InputError, match=words):
             built((True,), order=4, **settings)
+
+
+def test_order_four_takes_no_lever_arms():
+    # fails if the rule of order 4, whose terms lack their derivatives, is made of them
+    with pytest.raises(InputError, match="order 4 takes no power beside a wave; set order=2"):
+        ModelConfig(order=4, features=("q1 cos(q2)",), potential_width=0, **OF_TWO)
+
+
+def test_the_mass_of_a_slide_that_turns():
+    # fails if the lever arm is no part of the mass that weighs joints of segments
+    model: Any = ContactLagrangian(
+        ModelConfig(features=("q1^2 v2^2", "q1 cos(q2) v1 v2"), potential_width=0, damping_width=0, **OF_TWO)
+    )
+    with torch.no_grad():
+        model.kinetic.sum.coefficient.copy_(torch.tensor([0.5, 0.2]))
+    off = 0.2 * 0.7 * math.cos(0.3)
+    mass = torch.tensor([[0.0, off], [off, 0.7**2]], dtype=torch.float64)
+    torch.testing.assert_close(model.kinetic.mass(torch.tensor([0.7, 0.3]).double()), mass)
 
 
 def test_libraries_stand_for_lists_of_features():

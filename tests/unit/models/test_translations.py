@@ -108,6 +108,8 @@ def test_the_terms_that_are_searched(translations, some, none):
     moved = directions(translations, data.angles)
     assert all(unchanged(text, data.angles, moved) for text in every.features)
     assert not unchanged("r^-1", data.angles, moved)
+    # The lever arm of the wave moves.
+    assert not unchanged("q1 cos(q2)", (False, True), [(1.0, 0.0)])
     assert every.only(("q3^2",)).springs is False  # fails if a pruned model gets its springs back
 
 

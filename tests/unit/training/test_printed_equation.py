@@ -44,8 +44,9 @@ MODELS: dict[str, tuple[dict[str, Any], dict[str, list[float]]]] = {
         {"potential.features.sum.coefficient": [-1.0, 0.1, 1.0, 0.2], "kinetic.sum.coefficient": [0.3]},
     ),
     "lever arms": (
-        {"angles": (False, True), "stiffness": (1.0, 0.5), "features": ("q1 cos(q2)", "0.4 q1^2 sin(2q2) + q1^4")},
-        {"potential.features.sum.coefficient": [0.3, 0.2]},
+        {"angles": (False, True), "diagonal": True, "level": "forced", "stiffness": (1.0, 0.5),
+         "features": ("q1 cos(q2)", "0.4 q1^2 sin(2q2) + q1^4")},
+        {"potential.features.sum.coefficient": [0.3, 0.8]},
     ),
     "a slide that turns": (
         {"angles": (False, True), "stiffness": (1.0, 0.5), "features": ("q1 sin(q2)", "q1^2 v2^2", "q1 cos(q2) v1 v2")},

@@ -14,7 +14,7 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.data.sensors import measured
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, Plan, fit, flow
+from herglotz.training import FitConfig, Plan, fit, flow, search as search_module, structure
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.found_model import settings
 from herglotz.training.held_out import HeldOut, blocks
@@ -130,8 +130,9 @@ def test_a_pendulum_on_a_spring_is_found_in_noise():
     assert found.at_the_noise
 
 
-def test_a_motion_that_feedback_holds_is_found():
-    # fails if fits go on over segments so long that errors of an unstable motion swallow all that they say
+def test_a_motion_that_feedback_holds_is_found(monkeypatch):
+    # fails if fits go on over segments so long that errors of an unstable motion swallow all that they say, or if the
+    # final fit is not told how long these were
     def acceleration(r, a, v, w, u):  # of a ball on a beam
         tilting = u - 2 * 0.11 * r * v * w - 1.08 * r * a.cos()
         return r * w**2 - 7.007 * a.sin() - 0.3 * v, tilting / (0.02 + 0.11 * r**2)
@@ -145,6 +146,15 @@ def test_a_motion_that_feedback_holds_is_found():
     found = there(searched(rolled(acceleration, torque, starts, 500, 0.01, 1e-4)).first)
     assert {"q1 sin(q2)", "friction.input_map[1]"} <= found.taken
     assert found.rms < 0.05 * found.fitter.spread
+    search = found.fitter
+    read = SimpleNamespace(better_on_a_line=lambda _: False, fitters={})
+    asked = SimpleNamespace(best=found, read=read, differ=None, hold="", input_terms=(), wanted=SimpleNamespace())
+    asked.wanted.config = asked.wanted.part = FitConfig().resolved(search.data)
+    asked.how_inputs_act = asked.functions = asked.all_data = lambda: None
+    monkeypatch.setattr(structure, "Questions", lambda *_: asked)
+    monkeypatch.setattr(structure, "drifts", lambda _: None)
+    said = structure.search(search.data, search.base, asked.wanted.config, outliers=False)
+    assert said.length == found.length < max(search.data.lengths) - 1
 
 
 def closed_loop(steps, noise=5e-4):
@@ -478,6 +488,31 @@ def test_a_model_that_has_lost_its_friction_holds_no_joint():
     of, base = settings(there(fitter.fit({"q1^2"}, {}, 5, None)), FitConfig())
     assert not of.sticking
     assert not build_model(base, of, "none").capabilities.sticking
+
+
+@pytest.mark.parametrize(("rms", "joins"), [(0.2, True), (0.3, False)])
+def test_a_model_that_goes_astray_takes_no_place(rms, joins, monkeypatch):
+    # fails if a model that misses a quarter of the spread replaces one that follows: unstable motion, whose own score
+    # over held-out blocks is lost, ended in a model of rest
+    moves = SimpleNamespace(joining=lambda _: [frozenset("a")], start=lambda _: ({}, None))
+    monkeypatch.setattr(search_module, "Moves", lambda _: moves)
+    search, other = (
+        searched(Trajectories.of(torch.arange(9.0), torch.arange(9.0) ** 2)),
+        SimpleNamespace(rms=rms, pushing={}),
+    )
+    monkeypatch.setattr(search, "better", lambda _, richer: richer)
+    fitter = SimpleNamespace(spread=1.0, fit=lambda *_: other)
+    trial: Any = SimpleNamespace(taken=frozenset(), rms=0.1, pushing={}, length=5, fitter=fitter)
+    assert search.moved(trial) is (other if joins else None)
+
+
+def test_the_final_fit_takes_no_longer_segments_than_the_search():
+    # fails if whole trajectories are fitted of a motion that a search could follow over segments alone
+    data = simulate(scene("duffing"), trajectories=1, steps=200, h=0.1, noise=NOISE, seed=0)
+    run = fit(data, progress=False)
+    plan = replace(Plan.from_dict(run.metrics["plan"]), longest=40)
+    assert run.metrics["segment_steps"] > 130 * plan.substeps
+    assert fit(data, plan=plan, progress=False).metrics["segment_steps"] < 50 * plan.substeps
 
 
 def test_friction_that_pushes_does_not_join():
