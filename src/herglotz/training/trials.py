@@ -313,9 +313,7 @@ class Fitter:
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
         followed = min(max(LOST * trial.rms, FOLLOWED * self.spread), ASTRAY * self.spread)
-        # Errors of an unstable motion grow without end: over long segments the mean foretells held-out blocks better.
-        foretold = found is not None and found.rms <= followed and found.score.rms <= self.spread
-        return found if foretold else None
+        return None if found is None or found.rms > followed else found
 
     def grow(self, trial: Trial) -> Trial:
         """Over segments that grow as long as the model follows the data."""
