@@ -86,20 +86,11 @@ class Combination(nn.Module):
 
     def _powers(self, x: Tensor, k: int, function: str = "power") -> Tensor:
         """Return the k-th derivative of the powers of kind `function`, without a sign."""
-        exponent = self.power.split(self.counts)[RIDGES.index(function)]
-        rest, product = exponent - k, torch.ones_like(x)
-        # The forward-mode derivative of `pow` takes the logarithm of negative numbers.
-        for j in range(self.highest - k):
-            product = product * torch.where(rest > j, x, 1.0)
-        return _front(exponent, k) * product
+        return _power(x, self.power.split(self.counts)[RIDGES.index(function)], self.highest, k)
 
     def lever(self, q: Tensor, k: int) -> Tensor:
         """Return the k-th derivative of (a·q)^degree, (..., ridges)."""
-        x, rest = q @ self.arm.T, self.degree - k
-        product = torch.ones_like(x)
-        for j in range(self.highest_degree - k):
-            product = product * torch.where(rest > j, x, 1.0)
-        return _front(self.degree, k) * product
+        return _power(q @ self.arm.T, self.degree, self.highest_degree, k)
 
     def value(self, q: Tensor, f: Tensor) -> Tensor:
         """Return f (a·q)^degree, for f (..., ridges) of the ridges: what they are times their lever arms."""
@@ -227,6 +218,15 @@ def _wave(x: Tensor, k: int) -> Tensor:
     """Return the k-th derivative of cos; k + 3 gives the k-th derivative of sin."""
     wave = x.sin() if k % 2 else x.cos()
     return -wave if k % 4 in (1, 2) else wave
+
+
+def _power(x: Tensor, exponent: Tensor, highest: int, k: int) -> Tensor:
+    """Return the k-th derivative of x to whole powers, of which the largest is `highest`."""
+    rest, product = exponent - k, torch.ones_like(x)
+    # The forward-mode derivative of `pow` takes the logarithm of negative numbers.
+    for j in range(highest - k):
+        product = product * torch.where(rest > j, x, 1.0)
+    return _front(exponent, k) * product
 
 
 def _front(exponent: Tensor, k: int) -> Tensor:
