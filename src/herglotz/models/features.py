@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from inspect import signature
-from itertools import combinations, combinations_with_replacement, product
+from itertools import combinations, combinations_with_replacement, permutations, product
 
 from herglotz.errors import InputError
 from herglotz.models.feature_grammar import Feature, Product, parse
@@ -76,6 +76,16 @@ def revolute(angles: Sequence[bool]) -> list[str]:
     return _waves(angles, 1, len(angles))
 
 
+def spherical(angles: Sequence[bool]) -> list[str]:
+    """Joints q_j that turn about an axis across that of another joint q_i: the mass of q_i has cos 2q_j and sin 2q_j.
+
+    A link with the angle q_j to the axis of q_i, as a spherical or a rotary pendulum has, adds m l² sin² q_j v_i²/2 to
+    K.
+    """
+    turning = [i for i, angle in enumerate(angles, 1) if angle]
+    return [f"{f}(2q{j}) v{i} v{i}" for i, j in permutations(turning, 2) for f in ("cos", "sin")]
+
+
 def lengths(angles: Sequence[bool]) -> list[str]:
     """Frequent features of coordinates that are no angles, singly and in pairs.
 
@@ -134,5 +144,6 @@ LIBRARIES: dict[str, Callable[..., list[str]]] = {
     "harmonics": harmonics,
     "revolute": revolute,
     "slides": slides,
+    "spherical": spherical,
     "lengths": lengths,
 }

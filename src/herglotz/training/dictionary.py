@@ -13,7 +13,7 @@ from itertools import combinations
 from herglotz.models import ModelConfig
 from herglotz.models.config import POWERS
 from herglotz.models.drag import AIR
-from herglotz.models.features import expand, lengths, revolute, slides
+from herglotz.models.features import expand, lengths, revolute, slides, spherical
 
 # Highest power of a length in the potential of one coordinate: forces up to x⁵.
 HIGHEST = 6
@@ -56,7 +56,7 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
         return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", "|q1| q1", "|q1|^3")
     if any(angles):
         still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
-        return (*revolute(angles), *still, *slides(angles))
+        return (*revolute(angles), *still, *slides(angles), *spherical(angles))
     return tuple(name for name in lengths(angles) if not name.startswith("r^"))
 
 

@@ -170,8 +170,8 @@ def test_libraries_stand_for_lists_of_features():
     assert expand(["chain", "q1^2", "q1^2"], (False,) * 3)[0] == "(q1)^2 + (q2 - q1)^2 + (q3 - q2)^2 + (-q3)^2"
     assert expand(["q1^2", "q1^2"], LENGTHS) == ["q1^2"]
     for name in LIBRARIES:
-        turning = name in ("harmonics", "pendulums", "revolute", "slides")
-        for angles in ((False, True), (True, False, True)) if turning else (LENGTHS, (False,) * 5):
+        turning = name in ("harmonics", "pendulums", "revolute", "slides", "spherical")
+        for angles in ((False, True, True), (True, False, True)) if turning else (LENGTHS, (False,) * 5):
             names = expand([name], angles)
             assert len(set(names)) == len(names) > 0
             for text in names:
