@@ -8,7 +8,7 @@ from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.search import Search
-from herglotz.training.strengths import of_terms
+from herglotz.training.strengths import likeliest, of_terms
 from herglotz.training.trials import ITERATIONS, Fitter, Trial, Variant
 
 
@@ -36,16 +36,23 @@ def _fitter(search: Search, variant: Variant) -> Fitter | None:
 
 
 def _joined(search: Search, best: Trial) -> Trial | None:
-    """A model with the functions that join it; None where it cannot be fitted together with what all functions have.
+    """A model with the functions that join it one by one or, where that does not end at the noise, all at once.
 
-    Terms that are waves of a function bring that function with them.
+    None where the model cannot be fitted together with what all functions have. Terms that are waves of a function
+    bring that function with them.
     """
     if (fitter := _fitter(search, replace(best.fitter.variant, kept=best.taken))) is None:
         return None
     taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
     taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
     same = fitter.fit(taken, fitter.values_of(best), best.length, best)
-    return same and search.settled(search.finer(same), swapped=True)
+    found = same and search.settled(search.finer(same), swapped=True)
+    if found is None or found.at_the_noise:
+        return found
+    every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
+    if every is None or search.better(best, every) is best:
+        return found
+    return search.better(found, search.settled(likeliest(every, 2 * ITERATIONS), swapped=True))
 
 
 def _anew(search: Search) -> Trial | None:

@@ -22,7 +22,8 @@ class Questions:
     """The answers so far: the model, and what the data were found to be."""
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
-        self.wanted, self.holds = wanted, holds  # the search of all data, and the holds of inputs that may be tried
+        # The search of all data, and the holds of inputs that may be tried: where there are others, that of the data too.
+        self.wanted, self.holds = wanted, (*holds, *([wanted.data.hold] if holds else []))
         self.hold, self.input_terms = "", ()
         # The search of the part, its sensors' zeros taken off where these differ; the model; the zeros.
         self.read: Search = wanted.part
@@ -56,13 +57,17 @@ class Questions:
         return True
 
     def how_inputs_act(self) -> None:
-        """Terms anew with other terms of the inputs, where the model asks for some."""
+        """Terms anew with other terms of the inputs, where the model asks for some; then the hold once more.
+
+        A hold may have stood for the term that was missing.
+        """
         if self.best is None or not (terms := self.read.input_terms(self.best)):
             return
         read = self.read.driven_by(terms)
         found = _searched(read)
         if found is not None and found.replaces(self.best) and read.finalist(found, (self.best, found)) is found:
             self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
+            self.how_inputs_hold()
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.
@@ -72,8 +77,7 @@ class Questions:
         if self.best is None or (found := with_functions(self.read, self.best)) is self.best:
             return
         self.best = found
-        others = [] if self.wanted.part.longer > 1 else [hold for hold in self.holds if hold != self.hold]
-        later = self.read.held(found, others)
+        later = "" if self.wanted.part.longer > 1 else self.read.held(found, self.holds)
         wanted = self.wanted.of(replace(self.wanted.data, hold=later)) if later else self.wanted
         if (again := wanted.part.again(found)) is None:
             return

@@ -285,7 +285,7 @@ class Search:
     def held(self, trial: Trial, holds: Sequence[str], *, alike: bool = False) -> str:
         """The hold that the same model asks for; "" for none. `alike`: by the residuals of the fits themselves."""
         best, found = trial, ""
-        for hold in [] if trial.at_the_noise else holds:
+        for hold in [] if trial.at_the_noise else [hold for hold in holds if hold != self.data.hold]:
             other = self.of(replace(self.data, hold=hold)).again(trial)
             if other is not None and (other.fits_better(best) if alike else other.replaces(best)):
                 best, found = other, hold
