@@ -27,6 +27,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.polar import circles
 from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, coarse, precision, precisions
+from herglotz.data.splits import enough
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.flow import motion
@@ -210,11 +211,14 @@ def judged(
     was held out), and `metrics` the numbers of the fit so far.
     """
     used = torch.ones_like(task.data.t, dtype=torch.bool) if fitted.used is None else fitted.used
+    # Of a bad recording the fit may use too few samples for a motion.
+    used = enough(used, task.data.lengths)
     kept, states = task.data.keep(used), fitted.states[~seen.spikes]
     windows = window_errors(task, fitted, states[used], kept)
     out = _gross(windows, kept) if fitted.notes.get("robust") else torch.zeros_like(kept.t, dtype=torch.bool)
     out &= kept.complete
-    kept, windows = kept.keep(~out), windows[~out & kept.complete]
+    good = enough(~out, kept.lengths)
+    kept, windows = kept.keep(good), windows[good & kept.complete]
     held_out = seen.unseen is not None and bool(seen.unseen.complete.any())
     unseen = unseen_window_errors(task, fitted, cast(Trajectories, seen.unseen)) if held_out else None
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)

@@ -309,6 +309,20 @@ def test_gross_errors_have_no_say(wrong, told):
     assert text.endswith("their spread is 1 m; 15 training samples are far from the model, and are left out") is told
 
 
+def test_a_recording_of_something_else_does_not_end_a_fit():
+    # fails if the fit rejects all but two samples of one recording, and its judge refuses these two: 10 of 36 such sets
+    generator = torch.Generator().manual_seed(6)
+    t, q = 0.05 * torch.arange(12).double(), []
+    for b in range(10):
+        speed = torch.rand(1, generator=generator).double()
+        wrong = 0.4 + 0.25 * torch.randn(12, generator=generator).double() if b == 8 else None
+        fall = speed * t + 4.9 * t * t if wrong is None else wrong
+        q.append(fall + 0.0015 * torch.randn(12, generator=generator).double())
+    run = fit(Trajectories.of(t.repeat(10), torch.cat(q), (12,) * 10), progress=False)
+    assert len({row // 12 for row in run.metrics["outlier_samples"]}) == 1
+    assert "samples are far from the model" not in run.metrics["verdict"]
+
+
 def test_short_data_have_no_precision():
     # fails if fewer than nine samples raise, or are taken for exact
     t = torch.arange(6, dtype=torch.float64) * 0.1
