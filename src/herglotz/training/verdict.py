@@ -125,7 +125,7 @@ class Errors:
     `windows`, `unseen` and `free` are the three errors in the head of this module, None if nothing was held out; `free`
     is inf if the free run fails or diverges. `noise` is the precision of the data, inf if unknown. With `unit` None
     all numbers are over the spread; with `degrees` numbers in rad are printed in deg. `out` training samples with gross
-    errors are left out of the errors.
+    errors are left out of the errors. The precision of the coordinates `rough`, not of all, exceeds half their spread.
     """
 
     windows: float
@@ -136,6 +136,7 @@ class Errors:
     unit: str | None = ""
     degrees: bool = False
     out: int = 0
+    rough: tuple[str, ...] = ()
 
     @property
     def limit(self) -> float:
@@ -228,7 +229,11 @@ def judged(
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
     spread = _rms(scaled.q - scaled.q.mean(0))
     named, in_degrees = (common_unit(kept.units), bool(kept.degrees)) if kept.dof == 1 else (None, False)
-    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees, int(out.sum()))
+    rough = (precisions(scaled) > HALF).tolist() if kept.dof > 1 else [True]
+    names = () if all(rough) else tuple(name for name, own in zip(kept.names, rough, strict=True) if own)
+    errors = Errors(
+        _rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees, int(out.sum()), names
+    )
     ahead = foresee(task, fitted, seen, everywhere)
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)
@@ -270,7 +275,7 @@ def in_words(
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
-        return f"{FAILS}: no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
+        return f"{FAILS}: {_unseen_motion(errors)}"
     chance = 0.0 if ahead is None else CHANCE * ahead.start * errors.spread
     if free > max(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown)}"
@@ -279,6 +284,15 @@ def in_words(
     if errors.worst <= AT_THE_NOISE * errors.limit:
         return f"{FITS}: {errors}"
     return ". ".join(filter(None, (_worse(errors), shown() if missed else "")))
+
+
+def _unseen_motion(errors: Errors) -> str:
+    """The verdict where no motion stands out from the noise: of all coordinates, or of those without inertia."""
+    if not errors.rough:
+        return f"no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
+    names, move = ",".join(errors.rough), "moves" if len(errors.rough) == 1 else "move"
+    what = f"{names} {move} from sample to sample as no mass does; {errors}"
+    return f"{what}. Try --inputs {names} where the others follow what is commanded, else --drop {names}"
 
 
 def _worse(errors: Errors) -> str:

@@ -327,3 +327,13 @@ def test_short_data_have_no_precision():
     # fails if fewer than nine samples raise, or are taken for exact
     t = torch.arange(6, dtype=torch.float64) * 0.1
     assert math.isinf(precision(Trajectories.of(t, t.cos()[:, None], (6,), angles=(False,))))
+
+
+def test_a_command_among_the_coordinates_is_named():
+    # fails if a ball on a beam is told "less noise, or a longer recording": the angle of the beam is a command
+    errors = Errors(0.75, 1.5, 1.5, noise=0.59, spread=1.0, unit=None)
+    metrics = {"follows_data": True, "gain_over_mean": 1.0}
+    assert "no motion stands out from the noise" in in_words(replace(errors, windows=0.9), None, metrics)
+    text = in_words(replace(errors, windows=0.9, unseen=0.9, free=0.9, rough=("beam",)), None, metrics)
+    assert text.startswith("does not fit: beam moves from sample to sample as no mass does; free runs")
+    assert text.endswith(". Try --inputs beam where the others follow what is commanded, else --drop beam")
