@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -43,7 +44,7 @@ def test_verify_and_compare_with_the_run(tiny_onnx, tiny_run, monkeypatch, capsy
     assert "is no file" in capsys.readouterr().err
     # fails if the run of another machine ends in an internal error
     other = load_run(tiny_run)
-    ones = {name: (1.0, 1.0) for name in ("scale", "speed", "stiffness", "tilt")}
+    ones: Any = {name: (1.0, 1.0) for name in ("scale", "speed", "stiffness", "tilt")}
     model = ContactLagrangian(ModelConfig(angles=(False, False), **ones))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("herglotz.training.load_run", lambda *_: replace(other, model=model))
