@@ -81,6 +81,9 @@ def run(arguments: argparse.Namespace) -> int:
     result = load_run(arguments.source)
     data = load(arguments.data, like=result.data, **columns_of(arguments))
     _tell_of_names(data.names, result.data.names)
+    if data.input_labels and not result.model.inputs:
+        names = ", ".join(name for name, _ in data.input_labels)
+        say(f"herglotz: note: the run has no input: {names} left aside", sys.stderr)
     if data.time_unit != result.data.time_unit:
         raise InputError(
             f"{arguments.data}: time is in {data.time_unit}, the run was fitted in {result.data.time_unit}; convert it"

@@ -125,5 +125,5 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figu
         for trade in numbers["traded"]:
             print(fill(trade["words"], COLUMNS, initial_indent="  ", subsequent_indent="      "))
     else:
-        print("Each parameter above is determined on its own: none can be traded for another.")
+        print("None of these parameters can be traded for another of them.")
     print(f"Figure: {figure}")

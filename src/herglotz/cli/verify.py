@@ -66,6 +66,11 @@ def run(arguments: argparse.Namespace) -> int:
         save_theory_figures(arguments.target, arguments.plots, h=arguments.h)
     settings = {name: getattr(arguments, name) for name in ("h", "samples", "steps", "seed")}
     model = None if arguments.against is None else load_run(arguments.against).model.to(target.dtype)
+    if model is not None and (model.dof, model.inputs) != (target.dof, target.inputs):
+        raise InputError(
+            f"--against {arguments.against}: the run has {model.dof} coordinate(s) and {model.inputs} input(s), "
+            f"{arguments.target} has {target.dof} and {target.inputs}; give the run that the file was exported from"
+        )
     report = verify(target, model=model, **settings)
     found = symmetries(target, h=arguments.h, seed=arguments.seed) if arguments.symmetries else None
     agreement = None if arguments.against is None else _agreement(target, arguments)

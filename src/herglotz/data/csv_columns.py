@@ -149,6 +149,10 @@ def assign(cells: Sequence[str], where: str, wanted: Wanted = HEADER_DECIDES) ->
     wanted = wanted.by_name(cells, names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
+    refuse({
+        f"{where}: {quote(x)} is named for both {' and '.join(fields)}; a column has one role": len(fields) > 1
+        for x in names if (fields := [f for f in ROLE_OF_FIELD if x in as_names(getattr(wanted, f) or ())])
+    })  # fmt: skip
     guesses = _guesses(names, units, wanted)
     roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
     clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))

@@ -50,8 +50,8 @@ def with_input_terms(data: Trajectories, terms: Sequence[str]) -> Trajectories:
     where, labels = data.source or "data", dict(data.input_labels)
     known = {form.format(name): (name, form) for name in labels for form in FORMS}
     known |= {term: (found[2], term) for term in terms if (found := saturation(term)) and found[2] in labels}
-    every = ", ".join(labels) or "no inputs"
-    remedy = f"write x^2, |x|, x', sat(x/2) or tanh(x/2) of an input x, 2 being its level > 0; the inputs are {every}"
+    inputs = f"the inputs are {', '.join(labels)}" if labels else "the data have no input: name one with --inputs NAMES"
+    remedy = f"write x^2, |x|, x', sat(x/2) or tanh(x/2) of an input x, 2 being its level > 0; {inputs}"
     for term in terms:
         refuse({f"{where}: {term!r} is no term of an input; {remedy}": term not in known})
     assert data.u is not None

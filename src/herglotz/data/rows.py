@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from herglotz.data.checks import EXACT
 from herglotz.errors import InputError
@@ -41,3 +44,19 @@ def number(text: str, where: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{where}: {quote(text)} is not finite; correct or delete the row")
     return value
+
+
+def out_of_order(values: np.ndarray, starts: np.ndarray, names: Sequence[str]) -> str:
+    """The remedy for times that do not increase at the rows `starts` of a table, whose columns have these names.
+
+    A column that changes there and nowhere else numbers the recordings.
+    """
+    changes = np.diff(values, axis=0) != 0
+    expected = np.isin(np.arange(1, len(values)), starts)
+    numbered = [name for name, own in zip(names, changes.T, strict=True) if bool((own == expected).all())]
+    if len(starts) > 1 and numbered:
+        return f"column '{numbered[0]}' changes wherever time starts anew: --group {numbered[0]} (group= in Python)"
+    return (
+        "sort the rows, delete one, or number the trajectories in a column 'trajectory' (another name: --group NAME, "
+        "group= in Python)"
+    )

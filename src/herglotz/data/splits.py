@@ -56,6 +56,11 @@ def trained_whole(lengths: Sequence[int], fraction: float) -> str:
     )
 
 
+def enough(kept: Tensor, lengths: Sequence[int]) -> Tensor:
+    """The samples that are `kept`, (N,) bool, of trajectories that keep three or more; the others keep none."""
+    return torch.cat([own & (int(own.sum()) >= MIN_SAMPLES) for own in kept.split(list(lengths))])
+
+
 def leading(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
     """Which samples are among the first `lengths[b]` of the `of[b]` samples of trajectory b, (N,) bool."""
     return torch.cat([torch.arange(count) < k for count, k in zip(of, lengths, strict=True)])
@@ -85,10 +90,16 @@ def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
 def every_mth(lengths: Sequence[int], every: int) -> Tensor:
     """Return which samples are 0, m, 2m, … of their trajectory, (N,) bool.
 
-    Raise InputError if `every` is not a whole number >= 1.
+    Raise InputError if `every` is not a whole number >= 1, or leaves a trajectory fewer than three samples.
     """
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be a whole number >= 1, got {every!r}")
+    least = min(lengths)
+    if every > max(most := (least - 1) // (MIN_SAMPLES - 1), 1):
+        raise InputError(
+            f"every = {every} leaves {-(-least // every)} of the {least} samples of trajectory {lengths.index(least)}, "
+            f"at least {MIN_SAMPLES} are needed; every may be at most {most} here"
+        )
     return torch.cat([torch.arange(length) % every == 0 for length in lengths])
 
 

@@ -17,7 +17,7 @@ from herglotz.data.column_roles import name_and_unit
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import with_missing
 from herglotz.data.rates import Recording, completed, in_order, without_repeats
-from herglotz.data.rows import Unusable, quote
+from herglotz.data.rows import Unusable, out_of_order, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import PER_SECOND, in_seconds
 from herglotz.errors import InputError, refuse
@@ -146,8 +146,7 @@ def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
         k = int(back[0])
         raise Unusable(
             f"{path}, row {one.at[k + 1]}, column '{clock}': {float(t[k + 1])!r} does not increase on {float(t[k])!r} "
-            f"in row {one.at[k]}; sort the rows, delete one, or number the trajectories in a column 'trajectory' "
-            "(another name: --group NAME, group= in Python)"
+            f"in row {one.at[k]}; {out_of_order(one.values, back + 1, [columns.names[i] for i in columns.numeric])}"
         )
     return one
 

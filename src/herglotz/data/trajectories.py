@@ -261,16 +261,16 @@ class Trajectories:
     def keep(self, kept: Tensor) -> Trajectories:
         """Return these samples alone, (N,) bool; steps become longer where samples between are left out.
 
-        A longer step takes the mean of its inputs, weighted by duration. The first sample of every trajectory
-        must be kept. Inputs then belong to steps: the hold, if known, is "zero".
+        A longer step takes the mean of its inputs, weighted by duration. A trajectory without a sample is left out,
+        too. Inputs then belong to steps: the hold, if known, is "zero".
         """
         if bool(kept.all()):
             return self
         columns = self._map(lambda x: x[kept])
         if (u := self.inputs_of_steps()) is not None:
             columns["u"] = inputs_of_kept(self.t, u, self.lengths, kept)
-        lengths = tuple(int(own.sum()) for own in kept.split(list(self.lengths)))
-        return replace(self, **columns, lengths=lengths, hold="zero" if self.hold else "")
+        counts = (int(own.sum()) for own in kept.split(list(self.lengths)))
+        return replace(self, **columns, lengths=tuple(filter(None, counts)), hold="zero" if self.hold else "")
 
     def select(self, indices: Iterable[int] | Tensor) -> Trajectories:
         """Return these trajectories, in this order; an index may come twice."""

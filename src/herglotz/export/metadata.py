@@ -149,7 +149,8 @@ def describe(
         raise InputError(f"metadata may not replace {', '.join(taken)}; use another name")
     entries.update(extra)
     if (span := entries.get("h_range")) is not None and not (len(span) == 2 and 0 < span[0] <= h <= span[1]):
-        raise InputError(f"h_range must be (low, high) with 0 < low <= h = {h:g} <= high, got {list(span)}")
+        given = ", ".join(f"{x:g}" for x in span)
+        raise InputError(f"h_range must be (low, high) with 0 < low <= h = {h:g} <= high, got [{given}]")
     return entries
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,10 @@ from herglotz.export.noise import noise_of
 from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.training import Run
 from herglotz.training.summary import model_card
+
+# Relative rounding error of steps that are differences of recorded times: a clock's 0.001 s and 0.00099999999999989 s
+# are one step.
+ROUNDING = 1e-6
 
 IN_C: dict[str, Callable[..., Path]] = {
     "c": export_c,
@@ -66,8 +69,8 @@ def export_run(
         "pt2", "aoti", "onnx", "c", "casadi", "acados", "fmu" (FMI 3.0) or "fmu2" (2.0); None: by the end of the name.
     h_range
         Shortest and longest step of the file; None: the steps of the fit and of the recording, which a fit may cross
-        in several steps. An end that equals the run's own step to six digits becomes the run's step: recorded times
-        are rounded, and 0.2 also means 0.2000000000000002.
+        in several steps. The file takes steps that equal these to six digits, too: recorded times are rounded, and 0.2
+        also means 0.2000000000000002.
     name
         Prefix of every name in C, as in `export_c`, and the identifier of an FMU; None: the file's name.
     dtype
@@ -93,14 +96,15 @@ def export_run(
     refuse({f"{path}: {words}, not of {kind}; leave it out": key in asked and kind not in kinds
             for key, (kinds, words) in OF_KINDS.items()})  # fmt: skip
     (q, p, s), t = run.last_fitted()
-    span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or _steps(run)]
+    low, high = h_range or _steps(run)
+    span = [low * (1 - ROUNDING), high * (1 + ROUNDING)]
     metadata = {
         "names": list(run.data.names),
         "time_unit": run.data.time_unit,
         "degrees": list(run.data.degrees),
         "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t},
         "metrics": run.metrics,
-        "card": model_card(run, (span[0], span[-1])),
+        "card": model_card(run, (low, high)),
         "h_range": span,
         **_of_inputs(run),
     }

@@ -228,7 +228,7 @@ def _open(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
         blocks.append("What these data cannot tell apart (record other motions, or give one of them):")
         blocks += trades
     else:
-        blocks.append("Each physical parameter is determined on its own: none can be traded for another.")
+        blocks.append("None of the physical parameters can be traded for another of them.")
     caption = "Data minus model, with the 90 % bands of the model (dark) and of a measured value (light)."
     return (*blocks, Picture(plot_bands(run, posterior.bands()), caption))
 

@@ -24,6 +24,8 @@ DIMENSIONS = {
     "friction.log_stribeck": (1, 1),
     INPUT_MAP: (1, 2),
 }
+# Widths of dry friction, which exceed the sharpest one by the exponential of the parameter (`Friction.widths`).
+WIDTHS = ("friction.log_smooth", "friction.log_stribeck")
 # Parameters stored as logarithms, with the power of the exponential: the mass is the square of its factor's entry C.
 LOGARITHMS = {"kinetic.log_diagonal": 2, "friction.log_smooth": 1, "friction.log_stribeck": 1}
 
@@ -69,6 +71,8 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
         if (power := LOGARITHMS.get(name)) is not None:
             value = math.exp(power * value)
             spread *= power * value
+        if name in WIDTHS:
+            value += float(run.model.get_buffer("friction.sharpest")[i])
         found.append(Quantity(name, words + whose, _unit(name, run, i), value, spread))
     return found
 

@@ -27,6 +27,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.polar import circles
 from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, coarse, precision, precisions
+from herglotz.data.splits import enough
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.flow import motion
@@ -124,7 +125,7 @@ class Errors:
     `windows`, `unseen` and `free` are the three errors in the head of this module, None if nothing was held out; `free`
     is inf if the free run fails or diverges. `noise` is the precision of the data, inf if unknown. With `unit` None
     all numbers are over the spread; with `degrees` numbers in rad are printed in deg. `out` training samples with gross
-    errors are left out of the errors.
+    errors are left out of the errors. The precision of the coordinates `rough`, not of all, exceeds half their spread.
     """
 
     windows: float
@@ -135,6 +136,7 @@ class Errors:
     unit: str | None = ""
     degrees: bool = False
     out: int = 0
+    rough: tuple[str, ...] = ()
 
     @property
     def limit(self) -> float:
@@ -210,11 +212,14 @@ def judged(
     was held out), and `metrics` the numbers of the fit so far.
     """
     used = torch.ones_like(task.data.t, dtype=torch.bool) if fitted.used is None else fitted.used
+    # Of a bad recording the fit may use too few samples for a motion.
+    used = enough(used, task.data.lengths)
     kept, states = task.data.keep(used), fitted.states[~seen.spikes]
     windows = window_errors(task, fitted, states[used], kept)
     out = _gross(windows, kept) if fitted.notes.get("robust") else torch.zeros_like(kept.t, dtype=torch.bool)
     out &= kept.complete
-    kept, windows = kept.keep(~out), windows[~out & kept.complete]
+    good = enough(~out, kept.lengths)
+    kept, windows = kept.keep(good), windows[good & kept.complete]
     held_out = seen.unseen is not None and bool(seen.unseen.complete.any())
     unseen = unseen_window_errors(task, fitted, cast(Trajectories, seen.unseen)) if held_out else None
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)
@@ -224,7 +229,11 @@ def judged(
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
     spread = _rms(scaled.q - scaled.q.mean(0))
     named, in_degrees = (common_unit(kept.units), bool(kept.degrees)) if kept.dof == 1 else (None, False)
-    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees, int(out.sum()))
+    rough = (precisions(scaled) > HALF).tolist() if kept.dof > 1 else [True]
+    names = () if all(rough) else tuple(name for name, own in zip(kept.names, rough, strict=True) if own)
+    errors = Errors(
+        _rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees, int(out.sum()), names
+    )
     ahead = foresee(task, fitted, seen, everywhere)
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)
@@ -266,7 +275,7 @@ def in_words(
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
-        return f"{FAILS}: no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
+        return f"{FAILS}: {_unseen_motion(errors)}"
     chance = 0.0 if ahead is None else CHANCE * ahead.start * errors.spread
     if free > max(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown)}"
@@ -275,6 +284,15 @@ def in_words(
     if errors.worst <= AT_THE_NOISE * errors.limit:
         return f"{FITS}: {errors}"
     return ". ".join(filter(None, (_worse(errors), shown() if missed else "")))
+
+
+def _unseen_motion(errors: Errors) -> str:
+    """The verdict where no motion stands out from the noise: of all coordinates, or of those without inertia."""
+    if not errors.rough:
+        return f"no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
+    names, move = ",".join(errors.rough), "moves" if len(errors.rough) == 1 else "move"
+    what = f"{names} {move} from sample to sample as no mass does; {errors}"
+    return f"{what}. Try --inputs {names} where the others follow what is commanded, else --drop {names}"
 
 
 def _worse(errors: Errors) -> str:

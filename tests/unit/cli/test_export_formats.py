@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
 from herglotz.export import compare, export_run, load_exported
 from herglotz.export.load import _is_of, read_header
 from herglotz.export.metadata import KEY
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of, with_values
 from herglotz.training import load_run, save_run
 
@@ -40,6 +42,14 @@ def test_verify_and_compare_with_the_run(tiny_onnx, tiny_run, monkeypatch, capsy
     assert found["against"]["same_weights"] is True
     assert main(["verify", "damped_oscillator", "--against", str(tiny_run)]) == 2
     assert "is no file" in capsys.readouterr().err
+    # fails if the run of another machine ends in an internal error
+    other = load_run(tiny_run)
+    ones: Any = {name: (1.0, 1.0) for name in ("scale", "speed", "stiffness", "tilt")}
+    model = ContactLagrangian(ModelConfig(angles=(False, False), **ones))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("herglotz.training.load_run", lambda *_: replace(other, model=model))
+        assert main(arguments) == 2
+    assert "the run has 2 coordinate(s) and 0 input(s)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

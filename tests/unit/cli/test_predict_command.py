@@ -53,12 +53,16 @@ def test_columns_of_other_names_are_said(tiny_run, other_csv, tmp_path, capsys):
         f"{rows[0].replace('phi', 'theta')},y[m]\n" + "".join(f"{row},{k}\n" for k, row in enumerate(rows[1:]))
     )
     said = []
-    for file in (other_csv, tmp_path / "a.csv", tmp_path / "b.csv"):
+    (tmp_path / "c.csv").write_text(
+        f"{rows[0].replace('phi', 'theta')},push[N]\n" + "".join(f"{row},1\n" for row in rows[1:])
+    )
+    for file in (other_csv, *(tmp_path / f"{name}.csv" for name in "abc")):
         assert main(["predict", str(tiny_run), str(file)]) == 0
         said.append(" ".join(capsys.readouterr().err.split()))
     assert not any(words in said[0] for words in ("taken for theta", "left aside"))
     assert "note: phi is taken for theta, the run's only coordinate" in said[1]
     assert "note: the run has no coordinate y: left aside" in said[2]
+    assert "note: the run has no input: push left aside" in said[3]
 
 
 def test_windows(tiny_run, other_csv, capsys):

@@ -322,7 +322,7 @@ def test_trust(capsys, tiny_run, tmp_path):  # fails if a number is missing, or 
     assert 1 < found["effective_parameters"] < found["all_parameters"]
     assert main(["trust", str(tiny_run), "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
-    assert "each parameter above is determined on its own" in out.lower()
+    assert "none of these parameters can be traded for another of them" in out.lower()
     assert re.search(r"^  the damping rate γ: [\d.e-]+ ± [\d.e-]+ 1/s$", out, re.M)  # fails if names are the program's
     assert max(len(line) for line in out.splitlines() if not line.startswith("Figure")) <= 80
     assert "warning" not in err

@@ -132,3 +132,15 @@ def test_several_recordings_are_said_once(tmp_path, capsys):  # fails if every r
     err = capsys.readouterr().err
     assert err.count("warning") == 1
     assert "as their number says, and so of 3 more recordings" in err
+
+
+def test_a_column_that_numbers_the_recordings_is_named(tmp_path):
+    # fails if a table of drops, numbered in a column of another name, is told to sort its rows
+    path = written(tmp_path, "drop,t,x", recordings([4, 5, 4], 1))
+    with pytest.raises(InputError, match=r"row 6, column 't': 0.0 does not increase on 0.3\d* in row 5; column 'drop' "
+                       r"changes wherever time starts anew: --group drop \(group= in Python\)"):  # fmt: skip
+        load(path)
+    assert load(path, group="drop", show=False).lengths == (4, 5, 4)
+    # One row out of order is no second recording.
+    with pytest.raises(InputError, match="sort the rows, delete one, or number the trajectories"):
+        load(written(tmp_path, "t,x,y", [[0.0, 1.0, 1.0], [0.2, 1.0, 2.0], [0.1, 2.0, 3.0], [0.3, 2.0, 4.0]]))

@@ -214,3 +214,11 @@ def test_an_angle_of_another_recording_in_degrees_is_not_assumed(tmp_path):
     # fails if numbers without a unit become radians because the first file, in degrees, was converted to them
     told = read(tmp_path, "t,phi[deg]\n0,10\n1,20\n2,30\n")
     assert read(tmp_path, "t,phi\n0,10\n1,20\n2,30\n", like=told).units == ("1",)
+
+
+def test_a_column_has_one_role(tmp_path):
+    # fails if --coordinates x,F --inputs F makes F a coordinate, and says nothing of the input that was asked for
+    path = tmp_path / "a.csv"
+    path.write_text("t,x,F\n0,1,2\n1,2,3\n2,4,5\n")
+    with pytest.raises(InputError, match="row 1: 'F' is named for both coordinates and inputs; a column has one role"):
+        load(path, coordinates=["x", "F"], inputs="F", show=False)

@@ -85,3 +85,9 @@ def test_a_term_of_no_input_is_refused(tmp_path, term):
     forms = r"x\^2, \|x\|, x', sat\(x/2\) or tanh\(x/2\) of an input x, 2 being its level"
     with pytest.raises(InputError, match=rf"is no term of an input; write {forms} > 0; the inputs are"):
         load(recording(tmp_path), inputs=["volts", "base"], input_terms=[term], show=False)
+
+
+def test_a_term_of_an_input_needs_an_input():  # fails if the message lists "no inputs" as the inputs
+    data = Trajectories.of(range(4), range(4))
+    with pytest.raises(InputError, match=r"the data have no input: name one with --inputs NAMES"):
+        with_input_terms(data, ["V^2"])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
+from herglotz.data.splits import enough
 from herglotz.errors import InputError
 
 
@@ -300,6 +301,17 @@ def test_inputs_before_the_first_sample_that_is_kept_act_on_none():
     kept = data.keep(torch.tensor([False, True, False, True, True, False, True, True, True, True]))
     assert kept.u is not None
     assert kept.u.flatten().tolist() == [1.5, 3.0, 4.0, 6.0, 7.0, 8.0, 9.0]
+
+
+def test_a_trajectory_without_enough_samples_is_left_out():
+    # fails if a recording of which 2 samples are left ends a fit, or one without a sample has a length of 0
+    t = torch.arange(5.0).repeat(3)
+    data = Trajectories.of(t, t[:, None], (5, 5, 5), u=torch.arange(15.0)[:, None])
+    good = torch.tensor([True, True, False, True, True, False, True, True, False, False, True, True, True, True, False])
+    kept = data.keep(enough(good, data.lengths))
+    assert kept.u is not None
+    assert (kept.lengths, kept.t.tolist()) == ((4, 4), [0.0, 1.0, 3.0, 4.0, 0.0, 1.0, 2.0, 3.0])
+    assert kept.u.flatten().tolist() == [0.0, 1.5, 3.0, 4.0, 10.0, 11.0, 12.0, 13.0]
 
 
 @pytest.mark.parametrize(("way", "every"), [(4, 1), (-4, 1), (17, 4)])

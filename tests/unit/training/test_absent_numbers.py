@@ -114,6 +114,18 @@ def test_what_is_stored_as_a_logarithm_is_told_as_what_it_is():
     assert (mass.value, mass.std) == (pytest.approx(3.0), pytest.approx(0.06))
 
 
+def test_a_width_of_dry_friction_is_the_one_of_the_equation():
+    # fails if `herglotz trust` leaves the sharpest width out, and tells 0.002 rad/s where the equation has 0.0098
+    model: Any = ContactLagrangian(replace(two_bodies().config, coulomb=True))
+    spread = {name: torch.ones_like(p) for name, p in model.named_parameters()}
+    parameters = SimpleNamespace(parameters=ParameterVector(model))
+    posterior = SimpleNamespace(problem=parameters, standard_deviations=lambda: spread)
+    data = Trajectories.of(torch.arange(3.0), torch.zeros(3, 2), (3,), names=("a", "b"))
+    found = quantities(posterior, SimpleNamespace(model=model, data=data))  # pyright: ignore
+    for name, widths in zip(("smooth", "stribeck"), model.friction.widths, strict=True):
+        assert [x.value for x in found if x.name == f"friction.log_{name}"] == pytest.approx(widths.tolist())
+
+
 @pytest.mark.parametrize("order", [2, 4])
 def test_a_number_has_one_name_at_both_orders(order):
     # fails if a tilt of order 4, the second feature of its coordinate, is taken for the spring, the first one

@@ -309,7 +309,31 @@ def test_gross_errors_have_no_say(wrong, told):
     assert text.endswith("their spread is 1 m; 15 training samples are far from the model, and are left out") is told
 
 
+def test_a_recording_of_something_else_does_not_end_a_fit():
+    # fails if the fit rejects all but two samples of one recording, and its judge refuses these two: 10 of 36 such sets
+    generator = torch.Generator().manual_seed(6)
+    t, q = 0.05 * torch.arange(12).double(), []
+    for b in range(10):
+        speed = torch.rand(1, generator=generator).double()
+        wrong = 0.4 + 0.25 * torch.randn(12, generator=generator).double() if b == 8 else None
+        fall = speed * t + 4.9 * t * t if wrong is None else wrong
+        q.append(fall + 0.0015 * torch.randn(12, generator=generator).double())
+    run = fit(Trajectories.of(t.repeat(10), torch.cat(q), (12,) * 10), progress=False)
+    assert len({row // 12 for row in run.metrics["outlier_samples"]}) == 1
+    assert "samples are far from the model" not in run.metrics["verdict"]
+
+
 def test_short_data_have_no_precision():
     # fails if fewer than nine samples raise, or are taken for exact
     t = torch.arange(6, dtype=torch.float64) * 0.1
     assert math.isinf(precision(Trajectories.of(t, t.cos()[:, None], (6,), angles=(False,))))
+
+
+def test_a_command_among_the_coordinates_is_named():
+    # fails if a ball on a beam is told "less noise, or a longer recording": the angle of the beam is a command
+    errors = Errors(0.75, 1.5, 1.5, noise=0.59, spread=1.0, unit=None)
+    metrics = {"follows_data": True, "gain_over_mean": 1.0}
+    assert "no motion stands out from the noise" in in_words(replace(errors, windows=0.9), None, metrics)
+    text = in_words(replace(errors, windows=0.9, unseen=0.9, free=0.9, rough=("beam",)), None, metrics)
+    assert text.startswith("does not fit: beam moves from sample to sample as no mass does; free runs")
+    assert text.endswith(". Try --inputs beam where the others follow what is commanded, else --drop beam")
