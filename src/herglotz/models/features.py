@@ -77,13 +77,13 @@ def revolute(angles: Sequence[bool]) -> list[str]:
 
 
 def spherical(angles: Sequence[bool]) -> list[str]:
-    """Joints q_j that turn about an axis across that of another joint q_i: the mass of q_i has cos 2q_j and sin 2q_j.
+    """Joints q_j that turn about an axis across that of another joint q_i: the mass of q_i has cos 2q_j.
 
     A link with the angle q_j to the axis of q_i, as a spherical or a rotary pendulum has, adds m l² sin² q_j v_i²/2 to
     K.
     """
     turning = [i for i, angle in enumerate(angles, 1) if angle]
-    return [f"{f}(2q{j}) v{i} v{i}" for i, j in permutations(turning, 2) for f in ("cos", "sin")]
+    return [f"cos(2q{j}) v{i} v{i}" for i, j in permutations(turning, 2)]
 
 
 def lengths(angles: Sequence[bool]) -> list[str]:

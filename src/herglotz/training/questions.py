@@ -89,7 +89,8 @@ class Questions:
         """The model of a part fitted to all data, with what more these ask for, and its zeros of sensors."""
         if self.wanted.part is self.wanted:
             if self.best is not None and self.differ is not None:
-                self.read, self.best, self.differ = self.wanted.zeros_again(self.read, self.best, self.differ)
+                self.read, best, self.differ = self.wanted.zeros_again(self.read, self.best, self.differ)
+                self.best = best if best is self.best else self.read.settled(best, swapped=True)
             return
         longer = self.wanted.part.longer > 1  # inputs are means over several samples, which say little of holds of one
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
