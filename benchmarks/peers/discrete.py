@@ -68,7 +68,8 @@ class DiscreteLagrangian:
         """Position and momentum after a step of held inputs; NaN where Newton fails."""
         guess = q + self.h * p * self.scales.a * self.h
         q1 = newton(lambda x: p + self.momenta(q, x, *u)[0], guess)
-        return q1, self.momenta(q, q1, *u)[1].detach()
+        with torch.enable_grad():
+            return q1, self.momenta(q, q1, *u)[1].detach()
 
     def mixed(self, q0: Tensor, q1: Tensor) -> Tensor:
         """−h² σ D₁D₂L_d σ over h, (B, n, n): the unit matrix for a unit mass."""

@@ -2,11 +2,12 @@
 
 C. Offen, "Machine learning of continuous and discrete variational ODEs with convergence guarantee and uncertainty
 quantification", 2024 (arXiv:2404.19626): a Gaussian prior on L_d is conditioned on the discrete Euler–Lagrange equation
-of the data and on a normalisation, without which L_d = 0 is the most likely solution. J.-H. Ewering, K. Flaßkamp,
-N. Wahlström, T. B. Schön, T. Seel, "Structure-preserving Gaussian processes via discrete Euler–Lagrange equations", 2026
-(arXiv:2605.06246): the same for the forced equation, L and F at midpoints, with priors on both.
+of the data and on a normalisation, without which L_d = 0 is the most likely solution.
 
-Written anew from these, with differences. The kernel is squared exponential in the network inputs, by random Fourier
+J.-H. Ewering, K. Flaßkamp, N. Wahlström, T. B. Schön, T. Seel, "Structure-preserving Gaussian processes via discrete
+Euler–Lagrange equations", 2026 (arXiv:2605.06246): the same for the forced equation, from positions alone.
+
+Written anew after these (the second by its abstract), with differences. L and F stand at midpoints. The kernel is squared exponential in the network inputs, by random Fourier
 features (A. Rahimi, B. Recht, NeurIPS 2007), so that 10³ samples take 0.1 s. The prior's mean is a unit mass, and the
 normalisation is that the mean mass over the data stays it. F has linear terms in velocity and inputs, too. The lengths
 and strengths are those of the least held-out error M⁻¹R: the marginal likelihood of R would be the larger, the smaller
@@ -21,7 +22,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.func import jacfwd, vmap
+from torch.func import jacrev, vmap
 
 from .discrete import DiscreteLagrangian, scales_of_triples
 from .samples import Samples
@@ -85,11 +86,11 @@ class Equation:
         return torch.cat([F.value(x[:, : self.width]), x[:, self.width - self.n :], torch.ones_like(x[:, :1])], -1)
 
     def rows(self, L: Features, F: Features) -> tuple[Tensor, Tensor]:
-        """(N, n, P): the equation by weights of L and of each coordinate's force; (N, n, n, m): the mass by those of L."""
+        """The equation by the weights of L and of each force, (N, n, P); the mass by those of L, (N, n, n, m)."""
         unit, of_L, of_F = self.scales.v.square() / self.scales.a, torch.zeros(()), torch.zeros(())
         for (q, v), u, side in zip(self.states, self.inputs, (1, -1), strict=True):
             x = self.scales.of_state(q, v)
-            by_q = torch.cat([vmap(jacfwd(self.scales.of_q))(q), torch.zeros(len(q), self.n, self.n).double()], 1)
+            by_q = torch.cat([vmap(jacrev(self.scales.of_q))(q), torch.zeros(len(q), self.n, self.n).double()], 1)
             of_L = of_L + L.slope(x, by_q) / 2 + side / self.samples.h * L.slope(x, self.by_v)
             of_F = of_F + self.linear(torch.cat([x, u], -1), F) / 2
         blocks = torch.einsum("nf,ij->nijf", of_F, torch.eye(self.n).double()).flatten(2)
@@ -97,9 +98,15 @@ class Equation:
         bend = L.omega[-self.n :, None] * L.omega[-self.n :]  # (n, n, m) in units of σ_v
         return torch.cat([unit[:, None] * of_L, blocks], -1), -L.value(x)[:, None, None] * bend
 
+    def model(self, L: Features, F: Features, w: Tensor) -> DiscreteLagrangian:
+        """The Lagrangian and force of these weights."""
+        of_L, of_F = w[:FEATURES, None], w[FEATURES:].reshape(self.n, -1).mT
+        h = self.samples.h
+        return DiscreteLagrangian(self.scales, h, lambda x: L.value(x) @ of_L, lambda x: self.linear(x, F) @ of_F)
+
 
 def fit_gaussian_lagrangian(samples: Samples, seed: int, budget: float) -> DiscreteLagrangian:
-    """The posterior mean of L and F, its lengths and strengths found by a random search for the processor time given."""
+    """The posterior mean of L and F; a random search finds its lengths and strengths in the processor time given."""
     end = time.process_time() + budget
     generator = torch.Generator().manual_seed(seed)
     equation = Equation(samples, generator)
@@ -132,7 +139,4 @@ def fit_gaussian_lagrangian(samples: Samples, seed: int, budget: float) -> Discr
         least, best, idle = (error, trial, 0) if error < least else (least, best, idle + 1)
         size, idle = (size / 2, 0) if idle == PATIENCE else (size, idle)
     w = solved(best, torch.ones(N, dtype=torch.bool))[1]
-    L, F = equation.of_lengths(*best[:2].exp().tolist())
-    of_force = w[FEATURES:].reshape(n, -1)
-    return DiscreteLagrangian(equation.scales, samples.h, lambda x: L.value(x) @ w[:FEATURES, None],
-                              lambda x: equation.linear(x, F) @ of_force.mT)  # fmt: skip
+    return equation.model(*equation.of_lengths(*best[:2].exp().tolist()), w)

@@ -121,7 +121,6 @@ class ThreePoint:
         return torch.stack(out, 1)
 
 
-
 def fitted_start(model: Predictor, history: Tensor, iterations: int = 8) -> tuple[Tensor, Tensor]:
     """The pair (q0, q1) from which the model's motion lies nearest to a history (B, K, n) of noisy positions.
 

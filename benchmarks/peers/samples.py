@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int_]
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Samples:
     def motion(self) -> Motion:
         """All motions as one set of points."""
         parts = [vars(m) for m in self.motions()]
-        return Motion(**{k: None if x is None else torch.cat([m[k] for m in parts]) for k, x in parts[0].items()})
+        rows: Any = {k: None if x is None else torch.cat([m[k] for m in parts]) for k, x in parts[0].items()}
+        return Motion(**rows)
 
     def triples(self) -> tuple[Tensor, Tensor, Tensor]:
         """All three-sample windows, (N, n) each."""
@@ -67,7 +70,7 @@ class Samples:
 
     @staticmethod
     def _adjacent(rows: tuple[Tensor, ...], count: int) -> tuple[Tensor, ...]:
-        """All `count` neighbours of each trajectory, the first ones, the second ones, …"""
+        """The first, the second, … of all runs of `count` neighbours."""
         long = [x for x in rows if len(x) >= count]
         return tuple(torch.cat([x[k : len(x) - count + 1 + k] for x in long]) for k in range(count))
 
@@ -88,23 +91,23 @@ def differences(q: Tensor, h: float, noisy: bool) -> Motion:
     return Motion(q[2:-2], v, v, a, a)
 
 
-def local_polynomials(t: Array, q: Array, at: Array, half: int, degree: int) -> tuple[Array, Array, Array]:
-    """Value, slope and curvature at the samples `at` of polynomials through the 2 half + 1 samples nearest, (len(at), n).
+def local_polynomials(t: Array, q: Array, at: Indices, half: int, degree: int) -> tuple[Array, Array, Array]:
+    """Value, slope and curvature at some samples of polynomials through the 2 half + 1 nearest ones, (len(at), n) each.
 
-    Near an end the samples nearest lie more on one side.
+    Near an end the nearest ones lie more on one side.
     """
     c = _inverse(t, at, half, degree) @ q[_nearest(t, at, half)]
     return c[:, 0], c[:, 1], 2 * c[:, 2]
 
 
-def _nearest(t: Array, at: Array, half: int) -> Array:
+def _nearest(t: Array, at: Indices, half: int) -> Indices:
     return np.clip(at - half, 0, len(t) - 2 * half - 1)[:, None] + np.arange(2 * half + 1)
 
 
-def _inverse(t: Array, at: Array, half: int, degree: int) -> Array:
+def _inverse(t: Array, at: Indices, half: int, degree: int) -> Array:
     """(len(at), degree + 1, 2 half + 1): what takes samples to the coefficients of a polynomial in t − t[at]."""
     dt = t[_nearest(t, at, half)] - t[at][:, None]
-    return np.linalg.pinv(np.stack([dt**k for k in range(degree + 1)], -1))
+    return np.linalg.pinv(np.stack([dt**k for k in range(degree + 1)], -1)).astype(np.float64)
 
 
 def half_width(t: Array, q: Array, halves: tuple[int, ...], degree: int) -> int:
