@@ -7,11 +7,11 @@ of the data and on a normalisation, without which L_d = 0 is the most likely sol
 J.-H. Ewering, K. Flaßkamp, N. Wahlström, T. B. Schön, T. Seel, "Structure-preserving Gaussian processes via discrete
 Euler–Lagrange equations", 2026 (arXiv:2605.06246): the same for the forced equation, from positions alone.
 
-Written anew after these (the second by its abstract), with differences. L and F stand at midpoints. The kernel is squared exponential in the network inputs, by random Fourier
-features (A. Rahimi, B. Recht, NeurIPS 2007), so that 10³ samples take 0.1 s. The prior's mean is a unit mass, and the
-normalisation is that the mean mass over the data stays it. F has linear terms in velocity and inputs, too. The lengths
-and strengths are those of the least held-out error M⁻¹R: the marginal likelihood of R would be the larger, the smaller
-the mass.
+Written anew after these (the second by its abstract), with differences. L and F stand at midpoints. The kernel is
+squared exponential in the network inputs, by random Fourier features (A. Rahimi, B. Recht, NeurIPS 2007): 10³ samples
+take 0.1 s. The prior's mean is a unit mass, and the normalisation is that the mean mass over the data stays it. F has
+linear terms in velocity and inputs, too. The lengths and strengths are those of the least held-out error M⁻¹R: the
+marginal likelihood of R would be the larger, the smaller the mass.
 """
 
 from __future__ import annotations

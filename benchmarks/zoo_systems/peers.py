@@ -1,7 +1,7 @@
 """Peers in the zoo: SINDy, and the true structure with its numbers fitted.
 
-SINDy is a sparse regression of smoothed accelerations on a library of polynomials and trigonometric terms. Local cubic
-polynomials give position, velocity and acceleration; sequentially thresholded least squares selects. The width of the
+SINDy is a sparse regression of smoothed accelerations on a library of polynomials and trigonometric terms. Local
+polynomials of degree 4 give position, velocity and acceleration; sequentially thresholded least squares selects. The width of the
 smoothing and the threshold are chosen by free runs over the last fifth of the training part.
 
 The true structure is the best that a few-number model of the right equation can reach: Levenberg–Marquardt on whole
@@ -66,8 +66,8 @@ def fit_sindy(of: ZooSystem) -> SparseModel:
     for half in sorted({max(2, round(w * of.samples_per_period)) for w in HALF_WIDTHS}):
         if 2 * half + 1 > kept // 2:
             continue
-        at, degree = np.arange(half, m - half), min(4, 2 * half)
-        rows = [local_polynomials(of.train.t[:m], q[:m], at, half, degree) for q in of.train.q]
+        at = np.arange(half, m - half)
+        rows = [local_polynomials(of.train.t[:m], q[:m], at, half, 4) for q in of.train.q]
         x, y, a = (np.concatenate([row[i] for row in rows]) for i in range(3))
         terms = library(x, y, np.concatenate([u[half : m - half] for u in of.train.u]), angles)
         for threshold in THRESHOLDS:
