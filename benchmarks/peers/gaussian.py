@@ -1,8 +1,8 @@
 """A Gaussian-process Lagrangian from positions only, with a force: linear least squares in random Fourier features.
 
-C. Offen, "Machine learning of continuous and discrete variational ODEs with convergence guarantee and uncertainty
-quantification", 2024 (arXiv:2404.19626): a Gaussian prior on L_d is conditioned on the discrete Euler–Lagrange equation
-of the data and on a normalisation, without which L_d = 0 is the most likely solution.
+C. Offen, "Machine learning of continuous and discrete variational ODEs with guaranteed convergence and uncertainty
+quantifications", 2024 (arXiv:2404.19626): a Gaussian prior on L_d is conditioned on the discrete Euler–Lagrange
+equation of the data and on a normalisation, without which L_d = 0 is the most likely solution.
 
 J.-H. Ewering, K. Flaßkamp, N. Wahlström, T. B. Schön, T. Seel, "Structure-preserving Gaussian processes via discrete
 Euler–Lagrange equations", 2026 (arXiv:2605.06246): the same for the forced equation, from positions alone.
@@ -11,7 +11,7 @@ Written anew after these (the second by its abstract), with differences. L and F
 squared exponential in the network inputs, by random Fourier features (A. Rahimi, B. Recht, NeurIPS 2007): 10³ samples
 take 0.1 s. The prior's mean is a unit mass, and the normalisation is that the mean mass over the data stays it. F has
 linear terms in velocity and inputs, too. The lengths and strengths are those of the least held-out error M⁻¹R: the
-marginal likelihood of R would be the larger, the smaller the mass.
+marginal likelihood of R grows as the mass goes to 0.
 """
 
 from __future__ import annotations

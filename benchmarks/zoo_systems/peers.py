@@ -1,8 +1,8 @@
 """Peers in the zoo: SINDy, and the true structure with its numbers fitted.
 
 SINDy is a sparse regression of smoothed accelerations on a library of polynomials and trigonometric terms. Local
-polynomials of degree 4 give position, velocity and acceleration; sequentially thresholded least squares selects. The width of the
-smoothing and the threshold are chosen by free runs over the last fifth of the training part.
+polynomials of degree 4 give position, velocity and acceleration; sequentially thresholded least squares selects. The
+width of the smoothing and the threshold are chosen by free runs over the last fifth of the training part.
 
 The true structure is the best that a few-number model of the right equation can reach: Levenberg–Marquardt on whole
 training recordings over the numbers and the start states, from the true numbers; RK4 with implicit dry friction,

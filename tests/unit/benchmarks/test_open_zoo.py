@@ -274,24 +274,30 @@ def test_the_posterior_of_a_gaussian_lagrangian_is_its_least_squares():
 
 
 def test_the_command_measures_laws_and_open_draws(tmp_path, monkeypatch, capsys, drawn):
-    # fails if --open or --laws measures other systems, or a table of them cannot be made
+    # fails if --open or --laws measures other systems or peers, or a table or a figure of them cannot be made
     seen = []
 
-    def measure(of, *_):
+    def measure(of, folder, limit, peers):  # noqa: ARG001
         seen.append(of.name)
         numbers = {"score": 1.0, "relative": 0.01, "cpu_s": 3.0}
         row = of.facts() | {"ours": {**numbers, "said": ""}, "outcome": AT, "attainable": of.attainable}
-        return row | {name: numbers for name in LEARNED} | {f"ahead_of_{name}": True for name in LEARNED}
+        return row | {name: numbers for name in peers} | {f"ahead_of_{name}": True for name in peers}
 
     monkeypatch.setattr(zoo, "measure", measure)
     monkeypatch.setattr(zoo, "open_draw", lambda seed, index: {(9001, 2): drawn}[seed, index])
-    zoo.main(["--open", "--draw", "9001", "--only", "2", "--out", str(tmp_path)])
+    command = ["--open", "--draw", "9001", "--only", "2", "--out", str(tmp_path)]
+    zoo.main([*command, "--json", "--peers", "delan"])
+    assert set(LEARNED) & set(json.loads(capsys.readouterr().out)["rows"][0]) == {"delan"}
+    zoo.main(command)
     text = capsys.readouterr().out
     for method in ("ours", "neural ODE", "discrete forced Lagrangian net", "Gaussian-process Lagrangian"):
         assert f"| {method} | 1 | 100 % | – |" in text
     assert imread(tmp_path / "open_9001.png").std() > 0.05  # not an empty page
     assert "| attainable |" in text
     assert "SINDy" not in text
+    zoo.main([*command, "--json", "--no-peers"])
+    capsys.readouterr()
+    assert len(seen) == 2  # a row is measured again where a peer is missing, and not where it has more
     zoo.main(["--laws", "--only", "4", "--json", "--out", str(tmp_path)])
     assert [row["noise"] for row in json.loads(capsys.readouterr().out)["rows"]] == [0.0, 0.005]
-    assert seen[1].startswith("two saturating springs")
+    assert seen[2].startswith("two saturating springs")
