@@ -137,14 +137,6 @@ def test_discrete_lagrangian_is_a_free_particle_without_its_network_and_forces_e
 LONGER = [pytest.param(name, marks=pytest.mark.slow) for name in ("dissipative_hnn", "delan", "mlp")]
 
 
-@pytest.fixture(scope="module")
-def optimisers_are_imported():
-    """The first step of an optimiser imports modules for a second, which would count in the budget of a peer."""
-    x = torch.zeros(1, requires_grad=True)
-    x.sum().backward()
-    torch.optim.Adam([x]).step()
-
-
 @pytest.mark.usefixtures("optimisers_are_imported")
 @pytest.mark.parametrize("name", ["hnn", "forced_discrete_lagrangian", "neural_ode", *LONGER])
 def test_peers_learn_an_oscillator_in_seconds(name):
