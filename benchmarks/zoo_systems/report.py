@@ -75,7 +75,7 @@ def methods_of(rows: Sequence[Row]) -> list[str]:
 def standing(rows: Sequence[Row]) -> list[str]:
     """The table of methods: median error, shares of good ones, and how often and how far ours is ahead."""
     good = f"noisy: ≤ {NEAR:g} × the noise", f"exact: ≤ {SMALL:g} of the size"
-    head = ("method", "median error", *good, "ours ahead", "its error over ours, median", "processor time, s, median")
+    head = ("method", "median error", *good, "ours ahead", "its error over ours, median", "time of a fit, s, median")
     share = lambda good: f"{100 * sum(good) / len(good):.0f} %" if good else "–"  # noqa: E731
     lines = []
     for name in methods_of(rows):
@@ -155,16 +155,17 @@ def draw(rows: Sequence[Row], title: str, path: Path) -> None:
         for y, (name, found) in enumerate(errors.items()):
             color = MODEL if name == "ours" else INK
             place = y + 0.5 * (np.argsort(np.argsort(found)) / max(1, len(rows) - 1) - 0.5)  # marks do not hide another
-            for some, face in ((~exact, color), (exact, "white")):
-                x = np.where(np.isfinite(found), found, lost)[some]
-                ax.plot(x, place[some], "o", ms=4, mec=color, mfc=face, alpha=0.8, clip_on=False)
+            ended = np.isfinite(found)
+            for some, mark, face in ((ended & ~exact, "o", color), (ended & exact, "o", "white"), (~ended, "x", color)):
+                x = np.where(ended, found, lost)[some]
+                ax.plot(x, place[some], mark, ms=4, mec=color, mfc=face, alpha=0.8, clip_on=False)
             middle = min(float(np.median(found)), lost)
             ax.plot([middle] * 2, [y - 0.36, y + 0.36], color=color, lw=2.2)
         ax.axvline(1.0, color=MUTED, lw=1.0, zorder=0)
         ax.set(xscale="log", xlim=(low, lost * (high / low) ** 0.02), ylim=(len(methods) - 0.4, -0.6))
         ax.set_yticks(range(len(methods)), [METHODS[name] for name in methods])
         ax.set_xlabel("RMS error over the noise (1: a perfect model; exact data: over 1e-4 of the size)")
-        words = "● noisy recordings   ○ exact ones   | median   rightmost: the free run was not reached"
+        words = "● noisy recordings   ○ exact ones   × a free run that breaks down   | median"
         ax.set_title(words, fontsize=9, loc="left")
         ax.tick_params(axis="y", length=0)
         ax.grid(axis="x", color="#EEEEEE", lw=0.8)
