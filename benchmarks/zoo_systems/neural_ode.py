@@ -52,7 +52,7 @@ def fit_neural_ode(samples: Samples, seed: int, budget: float) -> Flow:
     """Train for this processor time, in seconds."""
     end, n, m = time.process_time() + budget, samples.dof, len(samples.q[0])
     firsts = np.arange(0, m - WINDOW + 1, WINDOW - 1)
-    t = samples.h * np.arange(m)
+    t = samples.h * np.arange(m, dtype=np.float64)
     v0 = torch.as_tensor(np.concatenate([local_polynomials(t, q.numpy(), firsts, SLOPES, 3)[1] for q in samples.q]))
     size, speed = torch.cat(samples.q).std(0), v0.std(0).clamp_min(1e-6)
     scales = Scales(samples.angles, torch.cat(samples.q).mean(0), size, speed, speed.square() / size)
