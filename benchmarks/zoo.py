@@ -7,8 +7,9 @@ equation with its numbers fitted. Rows are kept in FOLDER (runs/zoo), with the t
 again at the same commit.
 
 `--open` draws systems that no dictionary of terms holds, and `--laws` takes six fixed ones, each exact and with 0.5 %
-of noise: 20 samples of warm-up, 200 predicted steps. Beside them: a plain neural ODE, given the processor time that the
-fit took, 10 s at least (`--no-peers` leaves it out).
+of noise: 20 samples of warm-up, 200 predicted steps. Beside them four learned peers, each given the processor time that
+the fit took, 10 s at least: a neural ODE, a discrete forced Lagrangian net, DeLaN with friction and a Gaussian-process
+Lagrangian (`--peers NAME ...` takes some of them, `--no-peers` none). A figure stands beside the table.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
 from benchmarks.zoo_systems.drawing import draw
-from benchmarks.zoo_systems.neural_ode import fit_neural_ode
+from benchmarks.zoo_systems.learned import LEARNED, fit_learned
 from benchmarks.zoo_systems.open_laws import LAWS, fixed_law
 from benchmarks.zoo_systems.open_systems import open_draw
 from benchmarks.zoo_systems.ours import fit_ours
@@ -40,6 +41,7 @@ from benchmarks.zoo_systems.report import (
     METHODS,
     Predictions,
     ahead,
+    draw as draw_figure,
     number,
     outcome,
     relative,
@@ -51,11 +53,11 @@ from benchmarks.zoo_systems.report import (
 from benchmarks.zoo_systems.systems import ZooSystem
 
 NOISES = (("exact", 0.0), ("with noise", 0.005))  # of each fixed law
-LEAST = 10.0  # s of processor time that a neural ODE has at least
+LEAST = 10.0  # s of processor time that a learned peer has at least
 KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
 
 
-def measure(of: ZooSystem, folder: Path, limit: float, peers: bool = True) -> dict[str, Any]:
+def measure(of: ZooSystem, folder: Path, limit: float, peers: Sequence[str] = tuple(LEARNED)) -> dict[str, Any]:
     """One row of the results."""
     row = of.facts() | {"beyond": unseen_excess(of)}
     ours = fit_ours(of, folder, limit)
@@ -67,7 +69,7 @@ def measure(of: ZooSystem, folder: Path, limit: float, peers: bool = True) -> di
         others = {"known": lambda of: MechanismModel(of.fitted), "sindy": fit_sindy}
     else:
         row["attainable"] = of.attainable
-        others = {"neural_ode": lambda of: fit_neural_ode(of, max(LEAST, ours.cpu))} if peers else {}
+        others = {name: partial(fit_learned, name=name, budget=max(LEAST, ours.cpu)) for name in peers}
     for name, fit in others.items():
         row[name] = peer(of, fit)
         if name != "known":
@@ -76,10 +78,11 @@ def measure(of: ZooSystem, folder: Path, limit: float, peers: bool = True) -> di
 
 
 def peer(of: ZooSystem, fit: Callable[[ZooSystem], EquationModel]) -> dict[str, float | None]:
-    """Errors of another method, and its processor time."""
+    """Errors of another method, and the processor time of its fit."""
     began = time.process_time()
-    found = own_predictions(of, fit(of))
-    return {**numbers(of, found), "cpu_s": time.process_time() - began}
+    model = fit(of)
+    cpu = time.process_time() - began
+    return {**numbers(of, own_predictions(of, model)), "cpu_s": cpu}
 
 
 def unseen_excess(of: ZooSystem) -> float:
@@ -124,7 +127,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--draw", type=int, default=1, metavar="SEED", help="which zoo (default %(default)s)")
     parser.add_argument("--open", action="store_true", help="systems that no dictionary of terms holds")
     parser.add_argument("--laws", action="store_true", help="six fixed laws of that kind instead of a draw")
-    parser.add_argument("--no-peers", action="store_true", help="no neural ODE beside open systems")
+    parser.add_argument("--peers", nargs="+", choices=list(LEARNED), metavar="NAME", default=list(LEARNED),
+                        help=f"beside open systems (default: {', '.join(LEARNED)})")  # fmt: skip
+    parser.add_argument("--no-peers", dest="peers", action="store_const", const=[], help="none of them")
     parser.add_argument("--count", type=int, default=30, metavar="N", help="systems 0 to N - 1 (default %(default)s)")
     parser.add_argument("--only", type=int, nargs="+", metavar="I", help="these systems alone")
     parser.add_argument("--limit", type=float, default=300, metavar="S", help="processor time of a fit (default 300 s)")
@@ -138,16 +143,20 @@ def main(argv: list[str] | None = None) -> None:
     rows = harness.load(path, {})
     measured: list[dict[str, Any]] = []
     for index in wanted:
-        if not (index in rows and (arguments.again or rows[index]["commit"] == at)):
+        done = index in rows and (arguments.again or rows[index]["commit"] == at)
+        if not (done and (rows[index].get("attainable") is None or set(arguments.peers) <= set(rows[index]))):
             folder = path.with_suffix("") / index
             shutil.rmtree(folder, ignore_errors=True)
-            row = measure(wanted[index](), folder, arguments.limit, not arguments.no_peers)
+            row = measure(wanted[index](), folder, arguments.limit, arguments.peers)
             rows[index] = {**row, "commit": at}
             print(line(rows[index]), file=sys.stderr, flush=True)
         measured = [rows[k] for k in wanted if k in rows]
         harness.store(path, rows, report(measured, zoo, f"{flags} --limit {arguments.limit:g}"))
-    table = path.with_suffix(".md").read_text(encoding="utf-8")
-    print(json.dumps({"shares": shares(measured), "rows": measured}, indent=1) if arguments.json else table)
+    if arguments.json:
+        print(json.dumps({"shares": shares(measured), "rows": measured}, indent=1))
+    else:
+        draw_figure(measured, zoo, path.with_suffix(".png"))
+        print(path.with_suffix(".md").read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

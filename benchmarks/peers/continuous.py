@@ -75,18 +75,19 @@ def acceleration(L: Tensor, q: Tensor, v: Tensor) -> Tensor:
 
 
 class DeepLagrangian:
-    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate.
+    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the generalised force −d v + B u of each coordinate.
 
     The diagonal of C is softplus(net + 0.54), so that M is near 1 at the start.
     """
 
-    def __init__(self, scales: Scales, generator: torch.Generator):
+    def __init__(self, scales: Scales, generator: torch.Generator, inputs: int = 0):
         n = len(scales.angles)
         self.scales, self.index = scales, torch.tril_indices(n, n)
         self.factor = Network(scales.q_inputs, self.index.shape[1], generator)
         self.potential = Network(scales.q_inputs, 1, generator)
         self.log_friction = torch.full((n,), -3.0, dtype=torch.float64, requires_grad=True)
-        self.parameters = [*self.factor.parameters(), *self.potential.parameters(), self.log_friction]
+        self.gain = torch.zeros(n, inputs, dtype=torch.float64, requires_grad=True)
+        self.parameters = [*self.factor.parameters(), *self.potential.parameters(), self.log_friction, self.gain]
 
     def mass(self, q: Tensor) -> Tensor:
         """M(q) in units of the scaled velocity, (B, n, n), positive definite."""
@@ -98,8 +99,8 @@ class DeepLagrangian:
         C = C.tril(-1) + torch.diag_embed(diagonal)
         return C @ C.mT + 1e-3 * torch.eye(n, dtype=q.dtype)
 
-    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(v, v̇) at (q, v): M ẇ = r for the scaled velocity w = v/σ."""
+    def rates(self, q: Tensor, v: Tensor, *u: Tensor) -> tuple[Tensor, Tensor]:
+        """(v, v̇) at (q, v) with inputs: M ẇ = r for the scaled velocity w = v/σ."""
         q = q.requires_grad_()
         w = v / self.scales.v
         M = self.mass(q)
@@ -109,7 +110,7 @@ class DeepLagrangian:
         M_q_w = torch.stack([gradient(Mw[:, i], q) for i in range(q.shape[1])], 1)
         M_dot_w = (M_q_w @ v[..., None])[..., 0]
         T_q = gradient((w.detach() * (M @ w.detach()[..., None])[..., 0]).sum(-1) / 2, q)
-        right = self.scales.v * (T_q - V_q) - M_dot_w - self.log_friction.exp() * w
+        right = self.scales.v * (T_q - V_q) - M_dot_w - self.log_friction.exp() * w + sum(x @ self.gain.mT for x in u)
         return v, self.scales.v * torch.linalg.solve_ex(M, right)[0]
 
 
@@ -128,9 +129,9 @@ def train_lnn(samples: Samples, seed: int, budget: float) -> Flow:
 
 
 def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
-    """Fit M(q), V(q) and friction to accelerations."""
+    """Fit M(q), V(q), friction and the gains of inputs to accelerations."""
     generator = torch.Generator().manual_seed(seed)
-    model = DeepLagrangian(scales_of(samples, samples.motion()), generator)
+    model = DeepLagrangian(scales_of(samples, samples.motion()), generator, samples.inputs)
     return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False)
 
 

@@ -12,15 +12,18 @@ F± = ½h F(q̄, Δ), and D₂L_d(q0, q1) + D₁L_d(q1, q2) + F⁺(q0, q1) + F�
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from .networks import Network, Scales, count, split, train
-from .rollouts import ThreePoint
+from .rollouts import ThreePoint, newton
 from .samples import Samples
 
 REGULAR = 1.0  # weight of the penalty
 ANCHORS = 128  # base points
+Function = Callable[[Tensor], Tensor]  # (N, inputs) → (N, outputs)
 
 
 def scales_of_triples(samples: Samples) -> Scales:
@@ -30,11 +33,13 @@ def scales_of_triples(samples: Samples) -> Scales:
 
 
 class DiscreteLagrangian:
-    """L_d(q0, q1) = h E [½|Δ/σ|² + net(q̄, Δ)], and forces where given; in units in which mass and spreads are 1."""
+    """L_d(q0, q1) = h E [½|Δ/σ|² + net(q̄, Δ)], and forces where given; in units in which mass and spreads are 1.
 
-    def __init__(self, scales: Scales, h: float, net: nn.Module, force: nn.Module | None = None):
+    An input is held over a step, and is one more number that the force of the step depends on.
+    """
+
+    def __init__(self, scales: Scales, h: float, net: Function, force: Function | None = None):
         self.h, self.scales, self.net, self.force = h, scales, net, force
-        self.weights = [*net.parameters(), *(force.parameters() if force else ())]
 
     def inputs(self, q0: Tensor, q1: Tensor) -> Tensor:
         """Network inputs of a pair."""
@@ -46,15 +51,25 @@ class DiscreteLagrangian:
         value = v.square().sum() / 2 + self.net(self.inputs(q0, q1)).sum()
         return torch.autograd.grad(value, (q0, q1), create_graph=True)  # type: ignore[return-value]
 
-    def residual(self, q0: Tensor, q1: Tensor, q2: Tensor) -> Tensor:
-        """The (forced) discrete Euler–Lagrange equation, times σ_v² / σ_a: of order one for a unit mass."""
-        q0, q2 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q2))
-        left, right = q1.detach().requires_grad_(), q1.detach().requires_grad_()
-        r = self.slopes(q0, left)[1] + self.slopes(right, q2)[0]
-        r = r * self.scales.v.square() / self.scales.a
-        if self.force is not None:
-            r = r + (self.force(self.inputs(q0, q1)) + self.force(self.inputs(q1, q2))) / 2
-        return r
+    def momenta(self, q0: Tensor, q1: Tensor, *u: Tensor) -> tuple[Tensor, Tensor]:
+        """(D₁L_d + F⁻, D₂L_d + F⁺) over h, (B, n) each, times σ_v² / σ_a: minus the momentum before, that after."""
+        q0, q1 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q1))
+        D1, D2 = (D * self.scales.v.square() / self.scales.a for D in self.slopes(q0, q1))
+        if self.force is None:
+            return D1, D2
+        half = self.force(torch.cat([self.inputs(q0, q1), *u], -1)) / 2
+        return D1 + half, D2 + half
+
+    def residual(self, q0: Tensor, q1: Tensor, q2: Tensor, *u: Tensor) -> Tensor:
+        """The (forced) discrete Euler–Lagrange equation: of order one for a unit mass; `u` are the held inputs."""
+        return self.momenta(q0, q1, *u[:1])[1] + self.momenta(q1, q2, *u[1:])[0]
+
+    def step(self, q: Tensor, p: Tensor, *u: Tensor) -> tuple[Tensor, Tensor]:
+        """Position and momentum after a step of held inputs; NaN where Newton fails."""
+        guess = q + self.h * p * self.scales.a * self.h
+        q1 = newton(lambda x: p + self.momenta(q, x, *u)[0], guess)
+        with torch.enable_grad():
+            return q1, self.momenta(q, q1, *u)[1].detach()
 
     def mixed(self, q0: Tensor, q1: Tensor) -> Tensor:
         """−h² σ D₁D₂L_d σ over h, (B, n, n): the unit matrix for a unit mass."""
@@ -71,29 +86,40 @@ def regularity(mixed: Tensor) -> Tensor:
 
 
 def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, forced: bool = False) -> ThreePoint:
+    """`fit_discrete_lagrangian` as a predictor."""
+    model, parameters = fit_discrete_lagrangian(samples, seed, budget, forced=forced)
+    return ThreePoint(model.residual, parameters)
+
+
+def fit_discrete_lagrangian(
+    samples: Samples, seed: int, budget: float, *, forced: bool = False
+) -> tuple[DiscreteLagrangian, int]:
     """Least squares of the residual with the penalty |mixed − 1|² at a base point; where forced with discrete forces,
-    and `regularity` in its place.
+    and `regularity` in its place. The model, and the number of its trained values.
     """
     generator = torch.Generator().manual_seed(seed)
     scales = scales_of_triples(samples)
     inputs = scales.q_inputs + samples.dof
     net = Network(inputs, 1, generator, nn.Softplus())
-    model = DiscreteLagrangian(scales, samples.h, net, Network(inputs, samples.dof, generator) if forced else None)
+    force = Network(inputs + samples.inputs, samples.dof, generator) if forced else None
+    model, weights = DiscreteLagrangian(scales, samples.h, net, force), [*net.parameters()]
+    weights += force.parameters() if force else []
     q0, q1, q2 = samples.triples()
+    u0, u1 = samples.held()
     rows, held = split(len(q0), generator)
     base = rows[torch.randperm(len(rows), generator=generator)[: ANCHORS if forced else 1]]
     eye = torch.eye(samples.dof, dtype=torch.float64)
 
     def loss(i: Tensor) -> Tensor:
-        return model.residual(q0[i], q1[i], q2[i]).square().mean()
+        return model.residual(q0[i], q1[i], q2[i], u0[i], u1[i]).square().mean()
 
     def penalty() -> Tensor:
         mixed = model.mixed(q0[base], q1[base])
         return regularity(mixed) if forced else (mixed - eye).square().mean()
 
     fit, judge = (lambda i: loss(rows[i]) + REGULAR * penalty()), (lambda: loss(held) + REGULAR * penalty())
-    train(fit, len(rows), judge, model.weights, generator, budget)
-    return ThreePoint(model.residual, count(model.weights))
+    train(fit, len(rows), judge, weights, generator, budget)
+    return model, count(weights)
 
 
 def train_mlp(samples: Samples, seed: int, budget: float) -> ThreePoint:

@@ -20,7 +20,7 @@ LEARNING_RATE = 3e-3  # of Adam, falling as a cosine
 ADAM_PART = 0.6  # of the budget; L-BFGS has the rest
 PATIENCE = 0.35  # part of the budget without a better validation loss after which a fit stops
 ROWS = 2000  # that L-BFGS looks at, at most
-Rates = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (q, y) → (q̇, ẏ), y the velocity or the momentum
+Rates = Callable[..., tuple[Tensor, Tensor]]  # (q, y) → (q̇, ẏ), y the velocity or the momentum; and inputs if any
 
 
 class Network(nn.Module):
@@ -186,17 +186,18 @@ def fit_rates(
     scales = scales_of(samples, motion)
     y_spread = y_rate.square().mean(0).sqrt().clamp_min(1e-12)
     rows, held = split(len(motion.q), generator)
+    inputs = () if motion.u is None else (motion.u,)
 
     def loss(at: Tensor) -> Tensor:
-        q_rate, found = rates(motion.q[at], y[at])
+        q_rate, found = rates(motion.q[at], y[at], *(u[at] for u in inputs))
         value = ((found - y_rate[at]) / y_spread).square().mean()
         return value + ((q_rate - motion.v[at]) / scales.v).square().mean() if momentum else value
 
     train(lambda i: loss(rows[i]), len(rows), lambda: loss(held), parameters, generator, budget)
     n = samples.dof
 
-    def field(state: Tensor) -> Tensor:
+    def field(state: Tensor, *u: Tensor) -> Tensor:
         with torch.enable_grad():
-            return torch.cat(rates(state[:, :n].detach(), state[:, n:].detach()), -1).detach()
+            return torch.cat(rates(state[:, :n].detach(), state[:, n:].detach(), *u), -1).detach()
 
     return Flow(field, samples.h, substeps(samples.h, scales), count(parameters), momentum=momentum)

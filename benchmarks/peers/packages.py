@@ -30,7 +30,7 @@ from herglotz.training.run import Run
 
 from .networks import LEARNING_RATE, WIDTH, count, scales_of, split, substeps
 from .rollouts import Flow
-from .samples import Samples, differences
+from .samples import Samples
 
 THRESHOLDS = (0.003, 0.01, 0.03, 0.1, 0.3)  # of SINDy's sparse regression; a validation part chooses
 SHOTS, NEAR = 6, 1e-5  # iterations for the first momentum, and the differences that they use
@@ -94,7 +94,7 @@ def train_phlearn(samples: Samples, seed: int, budget: float) -> Flow:
         H = phnns.HamiltonianNN(2 * n, WIDTH).double()
         model = phnns.PseudoHamiltonianNN(2 * n, hamiltonian_est=H, dissipation_est=friction, ttype=torch.float64)
         weights = [x for x in (*H.parameters(), *friction.parameters()) if x.requires_grad]
-        motions = samples.exact or [m for q in samples.q if (m := differences(q, h, samples.noisy)) is not None]
+        motions = samples.motions()
         first = torch.cat([torch.cat([m.q, m.p], -1)[:-1] for m in motions])
         last = torch.cat([torch.cat([m.q, m.p], -1)[1:] for m in motions])
         rows, held = split(len(first), torch.Generator().manual_seed(seed))

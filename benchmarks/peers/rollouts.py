@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 SUBSTEP = 0.1  # longest Runge–Kutta step in units of the data's time scale, see `fields.substeps`
-Field = Callable[[Tensor], Tensor]  # (B, 2n) → (B, 2n)
+Field = Callable[..., Tensor]  # (B, 2n) → (B, 2n), with the inputs (B, m) where there are some
 
 
 class Predictor(Protocol):
@@ -26,14 +27,14 @@ class Predictor(Protocol):
         ...
 
 
-def rk4(field: Field, y: Tensor, h: float, substeps: int) -> Tensor:
-    """One step of length h, by `substeps` classical Runge–Kutta steps."""
+def rk4(field: Field, y: Tensor, h: float, substeps: int, *u: Tensor) -> Tensor:
+    """One step of length h with held inputs, by `substeps` classical Runge–Kutta steps."""
     k = h / substeps
     for _ in range(substeps):
-        a = field(y)
-        b = field(y + k / 2 * a)
-        c = field(y + k / 2 * b)
-        y = y + k / 6 * (a + 2 * (b + c) + field(y + k * c))
+        a = field(y, *u)
+        b = field(y + k / 2 * a, *u)
+        c = field(y + k / 2 * b, *u)
+        y = y + k / 6 * (a + 2 * (b + c) + field(y + k * c, *u))
     return y
 
 
@@ -52,9 +53,9 @@ class Flow:
     step: Callable[[Tensor], Tensor] | None = None  # another integrator for one step of length h
     momentum: bool = False
 
-    def advance(self, y: Tensor) -> Tensor:
-        """The state a step later."""
-        return (self.step(y) if self.step else rk4(self.field, y, self.h, self.substeps)).detach()
+    def advance(self, y: Tensor, *u: Tensor) -> Tensor:
+        """The state a step later, with held inputs."""
+        return (self.step(y) if self.step else rk4(self.field, y, self.h, self.substeps, *u)).detach()
 
     def rollout(self, q0: Tensor, q1: Tensor, steps: int, exact: Tensor | None = None) -> Tensor:
         """See `Predictor`."""
@@ -89,34 +90,35 @@ def solve(A: Tensor, b: Tensor) -> Tensor:
     return torch.where((bad | (info != 0))[:, None], torch.nan, x)
 
 
+def newton(residual: Callable[[Tensor], Tensor], x: Tensor, iterations: int = 12) -> Tensor:
+    """The root (B, n) of a residual (B, n) near x; NaN where Newton's iteration does not converge."""
+    n, change = x.shape[-1], torch.full_like(x, torch.inf)
+    for _ in range(iterations):
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            r = residual(x)
+            rows = [torch.autograd.grad(r[:, i].sum(), x, retain_graph=i + 1 < n)[0] for i in range(n)]
+        change = solve(torch.stack(rows, 1).detach(), r.detach())
+        x = x.detach() - change
+        if float(change.nan_to_num(0.0).abs().max()) < 1e-11:
+            break
+    return torch.where(change.abs().amax(-1, keepdim=True) < 1e-6, x, torch.nan)
+
+
 @dataclass(frozen=True)
 class ThreePoint:
     """An implicit equation R(q0, q1, q2) = 0 as a predictor: Newton for q2 from the extrapolated line."""
 
     residual: Callable[[Tensor, Tensor, Tensor], Tensor]  # (B, n) each → (B, n)
     parameters: int
-    iterations: int = 12
 
     def rollout(self, q0: Tensor, q1: Tensor, steps: int, exact: Tensor | None = None) -> Tensor:  # noqa: ARG002
         """See `Predictor`; NaN from the step on at which Newton fails."""
         out = [q0, q1]
         for _ in range(steps):
-            out.append(self._next(out[-2], out[-1]))
+            q0, q1 = out[-2:]
+            out.append(newton(partial(self.residual, q0, q1), 2 * q1 - q0))
         return torch.stack(out, 1)
-
-    def _next(self, q0: Tensor, q1: Tensor) -> Tensor:
-        q2, n = 2 * q1 - q0, q0.shape[-1]
-        change = torch.full_like(q2, torch.inf)
-        for _ in range(self.iterations):
-            with torch.enable_grad():
-                x = q2.detach().requires_grad_()
-                r = self.residual(q0, q1, x)
-                rows = [torch.autograd.grad(r[:, i].sum(), x, retain_graph=i + 1 < n)[0] for i in range(n)]
-            change = solve(torch.stack(rows, 1).detach(), r.detach())
-            q2 = q2 - change
-            if float(change.nan_to_num(0.0).abs().max()) < 1e-11:
-                break
-        return torch.where(change.abs().amax(-1, keepdim=True) < 1e-6, q2, torch.nan)
 
 
 def fitted_start(model: Predictor, history: Tensor, iterations: int = 8) -> tuple[Tensor, Tensor]:

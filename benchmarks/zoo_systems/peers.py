@@ -1,8 +1,8 @@
 """Peers in the zoo: SINDy, and the true structure with its numbers fitted.
 
-SINDy is a sparse regression of smoothed accelerations on a library of polynomials and trigonometric terms. Local cubic
-polynomials give position, velocity and acceleration; sequentially thresholded least squares selects. The width of the
-smoothing and the threshold are chosen by free runs over the last fifth of the training part.
+SINDy is a sparse regression of smoothed accelerations on a library of polynomials and trigonometric terms. Local
+polynomials of degree 4 give position, velocity and acceleration; sequentially thresholded least squares selects. The
+width of the smoothing and the threshold are chosen by free runs over the last fifth of the training part.
 
 The true structure is the best that a few-number model of the right equation can reach: Levenberg–Marquardt on whole
 training recordings over the numbers and the start states, from the true numbers; RK4 with implicit dry friction,
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.peers.samples import local_polynomials
 from benchmarks.zoo_systems.mechanisms import Array, Mechanism, rk4
 from benchmarks.zoo_systems.prediction import SMOOTH, MechanismModel, roll, start_states, trained
 from benchmarks.zoo_systems.systems import ZooSystem
@@ -65,23 +66,14 @@ def fit_sindy(of: ZooSystem) -> SparseModel:
     for half in sorted({max(2, round(w * of.samples_per_period)) for w in HALF_WIDTHS}):
         if 2 * half + 1 > kept // 2:
             continue
-        rows = [_smoothed(of.train.t[:m], q[:m], half) for q in of.train.q]
+        at = np.arange(half, m - half)
+        rows = [local_polynomials(of.train.t[:m], q[:m], at, half, 4) for q in of.train.q]
         x, y, a = (np.concatenate([row[i] for row in rows]) for i in range(3))
         terms = library(x, y, np.concatenate([u[half : m - half] for u in of.train.u]), angles)
         for threshold in THRESHOLDS:
             model = SparseModel(_thresholded(terms, a, threshold), angles)
             models.append((_held_out(of, model, kept, m), len(models), model))
     return min(models)[2]
-
-
-def _smoothed(t: Array, q: Array, half: int) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration at the interior samples, from cubics through 2·half + 1 samples."""
-    at = np.arange(half, len(t) - half)
-    near = at[:, None] + np.arange(-half, half + 1)
-    dt = t[near] - t[at][:, None]
-    A = np.stack([dt**k for k in range(min(4, 2 * half) + 1)], -1)
-    c = np.linalg.pinv(A) @ q[near]
-    return c[:, 0], c[:, 1], 2 * c[:, 2]
 
 
 def _thresholded(terms: Array, a: Array, threshold: float) -> Array:

@@ -22,7 +22,7 @@ class Questions:
     """The answers so far: the model, and what the data were found to be."""
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
-        # The search of all data, and the holds of inputs that may be tried: where there are others, that of the data too.
+        # The search of all data, and the holds of inputs that may be tried, that of the data among them.
         self.wanted, self.holds = wanted, (*holds, *([wanted.data.hold] if holds else []))
         self.hold, self.input_terms = "", ()
         # The search of the part, its sensors' zeros taken off where these differ; the model; the zeros.
@@ -90,7 +90,7 @@ class Questions:
         if self.wanted.part is self.wanted:
             if self.best is not None and self.differ is not None:
                 self.read, best, self.differ = self.wanted.zeros_again(self.read, self.best, self.differ)
-                self.best = best if best is self.best else self.read.settled(best, swapped=True)
+                self.best = best and (best if best is self.best else self.read.settled(best, swapped=True))
             return
         longer = self.wanted.part.longer > 1  # inputs are means over several samples, which say little of holds of one
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)

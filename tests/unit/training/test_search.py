@@ -118,7 +118,7 @@ def rolled(acceleration, starts, steps, h, noise, angles=(False, True)):
 
 def test_a_spherical_pendulum_is_found_in_noise():
     # fails if no named mass has cos 2q: functions had to say it, in the place of one term
-    def acceleration(a, b, v, w):
+    def acceleration(_, b, v, w):
         return -2 * b.cos() / b.sin() * v * w - 0.05 * v, b.sin() * b.cos() * v**2 - 9.81 * b.sin() - 0.05 * w
 
     starts = torch.tensor([[0.0, 0.9, 2.5, 0.0], [1.0, 0.6, 4.5, -1.0]], dtype=torch.float64)
