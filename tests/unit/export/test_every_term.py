@@ -60,7 +60,7 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "forced", "diagonal": True, "features": ("cos(q2) v1 v2", "q1^3", "sin(q2) v1^2"), "coulomb": True,
         "inputs": 1, "input_map": (1.0, 0.0), "drag": ("load 2", "|v2| v2", "q1 sgn(v2)", "sin(q2) sgn(v1)"),
     }),
-    "a joint that turns another": ("aa", {"level": "forced", "features": ("spherical",), "inputs": 1, "input_map": (1, 0)}),
+    "a turning joint": ("aa", {"level": "forced", "features": ("spherical",), "inputs": 1, "input_map": (1.0, 0.0)}),
     "a slide that turns": ("la", {"level": "forced", "features": ("slides",), "inputs": 1, "input_map": (0.0, 1.0)}),
     "lengths": ("ll", {
         "level": "forced", "diagonal": True, "coulomb": True, "sticking": True, "features": ("lengths", "q1 v1^2 v2"),
