@@ -276,7 +276,8 @@ def in_words(
         return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: {_unseen_motion(errors)}"
-    chance = 0.0 if ahead is None else CHANCE * ahead.start * errors.spread
+    # Two motions of one kind that know nothing of each other differ by √2 of their spread.
+    chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread
     if free > max(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown)}"
     if ahead is not None and ahead.open > UNCERTAIN:
