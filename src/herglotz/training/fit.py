@@ -25,6 +25,7 @@ from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
+from herglotz.training.disagreeing import look_at_agreeing
 from herglotz.training.distributed import is_first
 from herglotz.training.equation import equation_of
 from herglotz.training.equation_notes import notes_of
@@ -184,13 +185,16 @@ def told_arrival(data: Trajectories, config: FitConfig, planned: Arrival | None)
 def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stages) -> Run:
     started = time.perf_counter()
     with stages.bar:
-        seen = look(data, config, stages, plan)
+        seen, left_out = (look(data, config, stages, plan), ()) if plan else look_at_agreeing(data, config, stages)
+        for one in left_out:
+            tell(f"{data.source or 'data'}: warning: {one.in_words(data)}")
         plan = plan or choose(seen, config)
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
     if seen.found is not None and plan.network == "none":
         run.metrics["compared"] = list(seen.found.compared)
+    run.metrics["left_out"] = [vars(one) for one in left_out]
     joint = _joint(run, plan, ROUNDING * task.exact)
     run.metrics["equation"] = equation_of(run, joint, notes_of(run)).as_dict()
     run.metrics["verdict"] = ". ".join(filter(None, (run.metrics["verdict"], pushes(run, joint))))

@@ -1,0 +1,127 @@
+"""Recordings that the model of the others does not follow: something else was recorded, and they are left out whole.
+
+Every recording is followed over short segments from starts of its own, with the numbers of the model fixed. It
+disagrees if the scale of its misfit is an outlier (`TAIL`) of the misfit of the others, so that more than half of its
+samples are. A bad recording may have bent the model so far that no recording stands out: where the model is not at the
+noise, the recording that it misses by most is left out if the whole dictionary would follow the others to their noise.
+The model is then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is
+an outlier of that model. Most recordings have to agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import AT_THE_NOISE, precision, relative_spread
+from herglotz.data.units import common_unit, size
+from herglotz.models import ContactLagrangian
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.look import Look, look, read_like
+from herglotz.training.problems.robust import FREEDOM, MAD, TAIL, scale_of
+from herglotz.training.search import Search
+from herglotz.training.stages import Stages
+from herglotz.training.trajectory_fit import SegmentStages
+from herglotz.training.verdict import EXACT_ENOUGH, STATE_ITERATIONS
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A recording, counted from 0, and the scales of what the model of the others misses it and them by.
+
+    In units of q, over the balance of several kinds of coordinates.
+    """
+
+    recording: int
+    missed: float
+    others: float
+
+    def in_words(self, data: Trajectories) -> str:
+        """The same in a sentence."""
+        own, others = (size(x, common_unit(data.units), digits=2) for x in (self.missed, self.others))
+        return (
+            f"trajectory {self.recording}, counted from 0, is left out whole: the model of the others misses it by "
+            f"{own}, and them by {others}"
+        )
+
+
+def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) -> tuple[Look, tuple[LeftOut, ...]]:
+    """The look at the recordings that agree, and those that are left out: see the head of this module.
+
+    Raise InputError if the data cannot be used, or do not suit the settings.
+    """
+    whole = seen = look(data, settings, stages)
+    out: list[int] = []
+    while 2 * len(out) < len(data) and (missed := _missed(seen, data, out)) is not None:
+        rest = [b for b in range(len(data)) if b not in out]
+        scale = {b: MAD * float(missed[b].median()) for b in range(len(data))}
+        worst = max(rest, key=lambda b: scale[b])
+        others = [b for b in rest if b != worst]
+        outlier = scale[worst] > TAIL * _scale(missed, others, seen)
+        if outlier or (not out and not _agree(seen, _noise_of_each(seen)) and _would_agree(seen, worst)):
+            out.append(worst)
+            seen = look(data.select(others), settings, stages.labelled(f"{stages.label}, without {out}"))
+            continue
+        least = _scale(missed, rest, seen)
+        if _agree(seen, precision(seen.data)) and all(scale[b] > TAIL * least for b in out):
+            return seen, tuple(LeftOut(b, scale[b], least) for b in sorted(out))
+        break
+    return whole, ()
+
+
+def _scale(missed: Sequence[Tensor], recordings: Sequence[int], seen: Look) -> float:
+    """The scale of the misfit of these recordings; smaller errors than the verdict counts are none."""
+    return max(scale_of(torch.cat([missed[b] for b in recordings])), EXACT_ENOUGH * relative_spread(seen.data))
+
+
+def _agree(seen: Look, noise: float) -> bool:
+    """Whether the model misses what it was fitted to by no more than this noise."""
+    assert seen.found is not None
+    sigma = seen.found.sigma
+    return sigma is not None and sigma <= max(AT_THE_NOISE * noise, EXACT_ENOUGH * relative_spread(seen.data))
+
+
+def _noise_of_each(seen: Look) -> float:
+    """The noise of most recordings: that of a bad one may be anything."""
+    return float(torch.tensor([precision(one) for one in seen.data]).median())
+
+
+def _would_agree(seen: Look, left_out: int) -> bool:
+    """Whether the model of the whole dictionary follows all recordings but one to their noise."""
+    others = [b for b in range(len(seen.data)) if b != left_out]
+    kept = seen.kept.select(others).to(torch.float64, "cpu")
+    settings = replace(seen.settings, dtype="float64", device="cpu")
+    full = Search(kept, estimate_baseline(kept), settings).part.full
+    return full is not None and full.at_the_noise
+
+
+def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] | None:
+    """Sizes of the misfit of each recording, over the balance, at samples of which all positions were read.
+
+    Infinite where a step fails. None where no named terms were found, and where recordings differ by zeros of their
+    sensors, since those of recordings that are `out` are unknown.
+    """
+    if len(data) < 3 or seen.found is None or seen.found.sigma is None or (out and seen.zeros):
+        return None
+    read, model = read_like(data, seen), seen.task(Stages()).build("none")
+    together = _misfit(seen, model, read)
+    each = [_misfit(seen, model, one) for one in read] if together is None else together.split(read.lengths)
+    known = read.complete.split(read.lengths)
+    return [
+        read.q.new_full((1,), torch.inf) if own is None else (own / read.balance)[there].flatten().abs()
+        for own, there in zip(each, known, strict=True)
+    ]
+
+
+def _misfit(seen: Look, model: ContactLagrangian, data: Trajectories) -> Tensor | None:
+    """Misfit of segments that start anew, (N, n) in units of q; None if a step fails."""
+    assert seen.found is not None
+    config = replace(seen.settings, iterations=STATE_ITERATIONS)
+    stages = SegmentStages(replace(seen.task(Stages()), data=data, config=config), model, frozen=True)
+    found = stages.fit(stages.lengths[0], seen.found.sigma or 0.0, FREEDOM, None)
+    return None if found is None else found.problem.misfit(found.path) * data.balance
