@@ -11,27 +11,26 @@ an outlier of that model. Most recordings have to agree.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision, relative_spread
-from herglotz.data.units import common_unit, size
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.look import Look, look, read_like
-from herglotz.training.problems.robust import FREEDOM, MAD, TAIL, scale_of
+from herglotz.training.problems.robust import FREEDOM, TAIL, scale_of
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import SegmentStages
 from herglotz.training.verdict import EXACT_ENOUGH, STATE_ITERATIONS
 
 
-@dataclass(frozen=True)
-class LeftOut:
+class LeftOut(NamedTuple):
     """A recording, counted from 0, and the scales of what the model of the others misses it and them by.
 
     In units of q, over the balance of several kinds of coordinates.
@@ -41,14 +40,6 @@ class LeftOut:
     missed: float
     others: float
 
-    def in_words(self, data: Trajectories) -> str:
-        """The same in a sentence."""
-        own, others = (size(x, common_unit(data.units), digits=2) for x in (self.missed, self.others))
-        return (
-            f"trajectory {self.recording}, counted from 0, is left out whole: the model of the others misses it by "
-            f"{own}, and them by {others}"
-        )
-
 
 def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) -> tuple[Look, tuple[LeftOut, ...]]:
     """The look at the recordings that agree, and those that are left out: see the head of this module.
@@ -57,20 +48,27 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
     """
     whole = seen = look(data, settings, stages)
     out: list[int] = []
-    while 2 * len(out) < len(data) and (missed := _missed(seen, data, out)) is not None:
+    for _ in range(len(data)):
+        if (missed := _missed(seen, data, out)) is None:
+            break
         rest = [b for b in range(len(data)) if b not in out]
-        scale = {b: MAD * float(missed[b].median()) for b in range(len(data))}
+        scale = {b: scale_of(own) for b, own in enumerate(missed)}
         worst = max(rest, key=lambda b: scale[b])
-        others = [b for b in rest if b != worst]
-        outlier = scale[worst] > TAIL * _scale(missed, others, seen)
+        outlier = scale[worst] > TAIL * _scale(missed, [b for b in rest if b != worst], seen)
         if outlier or (not out and not _agree(seen, _noise_of_each(seen)) and _would_agree(seen, worst)):
-            out.append(worst)
-            seen = look(data.select(others), settings, stages.labelled(f"{stages.label}, without {out}"))
-            continue
-        least = _scale(missed, rest, seen)
-        if _agree(seen, precision(seen.data)) and all(scale[b] > TAIL * least for b in out):
-            return seen, tuple(LeftOut(b, scale[b], least) for b in sorted(out))
-        break
+            now = sorted([*out, worst])
+        else:
+            least = _scale(missed, rest, seen)
+            now = [b for b in out if scale[b] > TAIL * least]
+            if not _agree(seen, precision(seen.data)):
+                break
+            if now == out:
+                return seen, tuple(LeftOut(b, scale[b], least) for b in out)
+        if 2 * len(now) >= len(data):
+            break
+        out = now
+        others = data.select([b for b in range(len(data)) if b not in out])
+        seen = look(others, settings, stages.labelled(f"{stages.label}, without {out}"))
     return whole, ()
 
 
