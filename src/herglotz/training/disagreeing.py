@@ -2,10 +2,10 @@
 
 Every recording is followed over short segments from starts of its own, with the numbers of the model fixed. It
 disagrees if the scale of its misfit is an outlier (`TAIL`) of the misfit of the others, so that more than half of its
-samples are. A bad recording may have bent the model so far that no recording stands out: where the model is not at the
-noise, the recording that it misses by most is left out if the whole dictionary would follow the others to their noise.
-The model is then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is
-an outlier of that model. Most recordings have to agree.
+samples are. A bad recording may have bent the model so far that none stands out. Where the model is not at the noise,
+the recording whose accelerations are least like the others' is left out if the whole dictionary would follow the others
+to their noise. The model is then found anew. What is left out stays so if the others agree, whose model is at their
+noise, and if it is an outlier of that model. Most recordings have to agree.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision, relative_spread
 from herglotz.models import ContactLagrangian
-from herglotz.training.baseline import estimate_baseline
+from herglotz.training.baseline import differences, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.look import Look, look, read_like
-from herglotz.training.problems.robust import FREEDOM, TAIL, scale_of
+from herglotz.training.problems.robust import FREEDOM, TAIL, robust_fit, scale_of
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import SegmentStages
@@ -55,7 +55,10 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         scale = {b: scale_of(own) for b, own in enumerate(missed)}
         worst = max(rest, key=lambda b: scale[b])
         outlier = scale[worst] > TAIL * _scale(missed, [b for b in rest if b != worst], seen)
-        if outlier or (not out and not _agree(seen, _noise_of_each(seen)) and _would_agree(seen, worst)):
+        if not outlier and not out and not _agree(seen, _noise_of_each(seen)):
+            worst = _least_alike(seen)
+            outlier = _would_agree(seen, worst)
+        if outlier:
             now = sorted([*out, worst])
         else:
             least = _scale(missed, rest, seen)
@@ -87,6 +90,15 @@ def _agree(seen: Look, noise: float) -> bool:
 def _noise_of_each(seen: Look) -> float:
     """The noise of most recordings: that of a bad one may be anything."""
     return float(torch.tensor([precision(one) for one in seen.data]).median())
+
+
+def _least_alike(seen: Look) -> int:
+    """The recording whose accelerations are farthest from the linear model that Student's t fits to those of all."""
+    t, _, a, columns, _ = differences(seen.data)
+    rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
+    missed = (rows @ robust_fit(rows, right) - right).reshape(a.shape)
+    of = seen.data.trajectory[t.index].cpu()
+    return max(range(len(seen.data)), key=lambda b: scale_of(missed[of == b]) if bool((of == b).any()) else 0.0)
 
 
 def _would_agree(seen: Look, left_out: int) -> bool:
