@@ -9,10 +9,11 @@ from torch import Tensor
 
 from herglotz.data.checks import offsets_of
 from herglotz.data.gaps import complete
+from herglotz.data.splits import SHOWN
 from herglotz.data.trajectories import Trajectories
 
 # A polynomial of this degree is fitted to so many samples in a row.
-SAMPLES, DEGREE = 9, 5
+SAMPLES, DEGREE = SHOWN, 5
 # Degrees of `precision`. Noise leaves the same residual at each degree; coarsely sampled motion leaves less at higher
 # degrees.
 DEGREES = (3, 5, 7)

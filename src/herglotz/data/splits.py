@@ -12,6 +12,8 @@ from herglotz.errors import InputError
 
 # A part of a trajectory has at least so many samples in a row.
 RUN = 200
+# Samples in a row that show their noise: polynomials in time are fitted to as many (`herglotz.data.roughness`).
+SHOWN = 9
 # Rows of the concatenation, and the number of rows of each trajectory.
 Part = tuple[Tensor, tuple[int, ...]]
 
@@ -19,12 +21,13 @@ Part = tuple[Tensor, tuple[int, ...]]
 def time_split(lengths: Sequence[int], fraction: float, source: str = "") -> tuple[Part, Part]:
     """Cut each trajectory, of these lengths, after its first `round(fraction * length)` samples.
 
-    A trajectory that is too short to be cut trains whole. Raise InputError if the fraction is not inside (0, 1), or no
-    trajectory has two parts of three samples.
+    A trajectory that is too short to be cut trains whole. Of three trajectories or more, none of which has two parts
+    that show their noise, whole ones are held out: see `held_out_whole`. Raise InputError if the fraction is not inside
+    (0, 1), or no trajectory has two parts of three samples.
     """
     if not 0.0 < fraction < 1.0:
         raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
-    cuts = tuple(cut_of(length, fraction) for length in lengths)
+    cuts = cuts_of(lengths, fraction)
     rest = tuple(length - cut for cut, length in zip(cuts, lengths, strict=True) if cut < length)
     if not rest:
         most = max(lengths)
@@ -44,10 +47,35 @@ def cut_of(length: int, fraction: float) -> int:
     return cut if MIN_SAMPLES <= cut <= length - MIN_SAMPLES else length
 
 
+def cuts_of(lengths: Sequence[int], fraction: float) -> tuple[int, ...]:
+    """The number of samples of each trajectory that train."""
+    whole = held_out_whole(lengths, fraction)
+    if not any(whole):
+        return tuple(cut_of(length, fraction) for length in lengths)
+    return tuple(MIN_SAMPLES if out else length for out, length in zip(whole, lengths, strict=True))
+
+
+def held_out_whole(lengths: Sequence[int], fraction: float) -> tuple[bool, ...]:
+    """Which trajectories are held out whole, evenly chosen: all but this fraction of three or more short ones.
+
+    They are short if none has two parts of `SHOWN` samples. The first three samples of a trajectory that is held out
+    train all the same: they say where it starts.
+    """
+    parts = (min(cut := round(fraction * length), length - cut) for length in lengths)
+    if len(lengths) < 3 or fraction == 1 or max(parts) >= SHOWN:
+        return (False,) * len(lengths)
+    # Of trajectories that can be held out the k-th one is where (1 − fraction) k passes the next whole number.
+    found, count = [], 0
+    for length in lengths:
+        before, count = count, count + (length >= 2 * MIN_SAMPLES)
+        found.append(round((1 - fraction) * count) > round((1 - fraction) * before))
+    return tuple(found)
+
+
 def trained_whole(lengths: Sequence[int], fraction: float) -> str:
     """A warning of trajectories that are too short to be cut, so that no sample is held out; "" for no trajectory."""
     whole = [b for b, length in enumerate(lengths) if cut_of(length, fraction) == length]
-    if fraction == 1 or len(whole) in (0, len(lengths)):
+    if fraction == 1 or any(held_out_whole(lengths, fraction)) or len(whole) in (0, len(lengths)):
         return ""
     plural = "y is" if len(whole) == 1 else "ies are"
     return (

@@ -14,7 +14,7 @@ from torch import Tensor
 import herglotz
 from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes
-from herglotz.data.splits import leading, leading_rows
+from herglotz.data.splits import held_out_whole, leading, leading_rows
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.config import FitConfig
 from herglotz.training.free_run import states_everywhere
@@ -24,11 +24,12 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.plan import Plan
 from herglotz.training.problems.grid import step_inputs
 from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.recorded_range import box_of
 from herglotz.training.run import Run
 from herglotz.training.task import Task
-from herglotz.training.verdict import judged
+from herglotz.training.verdict import judged, with_own_starts
 
 # Multiple of the spread. A free run with a larger error has diverged, whatever the uncertainty of its start.
 DIVERGED = 1e3
@@ -41,6 +42,7 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
     """
     train, data, config = seen.train, seen.data, task.config
     fitted = replace(fitted, states=_with_dropped(fitted, train, seen.spikes))
+    fitted = replace(fitted, states=_with_starts(task, seen, fitted))
     dropped = seen.spikes.clone()
     if fitted.used is not None:
         dropped[~dropped] = ~fitted.used
@@ -96,6 +98,25 @@ def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tenso
             found = Stepper(fitted.model).rollout(*state_of(out[run[0] - 1]), h=h, inputs=inputs)
         out[run] = found.states.joined[1:]
     return out
+
+
+def _with_starts(task: Task, seen: Look, fitted: Fitted) -> Tensor:
+    """States at all training samples; those of trajectories that are held out whole start where their samples say.
+
+    Three noisy samples tell no velocity. All samples of such a trajectory tell its start, and nothing else of the fit.
+    """
+    whole = held_out_whole(seen.data.lengths, task.config.train_fraction)
+    held = [b for b, out in enumerate(whole) if out]
+    if not held:
+        return fitted.states
+    data = seen.data.select(held)
+    own = with_own_starts(task, fitted, data, FREEDOM if task.config.robust != "off" else None)
+    if own is None:
+        return fitted.states
+    first = leading_rows(data.lengths, [seen.train.lengths[b] for b in held])
+    at, states = torch.tensor(whole)[seen.train.trajectory.cpu()], fitted.states.clone()
+    states[at] = own.problem.grid.at_samples(own.path.x)[first]
+    return states
 
 
 def _errors(

@@ -25,6 +25,7 @@ from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
+from herglotz.training.disagreeing import look_at_agreeing
 from herglotz.training.distributed import is_first
 from herglotz.training.equation import equation_of
 from herglotz.training.equation_notes import notes_of
@@ -39,6 +40,7 @@ from herglotz.training.push import pushes
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages
+from herglotz.training.summary import left_out_of
 from herglotz.training.tensorboard import log_result, tensorboard_log
 from herglotz.training.uncertainty import laplace
 
@@ -184,13 +186,17 @@ def told_arrival(data: Trajectories, config: FitConfig, planned: Arrival | None)
 def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stages) -> Run:
     started = time.perf_counter()
     with stages.bar:
-        seen = look(data, config, stages, plan)
+        seen, left_out = (look(data, config, stages, plan), ()) if plan else look_at_agreeing(data, config, stages)
+        found = {"left_out": [one._asdict() for one in left_out]}
+        for words in left_out_of(found, data):
+            tell(f"{data.source or 'data'}: warning: left out is {words}")
         plan = plan or choose(seen, config)
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
     if seen.found is not None and plan.network == "none":
         run.metrics["compared"] = list(seen.found.compared)
+    run.metrics.update(found)
     joint = _joint(run, plan, ROUNDING * task.exact)
     run.metrics["equation"] = equation_of(run, joint, notes_of(run)).as_dict()
     run.metrics["verdict"] = ". ".join(filter(None, (run.metrics["verdict"], pushes(run, joint))))

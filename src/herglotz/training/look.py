@@ -11,7 +11,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS, Arrival
-from herglotz.data.input_terms import with_input_terms
+from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.roughness import roughness
 from herglotz.data.sensors import measured
 from herglotz.data.spikes import spikes
@@ -178,6 +178,14 @@ def _read(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Arriva
     data = data if settings.use_inputs else replace(data, u=None)
     data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
     return with_arrival(data, split(data, settings)[0])
+
+
+def read_like(data: Trajectories, seen: Look) -> Trajectories:
+    """Recordings as a look has read its own: sensors, angles, and inputs as they act."""
+    data = data if seen.turning else on_a_line(data)
+    data = data if data.u is None else replace(data, **seen.arrival._asdict())
+    data = with_input_terms(data, input_terms_of(seen.data.columns))
+    return _read(measured(data, seen.zeros, drifts=seen.drifts), seen.settings)[0]
 
 
 def split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Trajectories | None]:

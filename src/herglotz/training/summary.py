@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 from textwrap import fill
+from typing import Any
 
+from herglotz.data import Trajectories
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.equation import Equation
 from herglotz.training.fitted_run import FittedRun
@@ -23,6 +26,7 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", as_recorded(data)[0].summary()),
+        ("left out", "; ".join(left_out_of(m, data))),
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {level}"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
@@ -33,6 +37,16 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
         ("time", _told(m.get("seconds"), "s")),
     ]
     return [(name, value) for name, value in found if value]
+
+
+def left_out_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
+    """The recordings that were left out whole, with what the model of the others misses them by."""
+    unit = common_unit(data.units)
+    return [
+        f"trajectory {one['recording']}, counted from 0, whole: the model of the others misses it by "
+        f"{size(one['missed'], unit, digits=2)}, and them by {size(one['others'], unit, digits=2)}"
+        for one in metrics.get("left_out", ())
+    ]
 
 
 def summary(run: FittedRun) -> str:

@@ -78,14 +78,14 @@ def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories
 
 def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tensor:
     """Errors of windows of unseen data, (N', n), from states fitted there; inf if a step fails."""
-    found = _with_own_starts(task, fitted, data, FREEDOM if task.config.robust != "off" else None)
+    found = with_own_starts(task, fitted, data, FREEDOM if task.config.robust != "off" else None)
     if found is None:
         return data.q.new_full((1, data.dof), torch.inf)
     miss = found.misfit
     return miss if found.problem.freedom is None else miss * (scale_of(miss) / miss.square().mean().sqrt())
 
 
-def _with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: float | None) -> TrajectoryFit | None:
+def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: float | None) -> TrajectoryFit | None:
     """The fit of the states of windows, with fixed parameters; None if a step fails."""
     config = replace(task.config, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(task, data=data, config=config, stages=Stages()), fitted.model, frozen=True)
@@ -100,7 +100,7 @@ def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
     reason, steps = reason_of_data(train.liveliest(MOST)) or None, 1
     while reason is None:
         data, base = train.liveliest(MOST), task.base.stepped(steps)
-        found = _with_own_starts(replace(task, base=base), fitted, data, None)
+        found = with_own_starts(replace(task, base=base), fitted, data, None)
         if found is None:
             break
         grid = found.problem.grid

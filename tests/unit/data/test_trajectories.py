@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.splits import enough
+from herglotz.data.splits import cuts_of, enough
 from herglotz.errors import InputError
 
 
@@ -173,6 +173,14 @@ def test_split_time():  # fails if the cut is not per trajectory, or a sample is
     for bad in (0.0, 1.0, -0.5, 2.0, NAN):
         with pytest.raises(InputError, match="fraction must lie between 0 and 1"):
             long.split_time(bad)
+
+
+def test_whole_short_trajectories_are_held_out():
+    # fails if short ones are cut in time, long ones are not, or one too short to be judged is held out
+    assert cuts_of((13, 12, 11, 5, 10, 9), 2 / 3) == (13, 3, 11, 5, 10, 3)
+    assert cuts_of((13, 12, 27), 2 / 3) == (9, 8, 18)
+    assert cuts_of((13, 12), 2 / 3) == (9, 8)
+    assert cuts_of((4, 5, 5), 2 / 3) == (4, 5, 5)
 
 
 def test_select():  # fails if order or repetition is lost, or a wrong index wraps round

@@ -1,0 +1,137 @@
+"""Recordings that the model of the others does not follow: something else was recorded, and they are left out whole.
+
+Every recording is followed over short segments from starts of its own, with the numbers of the model fixed. It
+disagrees if the scale of its misfit is an outlier (`TAIL`) of the misfit of the others, so that more than half of its
+samples are. A bad recording may have bent the model so far that none stands out. Where the model is not at the noise,
+the recording whose accelerations are least like the others' is left out if the whole dictionary would follow the others
+to their noise. The model is then found anew. What is left out stays so if the others agree, whose model is at their
+noise, and if it is an outlier of that model. Most recordings have to agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import AT_THE_NOISE, precision, relative_spread
+from herglotz.models import ContactLagrangian
+from herglotz.training.baseline import differences, estimate_baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.look import Look, look, read_like
+from herglotz.training.problems.robust import FREEDOM, TAIL, robust_fit, scale_of
+from herglotz.training.search import Search
+from herglotz.training.stages import Stages
+from herglotz.training.trajectory_fit import SegmentStages
+from herglotz.training.verdict import EXACT_ENOUGH, STATE_ITERATIONS
+
+
+class LeftOut(NamedTuple):
+    """A recording, counted from 0, and the scales of what the model of the others misses it and them by.
+
+    In units of q, over the balance of several kinds of coordinates.
+    """
+
+    recording: int
+    missed: float
+    others: float
+
+
+def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) -> tuple[Look, tuple[LeftOut, ...]]:
+    """The look at the recordings that agree, and those that are left out: see the head of this module.
+
+    Raise InputError if the data cannot be used, or do not suit the settings.
+    """
+    whole = seen = look(data, settings, stages)
+    out: list[int] = []
+    for _ in range(len(data)):
+        if (missed := _missed(seen, data, out)) is None:
+            break
+        rest = [b for b in range(len(data)) if b not in out]
+        scale = {b: scale_of(own) for b, own in enumerate(missed)}
+        worst = max(rest, key=lambda b: scale[b])
+        outlier = scale[worst] > TAIL * _scale(missed, [b for b in rest if b != worst], seen)
+        if not outlier and not out and not _agree(seen, _noise_of_each(seen)):
+            worst = _least_alike(seen)
+            outlier = _would_agree(seen, worst)
+        if outlier:
+            now = sorted([*out, worst])
+        else:
+            least = _scale(missed, rest, seen)
+            now = [b for b in out if scale[b] > TAIL * least]
+            if not _agree(seen, precision(seen.data)):
+                break
+            if now == out:
+                return seen, tuple(LeftOut(b, scale[b], least) for b in out)
+        if 2 * len(now) >= len(data):
+            break
+        out = now
+        others = data.select([b for b in range(len(data)) if b not in out])
+        seen = look(others, settings, stages.labelled(f"{stages.label}, without {out}"))
+    return whole, ()
+
+
+def _scale(missed: Sequence[Tensor], recordings: Sequence[int], seen: Look) -> float:
+    """The scale of the misfit of these recordings; smaller errors than the verdict counts are none."""
+    return max(scale_of(torch.cat([missed[b] for b in recordings])), EXACT_ENOUGH * relative_spread(seen.data))
+
+
+def _agree(seen: Look, noise: float) -> bool:
+    """Whether the model misses what it was fitted to by no more than this noise."""
+    assert seen.found is not None
+    sigma = seen.found.sigma
+    return sigma is not None and sigma <= max(AT_THE_NOISE * noise, EXACT_ENOUGH * relative_spread(seen.data))
+
+
+def _noise_of_each(seen: Look) -> float:
+    """The noise of most recordings: that of a bad one may be anything."""
+    return float(torch.tensor([precision(one) for one in seen.data]).median())
+
+
+def _least_alike(seen: Look) -> int:
+    """The recording whose accelerations are farthest from the linear model that Student's t fits to those of all."""
+    t, _, a, columns, _ = differences(seen.data)
+    rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
+    missed = (rows @ robust_fit(rows, right) - right).reshape(a.shape)
+    of = seen.data.trajectory[t.index].cpu()
+    return max(range(len(seen.data)), key=lambda b: scale_of(missed[of == b]) if bool((of == b).any()) else 0.0)
+
+
+def _would_agree(seen: Look, left_out: int) -> bool:
+    """Whether the model of the whole dictionary follows all recordings but one to their noise."""
+    others = [b for b in range(len(seen.data)) if b != left_out]
+    kept = seen.kept.select(others).to(torch.float64, "cpu")
+    settings = replace(seen.settings, dtype="float64", device="cpu")
+    full = Search(kept, estimate_baseline(kept), settings).part.full
+    return full is not None and full.at_the_noise
+
+
+def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] | None:
+    """Sizes of the misfit of each recording, over the balance, at samples of which all positions were read.
+
+    Infinite where a step fails. None where no named terms were found, and where recordings differ by zeros of their
+    sensors, since those of recordings that are `out` are unknown.
+    """
+    if len(data) < 3 or seen.found is None or seen.found.sigma is None or (out and seen.zeros):
+        return None
+    read, model = read_like(data, seen), seen.task(Stages()).build("none")
+    together = _misfit(seen, model, read)
+    each = [_misfit(seen, model, one) for one in read] if together is None else together.split(read.lengths)
+    known = read.complete.split(read.lengths)
+    return [
+        read.q.new_full((1,), torch.inf) if own is None else (own / read.balance)[there].flatten().abs()
+        for own, there in zip(each, known, strict=True)
+    ]
+
+
+def _misfit(seen: Look, model: ContactLagrangian, data: Trajectories) -> Tensor | None:
+    """Misfit of segments that start anew, (N, n) in units of q; None if a step fails."""
+    assert seen.found is not None
+    config = replace(seen.settings, iterations=STATE_ITERATIONS)
+    stages = SegmentStages(replace(seen.task(Stages()), data=data, config=config), model, frozen=True)
+    found = stages.fit(stages.lengths[0], seen.found.sigma or 0.0, FREEDOM, None)
+    return None if found is None else found.problem.misfit(found.path) * data.balance

@@ -1,0 +1,68 @@
+"""A recording of something else among good ones is left out whole, and named."""
+
+import math
+
+import pytest
+import torch
+
+from herglotz import fit
+from herglotz.data import Trajectories
+
+
+def _drops(seed: int, count: int, samples: int, bad: int, wrong: float = 0.25) -> Trajectories:
+    """Drops x = v t + 4.9 t² with 1.5 mm of noise; of the recording `bad` nothing but other noise."""
+    of, t = torch.Generator().manual_seed(seed), 0.05 * torch.arange(samples).double()
+    parts = []
+    for b in range(count):
+        x = float(torch.rand(1, generator=of, dtype=torch.float64)) * t + 4.9 * t.square()
+        other = 0.4 + wrong * torch.randn(samples, generator=of, dtype=torch.float64)
+        parts.append((other if b == bad else x) + 0.0015 * torch.randn(samples, generator=of, dtype=torch.float64))
+    return Trajectories.of(t.repeat(count), torch.cat(parts), (samples,) * count, units=("m",), names=("x",))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_one_bad_recording_is_left_out_and_named(seed, capsys):
+    # fails if the bad recording bends the model of the others, is not named, or takes another one with it
+    run = fit(_drops(seed, 6, 13, bad=4), progress=False)
+    (out,) = run.metrics["left_out"]
+    assert out["recording"] == 4
+    assert out["missed"] > 50 * out["others"]
+    assert len(run.data) == 5
+    assert run.metrics["verdict"].startswith("fits")
+    assert run.metrics["extrapolation_rms"] < 2 * 0.0015
+    assert "warning: left out is trajectory 4, counted from 0" in capsys.readouterr().err
+    assert "left out" in run.summary()
+
+
+def test_good_recordings_all_stay():
+    # fails if a recording is left out that differs from the others by its start alone
+    run = fit(_drops(2, 6, 13, bad=-1), progress=False)
+    assert run.metrics["left_out"] == []
+    assert len(run.data) == 6
+
+
+def test_without_a_majority_nothing_is_left_out():
+    # fails if one of two recordings is said to be the bad one
+    assert fit(_drops(0, 2, 13, bad=1), progress=False).metrics["left_out"] == []
+
+
+def test_a_wide_swing_is_no_bad_recording():
+    # fails if a motion that tells more of the law than the others, which are all but linear, is left out for it
+    of, parts, t = torch.Generator().manual_seed(3), [], 0.1 * torch.arange(30).double()
+    for amplitude in (0.1, 0.15, 0.2, 0.25, 2.5):
+        q = _swing(amplitude)
+        parts.append(q + 0.002 * torch.randn(30, generator=of, dtype=torch.float64))
+    run = fit(Trajectories.of(t.repeat(5), torch.cat(parts), (30,) * 5, angles=(True,)), progress=False)
+    assert run.metrics["left_out"] == []
+
+
+def _swing(amplitude: float) -> torch.Tensor:
+    """30 samples, 0.1 apart, of q″ = −9.81 sin q from rest, by 20 leapfrog steps each."""
+    q, v, found = amplitude, 0.0, []
+    for k in range(30 * 20):
+        if k % 20 == 0:
+            found.append(q)
+        v -= 0.0025 * 9.81 * math.sin(q)
+        q += 0.005 * v
+        v -= 0.0025 * 9.81 * math.sin(q)
+    return torch.tensor(found, dtype=torch.float64)
