@@ -14,10 +14,12 @@ import numpy as np
 
 from benchmarks.zoo_systems.mechanisms import Array
 from benchmarks.zoo_systems.prediction import trained
+from benchmarks.zoo_systems.report import USABLE, relative
 from benchmarks.zoo_systems.systems import Recording, ZooSystem
 from herglotz.data import Trajectories, save
 from herglotz.training import load_run
 
+EXTRAPOLATES = "predict: the motion leaves the range that the model was fitted to"
 WALL = 30  # times the processor time that a fit may wait on a busy machine
 
 
@@ -49,6 +51,8 @@ def fit_ours(of: ZooSystem, folder: Path, limit: float) -> OurFit:
         thinned = trajectories(of, of.test).thinned(test.every)
         free = test.free.numpy()
         found["unseen"] = test.prediction.numpy()[free] / unit(of), thinned.q.numpy()[free] / unit(of)
+        if test.beyond and relative(of, {"later": found["later"]}) <= USABLE:
+            said = said or EXTRAPOLATES
     except Exception as error:
         said, found["unseen"] = said or f"predict: {error}", (np.full((1, of.mechanism.n), np.nan),) * 2
     return OurFit(found, said, cpu, run.metrics, code)

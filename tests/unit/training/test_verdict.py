@@ -33,7 +33,13 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
         (0.011, None, None, None, "fits to the noise"),
         (0.011, 0.012, 0.02, KNOWN, "fits, worse than the noise by a factor of 2:"),
         (0.011, 0.012, 1.2, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 1.2e+02:"),  # chaos
-        (0.011, 0.012, 1.5, replace(KNOWN, start=9.0), "does not fit beyond the recording"),  # no chaos leaves the world
+        (
+            0.011,
+            0.012,
+            1.5,
+            replace(KNOWN, start=9.0),
+            "does not fit beyond the recording",
+        ),  # no chaos leaves the world
         (0.011, 0.012, 1.2, KNOWN, "does not fit beyond the recording"),
         (0.011, 0.012, 1.2, None, "does not fit beyond the recording"),
         (0.011, 0.012, 0.013, replace(KNOWN, parameters=0.2), "does not fit: too little was recorded"),
