@@ -38,6 +38,7 @@ def _fitter(search: Search, variant: Variant) -> Fitter | None:
 def _joined(search: Search, best: Trial) -> Trial | None:
     """A model with the functions that join it one by one or, where that does not end at the noise, all at once.
 
+    The model with all functions is worth further fits if it misses held-out blocks by less than the one without.
     None where the model cannot be fitted together with what all functions have. Terms that are waves of a function
     bring that function with them.
     """
@@ -50,7 +51,7 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     if found is None or found.at_the_noise:
         return found
     every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
-    if every is None or search.better(best, every) is best:
+    if every is None or not float((best.score.losses - every.score.losses).sum()) > 0:
         return found
     return search.better(found, search.settled(likeliest(every, 2 * ITERATIONS), swapped=True))
 

@@ -335,6 +335,27 @@ def test_functions_join_a_model_that_is_near_the_data(monkeypatch):
     assert "q1^3" not in {offer.name for offer in kept.offers}
 
 
+def test_functions_join_all_at_once_where_none_does_alone(monkeypatch):
+    # fails if a mass joins without the potential that goes with it, which one after the other do not: three waves and
+    # friction stay in the place of a pendulum whose length ℓ = 1 + 0.14 cos θ turns with it
+    monkeypatch.setattr("herglotz.training.function_search._anew", lambda _: pytest.fail("made anew"))
+
+    def acceleration(q, v):
+        length, slope = 1 + 0.14 * np.cos(q), -0.14 * np.sin(q)
+        forces = -slope * v * v - length * np.sin(q) + slope * np.cos(q) - 0.06 * v  # ℓ + ℓ″ = 1
+        return forces / (length**2 + slope**2)
+
+    data = recorded(acceleration, [(2.0, 0.0), (-1.2, 0.7)], angle=True, steps=200)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    named = search.run()
+    assert named is not None
+    assert named.near
+    assert not named.at_the_noise
+    found = with_functions(search, named)
+    assert found.at_the_noise
+    assert "mass(q1) 1" in found.taken
+
+
 def test_no_functions_where_named_terms_are_at_the_noise(monkeypatch):
     # fails if functions are tried for every recording: they would take the place of the law
     data = recorded(lambda q, v: -np.sin(q) - 0.1 * v, [(2.0, 0.0), (0.5, 1.0)], angle=True)
