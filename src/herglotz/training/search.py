@@ -18,6 +18,7 @@ from herglotz.data.input_terms import with_input_terms
 from herglotz.data.roughness import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
+from herglotz.models.features import spherical
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.acting_inputs import asked_terms
 from herglotz.training.baseline import Baseline, estimate_baseline
@@ -154,9 +155,12 @@ class Search:
         return winner
 
     def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
-        """Offers and values that one linear problem of smoothed accelerations gives; None where it gives none."""
+        """Offers and values that one linear problem of smoothed accelerations gives; None where it gives none.
+
+        Its terms are those that do not stand for one another in noise.
+        """
         local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
-        every = every.only(set(every.names) - set(special(self.data)))
+        every = every.only(set(every.names).difference(special(self.data), spherical(self.data.angles)))
         start = None if local is None else start_of(self.data, self.base, every, local)
         if start is None:
             return None

@@ -291,6 +291,8 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
     # Each coordinate that is no angle has a mass, a spring, a tilt and a friction.
     coefficients = len(names) + (n * n if any(data.angles) else 4 * n)
     for every in STRIDES:
+        if min(data.lengths) <= 2 * every and every > 1:
+            break
         most = min(TRIPLES, int(MAX_NUMBERS / (n * n * (len(names) + n * (n + 4)))))
         t = data.thinned(every).triples(every * base.max_step).spread_out(most)
         if len(t) * n < ENOUGH * coefficients:
