@@ -1,11 +1,11 @@
 """Recordings that the model of the others does not follow: something else was recorded, and they are left out whole.
 
-Every recording is followed over short segments from starts of its own, with the numbers of the model fixed. It
-disagrees if the scale of its misfit is an outlier (`TAIL`) of the misfit of the others, so that more than half of its
-samples are. A bad recording may have bent the model so far that none stands out. Where the model is not at the noise,
-the recording whose accelerations are least like the others' is left out if the whole dictionary would follow the others
-to their noise. The model is then found anew. What is left out stays so if the others agree, whose model is at their
-noise, and if it is an outlier of that model. Most recordings have to agree.
+Of every recording the part that a fit uses is followed over short segments from starts of its own, with the numbers of
+the model fixed. A recording disagrees if the scale of its misfit is an outlier (`TAIL`) of the misfit of the others, so
+that more than half of its samples are. A bad recording may have bent the model so far that none stands out. Where the
+model is not at the noise, the recording whose accelerations are least like the others' is left out if the whole
+dictionary would follow the others to their noise. The model is then found anew. What is left out stays so if the others
+agree, whose model is at their noise, and if it is an outlier of that model. Most recordings have to agree.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision, relative_spread
+from herglotz.data.splits import cuts_of, held_out_whole, leading
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import differences, estimate_baseline
 from herglotz.training.config import FitConfig
@@ -118,7 +119,7 @@ def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] 
     """
     if len(data) < 3 or seen.found is None or seen.found.sigma is None or (out and seen.zeros):
         return None
-    read, model = read_like(data, seen), seen.task(Stages()).build("none")
+    read, model = _followed(read_like(data, seen), seen.settings), seen.task(Stages()).build("none")
     together = _misfit(seen, model, read)
     each = [_misfit(seen, model, one) for one in read] if together is None else together.split(read.lengths)
     known = read.complete.split(read.lengths)
@@ -126,6 +127,14 @@ def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] 
         read.q.new_full((1,), torch.inf) if own is None else (own / read.balance)[there].flatten().abs()
         for own, there in zip(each, known, strict=True)
     ]
+
+
+def _followed(data: Trajectories, settings: FitConfig) -> Trajectories:
+    """The part of every recording that a fit uses, or all of a recording that is held out whole."""
+    held = held_out_whole(data.lengths, settings.train_fraction)
+    cuts = cuts_of(data.lengths, settings.train_fraction)
+    kept = [length if whole else cut for length, cut, whole in zip(data.lengths, cuts, held, strict=True)]
+    return data.keep(leading(data.lengths, kept).to(data.q.device))
 
 
 def _misfit(seen: Look, model: ContactLagrangian, data: Trajectories) -> Tensor | None:

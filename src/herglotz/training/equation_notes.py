@@ -118,10 +118,10 @@ class Departure(NamedTuple):
 def departure(run: FittedRun) -> Departure | None:
     """Errors of free runs of all recordings; the exact motion is extrapolated from whole and halved steps.
 
-    None if a run fails, the model fits the data exactly, or the equation is not the whole model.
+    None if a run fails or leaves the world, the model fits the data exactly, or the equation is not the whole model.
     """
     data = run.data.unwrapped()
-    if not is_formula(run.model):
+    if not is_formula(run.model) or _is_lost(run):
         return None
     longest = longest_step(run)
     try:
@@ -131,6 +131,13 @@ def departure(run: FittedRun) -> Departure | None:
     changes = whole - data.q, HALVED * (halved - whole)
     missed, moved = (float((x / data.balance).square().mean().sqrt()) for x in changes)
     return Departure(moved, missed) if missed > 0 and math.isfinite(moved) and math.isfinite(missed) else None
+
+
+def _is_lost(run: FittedRun) -> bool:
+    """Whether the free run misses the data by more than an unrelated motion of the same spread would, √2 of it."""
+    q = run.data.q / run.data.balance
+    missed = (run.prediction.detach().to(q) / run.data.balance - q).square().mean()
+    return not bool(missed <= 2 * (q - q.mean(0)).square().mean())
 
 
 def longest_step(run: FittedRun) -> float:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from torch import Tensor
+
 from herglotz.data import Trajectories
 from herglotz.data.holds import Arrival
 from herglotz.models import ContactLagrangian
@@ -26,6 +28,8 @@ class FittedRun(Protocol):
     def data(self) -> Trajectories: ...  # noqa: D102
     @property
     def states(self) -> State: ...  # noqa: D102
+    @property
+    def prediction(self) -> Tensor: ...  # noqa: D102
     @property
     def reading(self) -> dict[str, Any]: ...  # noqa: D102
     @property
