@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DATA = ROOT.parent / "shared" / "data"  # measured recordings; data/README.md says where to get them
 DIGITS = 6  # significant ones of a stored number: more than any table shows
-COLOURS, DPI = 256, 100  # of pictures: enough for lines and text, half the size
+COLOURS, DPI = 32, 100  # of pictures: enough for lines and text, half the size
 
 
 def parser(text: str | None, *, quick: bool = False) -> argparse.ArgumentParser:
@@ -182,6 +182,6 @@ def picture(figure: Any, path: Path) -> None:
 
     whole, small = io.BytesIO(), io.BytesIO()
     figure.savefig(whole, format="png", dpi=DPI)
-    image = Image.open(whole).convert("RGB").quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    image = Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
     image.save(small, format="png", optimize=True)
     write_atomically(path, small.getvalue())

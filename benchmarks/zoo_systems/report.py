@@ -131,12 +131,14 @@ def _cells(row: Row, methods: Sequence[str], attained: bool) -> list[Any]:
     """A line of the table."""
     ours = row["ours"]
     how = "/".join(str(ours[name]) for name in ("level", "objective") if name in ours)
+    verdict = str(ours.get("verdict") or ours["said"]).split(":")[0]
+    warned = "; predict warns of its range" if ours["said"].startswith("predict") else ""
     return [
         row["index"], row["name"], f"{row['trajectories']} × {row['samples'] // row['trajectories']}",
         f"**{row['outcome']}**" if row["outcome"] == SILENT else row["outcome"],
         *(f"{shown(row[name]['score'])} ({shown(row[name]['relative'])})" for name in methods),
         *([f"{row['attainable']:.3g}"] if attained else []),
-        f"{ours['cpu_s']:.0f}", f"{how} {ours['said'] or ours.get('verdict') or ''}".strip(),
+        f"{ours['cpu_s']:.0f}", f"{how} {verdict}{warned}".strip(),
     ]  # fmt: skip
 
 
