@@ -7,6 +7,8 @@ import torch
 
 from herglotz import fit
 from herglotz.data import Trajectories
+from herglotz.training.config import FitConfig
+from herglotz.training.disagreeing import _followed
 
 
 def _drops(seed: int, count: int, samples: int, bad: int, wrong: float = 0.25) -> Trajectories:
@@ -66,3 +68,12 @@ def _swing(amplitude: float) -> torch.Tensor:
         q += 0.005 * v
         v -= 0.0025 * 9.81 * math.sin(q)
     return torch.tensor(found, dtype=torch.float64)
+
+
+def test_recordings_are_judged_by_what_a_fit_uses():
+    # fails if a model that breaks off where it was not fitted calls the recording something else, or if of a recording
+    # that is held out whole the three samples of its start decide
+    config = FitConfig(train_fraction=2 / 3)
+    assert _followed(_drops(0, 3, 60, bad=3), config).lengths == (40, 40, 40)
+    assert _followed(_drops(0, 3, 13, bad=3), config).lengths == (13, 13, 13)
+    assert _followed(_drops(0, 3, 60, bad=3), FitConfig(train_fraction=1.0)).lengths == (60, 60, 60)

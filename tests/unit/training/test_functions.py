@@ -54,6 +54,16 @@ def ended(search):
     return with_functions(search, named)
 
 
+def near(data):
+    """A search whose named terms end near the data, and that model."""
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    named = search.run()
+    assert named is not None
+    assert named.near
+    assert not named.at_the_noise
+    return search, named
+
+
 STARTS = [(0.9, 0.0), (-0.7, 0.6), (0.5, -0.9), (-0.4, 0.2)]
 
 
@@ -318,11 +328,7 @@ def test_functions_join_a_model_that_is_near_the_data(monkeypatch):
     monkeypatch.setattr("herglotz.training.function_search._anew", lambda _: pytest.fail("made anew"))
     dent = lambda q: (q - 0.4) * np.exp(-(((q - 0.4) / 0.3) ** 2) / 2)  # noqa: E731
     data = recorded(lambda q, v: -np.sin(q) + dent(q) - 0.1 * v, STARTS, angle=True)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    named = search.run()
-    assert named is not None
-    assert named.near
-    assert not named.at_the_noise
+    search, named = near(data)
     found = with_functions(search, named)
     assert found.at_the_noise
     assert found.taken & set(found.fitter.functions)
@@ -346,11 +352,7 @@ def test_functions_join_all_at_once_where_none_does_alone(monkeypatch):
         return forces / (length**2 + slope**2)
 
     data = recorded(acceleration, [(1.9, 0.3)], angle=True, h=0.14, noise=0.0)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    named = search.run()
-    assert named is not None
-    assert named.near
-    assert not named.at_the_noise
+    search, named = near(data)
     found = with_functions(search, named)
     assert found.at_the_noise
     assert "mass(q1) 1" in found.taken

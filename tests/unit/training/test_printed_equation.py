@@ -4,7 +4,7 @@ import math
 import re
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace
 from herglotz.training.equation import equation_of
-from herglotz.training.equation_notes import notes_of
+from herglotz.training.equation_notes import _is_lost, notes_of
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.identifiability import joint_of
 from herglotz.training.recorded_range import box_of
@@ -259,3 +259,11 @@ def test_an_equation_survives_its_file():
     old = {key: value for key, value in stored.items() if key != "notes"}
     old["terms"] = [{key: x for key, x in term.items() if key != "alone"} for term in old["terms"]]
     assert "with x in rad" in str(type(equation).from_dict(old))
+
+
+def test_a_motion_that_leaves_the_world_has_no_departure():
+    # fails if steps are halved along a motion that says nothing of the equation: that took minutes
+    q = torch.linspace(-1.0, 1.0, 21, dtype=torch.float64)[:, None]
+    data = Trajectories.of(torch.arange(21).double(), q, angles=(False,))
+    lost = [_is_lost(cast(Any, SimpleNamespace(data=data, prediction=x))) for x in (q, -0.4 * q, -q, 1e20 * q, q / 0)]
+    assert lost == [False, False, True, True, True]
