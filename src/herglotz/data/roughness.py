@@ -11,6 +11,7 @@ from herglotz.data.checks import offsets_of
 from herglotz.data.gaps import complete
 from herglotz.data.splits import SHOWN
 from herglotz.data.trajectories import Trajectories
+from herglotz.data.window_polynomials import powers, pseudo_inverses
 
 # A polynomial of this degree is fitted to so many samples in a row.
 SAMPLES, DEGREE = SHOWN, 5
@@ -58,8 +59,8 @@ def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> T
     rows = rows[:: -(-len(rows) // MAX_WINDOWS)].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device)
     t, q = t[rows].double().cpu(), q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
-    Q = torch.linalg.qr(torch.stack([x**k for k in range(degree + 1)], -1)).Q
-    r = q - Q @ (Q.mT @ q)
+    inverses = pseudo_inverses(x, degree)
+    r = q - powers(x[: len(inverses)], degree) @ (inverses @ q)
     return (r.square().mean((0, 1)) * SAMPLES / (SAMPLES - degree - 1)).sqrt()
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
+from herglotz.data.window_polynomials import powers, pseudo_inverses
 from herglotz.data.windows import Triples
 
 # Even: at the middle of a window an odd power adds nothing to position and acceleration.
@@ -62,8 +63,8 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     # A residual beyond the noise keeps its sign over a window, and enters the acceleration whole; noise averages out.
     width, degree, _, _ = min(fair, key=lambda x: (noise + x[0] * (x[2] - noise)) * x[3])
     rows = _windows(data, width)
-    half, A = _design(data, rows, degree)
-    coefficients = _inverse(A) @ data.q[rows].double()
+    half, x = _times(data, rows)
+    coefficients = pseudo_inverses(x, degree) @ data.q[rows].double()
     middle = rows[:, width // 2] == torch.arange(data.samples)
     return LocalPolynomials(width, coefficients, half, middle, rows)
 
@@ -93,22 +94,20 @@ def smooth_triples(data: Trajectories, local: LocalPolynomials) -> tuple[Triples
 
 def _quality(data: Trajectories, width: int, degree: int) -> tuple[float, float]:
     """Mean squared residual per degree of freedom, and the squared factor of the noise in the acceleration."""
-    rows = _windows(data, width)
-    inside = rows[:, width // 2] == torch.arange(data.samples)
-    rows = rows[inside]
-    rows = rows[:: -(-len(rows) // MAX_WINDOWS)]
-    half, A = _design(data, rows, degree)
+    # Samples with a window around them.
+    ends = [
+        torch.arange(first, first + length)[width // 2 : length - width // 2]
+        for first, length in zip(data.offsets, data.lengths, strict=True)
+    ]
+    middle = torch.cat(ends)
+    middle = middle[:: -(-len(middle) // MAX_WINDOWS)]
+    rows = middle[:, None] + torch.arange(width) - width // 2
+    half, x = _times(data, rows)
     q = data.q[rows].double()
-    inverse = _inverse(A)
-    left = (q - A @ (inverse @ q)).square().mean() * width / (width - degree - 1)
+    inverse = pseudo_inverses(x, degree)
+    left = (q - powers(x[: len(inverse)], degree) @ (inverse @ q)).square().mean() * width / (width - degree - 1)
     gain = (2 * inverse[:, 2] / half[:, None].square()).square().sum(1).mean()
     return float(left), float(gain)
-
-
-def _inverse(A: Tensor) -> Tensor:
-    """The pseudo-inverse of tall matrices of full rank."""
-    Q, R = torch.linalg.qr(A)
-    return torch.linalg.solve_triangular(R, Q.mT, upper=True)
 
 
 def _windows(data: Trajectories, width: int) -> Tensor:
@@ -120,10 +119,9 @@ def _windows(data: Trajectories, width: int) -> Tensor:
     return torch.cat(parts)
 
 
-def _design(data: Trajectories, rows: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """Half the span of each window, and its powers of time, (N, width, degree + 1)."""
+def _times(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Half the span of each window (N,), and its times around that of its sample, over that (N, width)."""
     t = data.t[rows].double()
     own = data.t.double()[torch.arange(data.samples)] if len(rows) == data.samples else t[:, rows.shape[1] // 2]
     half = (t[:, -1] - t[:, 0]) / 2
-    x = (t - own[:, None]) / half[:, None]
-    return half, torch.stack([x**k for k in range(degree + 1)], -1)
+    return half, (t - own[:, None]) / half[:, None]

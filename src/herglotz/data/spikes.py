@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
-from herglotz.least_squares import least_squares
+from herglotz.data.window_polynomials import powers, pseudo_inverses
 
 # A sample is compared with the polynomial of degree 3 through four neighbours on either side.
 BESIDE, DEGREE = 4, 3
@@ -90,9 +90,8 @@ def _worst(t: Tensor, q: Tensor, size: Tensor, run: int) -> Tensor:
     inside = (place >= BESIDE) & (place < BESIDE + run)
     x = times - times[:, BESIDE : BESIDE + 1]
     x = x / x.abs().amax(1, keepdim=True)
-    A = torch.stack([x**k for k in range(DEGREE + 1)], -1)
-    c = least_squares(A[:, ~inside], values[:, ~inside])
-    r = A @ c - values
+    c = pseudo_inverses(x[:, ~inside], DEGREE) @ values[:, ~inside]
+    r = powers(x, DEGREE) @ c - values
     miss = r[:, inside].abs().amin(1)  # (W, n): the smallest departure in the run
     local = (r[:, ~inside].square().sum(1) / (2 * BESIDE - DEGREE - 1)).sqrt()
     noise = 1.4826 * r[:, inside].abs().amax(1).median(0).values
