@@ -121,9 +121,9 @@ class Ways:
     def of(self, arrival: Arrival) -> Way:
         """An arrival with its errors."""
         u = self.pieces(arrival.hold).acting(*arrival.late)
-        u = replace(self.all, u=u, hold=arrival.hold).inputs_of_steps()
+        u = replace(self.all, u=u, hold=arrival.hold).inputs_of_steps(self.rows)
         assert u is not None
-        return Way(arrival, self.problem.errors(u[self.rows]))
+        return Way(arrival, self.problem.errors(u))
 
     def along(self, axis: tuple[int, int], plain: Arrival) -> Way:
         """The best delay, or the best lag."""

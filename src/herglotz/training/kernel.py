@@ -42,7 +42,9 @@ from herglotz.training.parameter_vector import ParameterVector
 
 RUNTIME = Path(herglotz.__file__).parent / "codegen" / "runtime"
 MAX_PARAMETERS = 300  # of a kernel: three joints with all their terms have 206, and gcc takes 5 s for them
-LEVEL = "-O1"  # long straight lines of sums and products gain nothing from -O3, which takes 13 times as long
+# Long straight lines of sums and products gain nothing from -O3, which takes 13 times as long, and much from fused
+# multiply-adds, which gcc's -O1 leaves out.
+LEVEL = ("-O1", "-fexpensive-optimizations")
 # Rooms, and files beside this one, whose sources decide what a kernel computes.
 MADE_OF = ("models", "mechanics", "stepping", "codegen")
 OWN = ("kernel.py", "parameter_vector.py")

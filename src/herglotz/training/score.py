@@ -138,9 +138,10 @@ def _scale(r: Tensor) -> Tensor:
     squared, v = r.square(), FREEDOM
     tiny = torch.finfo(r.dtype).tiny
     s = squared.median(1, keepdim=True).values.clamp_min(tiny)
+    # Σ w r² / Σ w with the weights w = 1 / (v + r²/s).
     for _ in range(ROUNDS):
-        weight, before = 1 / (v + squared / s), s
-        s = ((weight * squared).sum(1, keepdim=True) / weight.sum(1, keepdim=True)).clamp_min(tiny)
+        before = s
+        s = (r.shape[1] / (squared + v * s).reciprocal_().sum(1, keepdim=True) - v * s).clamp_min(tiny)
         if bool(((s - before).abs() <= SETTLED * s).all()):
             break
     return s.sqrt()

@@ -27,7 +27,7 @@ from herglotz.training.held_out import HeldOut
 from herglotz.training.named_terms import DRY, candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import ALWAYS, offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import segment_grid, segment_lengths
+from herglotz.training.problems.grid import Grids, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.robust import scale_of
 from herglotz.training.problems.shooting import ShootingProblem
@@ -221,6 +221,7 @@ class Fitter:
         lengths = segment_lengths(data)
         self.lengths = [*(length for length in SHORT if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
+        self.grids = Grids(data) if like is None else like.grids  # the same for all variants
         self.floor = ALIKE * EXACT["float64"] * max(base.scale)
         self.offered = len(every_offer)
         known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
@@ -247,9 +248,9 @@ class Fitter:
     def problem(self, length: int) -> ShootingProblem:
         """Of all numbers."""
         if length not in self.problems:
-            grid = segment_grid(self.data, length, self.base.model_step)
-            sigma = min(max(self.precision, self.floor), self.spread)
-            self.problems[length] = ShootingProblem(self.model, self.data, grid, sigma=sigma, freedom=self.freedom)
+            grid, u = self.grids.of(length, self.base.model_step)
+            own = {"sigma": min(max(self.precision, self.floor), self.spread), "freedom": self.freedom}
+            self.problems[length] = ShootingProblem(self.model, self.data, grid, u=u, **own)
         return self.problems[length]
 
     def numbers(self, taken: Iterable[str]) -> list[str]:

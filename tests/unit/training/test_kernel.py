@@ -136,7 +136,8 @@ def test_pieces_add_up_to_the_whole(length, monkeypatch):
     one, other = (problem.compiled.run(theta, problem.with_s(starts), problem._observed(), of) for of in (sums, None))
     assert one is not None
     assert other is not None
-    assert torch.equal(one, other)
+    # Fused multiply-adds round the end of a step in another way where its derivatives are made beside it.
+    assert float((one - other).abs().max()) <= 1e-14 * float(other.abs().max())
     assert float((dense(whole[1]) - dense(pieces[1])).abs().max()) <= 1e-12 * float(dense(whole[1]).abs().max())
     assert float((whole[2] - pieces[2]).abs().max()) <= 1e-12 * float(whole[2].abs().max())
 

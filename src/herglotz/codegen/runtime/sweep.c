@@ -110,30 +110,34 @@ static int hz_increment(const double x[hz_X], double h, const double *u, const d
   return 1;
 }
 
-/* Z <- A Z + dPhi/dtheta, (D, F + D): the derivatives of the next state by the free parameters and the start. */
-static void hz_carry(const double A[hz_D * hz_D], const double G[hz_D * hz_P], double c, long F, const long *chosen,
-                     double *Z, double *Y) {
+/* Z <- A Z + dPhi/dtheta, (D, F + D): the derivatives of the next state by the free parameters and the start.
+   G becomes its columns of these parameters, (D, F). A parameter acts through F as c p0 does. */
+static void hz_carry(const double *restrict A, double *restrict G, double c, long F, const long *restrict chosen,
+                     double *restrict Z, double *restrict Y) {
   const long W = F + hz_D;
+  double by[hz_D][hz_N];
   long a;
   int i, j;
-  for (i = 0; i < hz_D; i++) {
-    double *y = Y + i * W;
-    for (a = 0; a < W; a++) y[a] = 0;
-    for (j = 0; j < hz_D; j++) {
-      const double by = A[i * hz_D + j], *z = Z + j * W;
-      if (by != 0)
-        for (a = 0; a < W; a++) y[a] += by * z[a];
+  for (i = 0; i < hz_D; i++)
+    for (j = 0; j < hz_N; j++) by[i][j] = A[i * hz_D + hz_N + j] / c;
+  for (i = 0; i < hz_D; i++)
+    for (a = 0; a < F; a++) Y[i * F + a] = G[i * hz_P + chosen[a]];
+  memcpy(G, Y, (size_t)(hz_D * F) * sizeof(double));
+  for (a = 0; a < W; a++) {
+    double z[hz_D], y[hz_D];
+    for (j = 0; j < hz_D; j++) z[j] = Z[j * W + a];
+    for (i = 0; i < hz_D; i++) {
+      y[i] = 0;
+      for (j = 0; j < hz_D; j++) y[i] += A[i * hz_D + j] * z[j];
     }
-    /* A parameter acts through F as c p0 does. */
-    for (j = 0; j < hz_N; j++) {
-      const double by = A[i * hz_D + hz_N + j] / c, *g = G + j * hz_P;
-      if (by != 0)
-        for (a = 0; a < F; a++) y[a] += by * g[chosen[a]];
-    }
-    if (i >= hz_N)
-      for (a = 0; a < F; a++) y[a] += G[i * hz_P + chosen[a]];
+    for (i = 0; i < hz_D; i++) Z[i * W + a] = y[i];
   }
-  for (a = 0; a < hz_D * W; a++) Z[a] = Y[a];
+  for (a = 0; a < F; a++)
+    for (i = 0; i < hz_D; i++) {
+      double more = i >= hz_N ? G[i * F + a] : 0;
+      for (j = 0; j < hz_N; j++) more += by[i][j] * G[j * F + a];
+      Z[i * W + a] += more;
+    }
 }
 
 /* The residuals of a sample, r = weight (q - y), and their rows, both times the root of the robust weight. */

@@ -56,6 +56,22 @@ class SegmentGrid:
         return x.flatten(0, 1)[self.node]
 
 
+class Grids:
+    """Grids of a recording with the inputs of their model steps, (S, K, m), each made once."""
+
+    def __init__(self, data: Trajectories):
+        self.data = data
+        self.made: dict[tuple[int, float], tuple[SegmentGrid, Tensor | None]] = {}
+
+    def of(self, length: int, max_step: float) -> tuple[SegmentGrid, Tensor | None]:
+        """As `segment_grid` divides the recording."""
+        key = length, max_step
+        if key not in self.made:
+            grid = segment_grid(self.data, *key)
+            self.made[key] = grid, self.data.inputs_of_steps(grid.row, grid.part)
+        return self.made[key]
+
+
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
     """Inputs of the steps that start at each sample, (N, m), or of the model steps of a grid, (S, K, m).
 

@@ -6,7 +6,7 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, jacrev
+from torch.func import functional_call
 
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.mass import PositionKinetic
@@ -23,6 +23,7 @@ class JointMasses:
     def __init__(self, parameters: ParameterVector, q: Tensor):
         self.parameters = parameters
         self.q = q[torch.linspace(0, len(q) - 1, FEW, device=q.device).round().long()]
+        self._made: tuple[Tensor, Tensor] | None = None
 
     @property
     def move(self) -> bool:
@@ -31,14 +32,27 @@ class JointMasses:
 
     def at(self, theta: Tensor) -> Tensor:
         """At θ, (n,), positive."""
-        named = self.parameters.unflatten(theta)
-        own = {name: value for name, value in named.items() if name.startswith("kinetic.")}
-        mass = functional_call(_Mass(self.parameters.model.kinetic), own, (self.q,))
-        return mass.diagonal(0, -2, -1).abs().mean(0).clamp_min(torch.finfo(theta.dtype).tiny ** 0.5)
+        return self._graph(theta)[1].detach()
 
     def slopes(self, theta: Tensor) -> Tensor:
         """∂ log mass / ∂θ, (n, P)."""
-        return jacrev(lambda x: self.at(x).log())(theta)
+        own, mass = self._graph(theta)
+        if not mass.requires_grad:
+            return theta.new_zeros(len(mass), len(theta))
+        rows = (torch.autograd.grad(x, own, retain_graph=True)[0] for x in mass)
+        return torch.stack(list(rows)) / mass.detach()[:, None]
+
+    def _graph(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """θ and the masses, as autograd remembers them; made once for a θ, which a fit asks for again."""
+        if self._made is None or not torch.equal(self._made[0], theta):
+            with torch.enable_grad():
+                theta = theta.detach().clone().requires_grad_()
+                named = self.parameters.unflatten(theta)
+                own = {name: value for name, value in named.items() if name.startswith("kinetic.")}
+                mass = functional_call(_Mass(self.parameters.model.kinetic), own, (self.q,))
+                mass = mass.diagonal(0, -2, -1).abs().mean(0).clamp_min(torch.finfo(theta.dtype).tiny ** 0.5)
+            self._made = theta, mass
+        return self._made
 
 
 class _Mass(nn.Module):

@@ -26,7 +26,8 @@ class LeastSquares:
 
     An objective derives `cost` and `normal_equations` (`solvers.levenberg_marquardt.SumOfSquares`) from these parts.
     The parameters of `model` are the start; the model is not changed. `sigma` is the standard deviation of the noise of
-    q over its `balance`, `freedom` the ν of Student's t (`robust`; None: least squares).
+    q over its `balance`, `freedom` the ν of Student's t (`robust`; None: least squares). `u` are the inputs of all
+    steps, or of the model steps of a grid, where these are known.
     """
 
     def __init__(
@@ -37,13 +38,15 @@ class LeastSquares:
         sigma: float,
         prior: Prior | None = None,
         freedom: float | None = None,
+        grid: SegmentGrid | None = None,
+        u: Tensor | None = None,
     ):
         self.parameters, self.data, self.n = ParameterVector(model), data, data.dof
         self.P = len(self.parameters.get())
         self.sigma, self.prior, self.freedom = sigma, prior, freedom
         # Standard deviation of each coordinate, in its unit.
         self.deviations = sigma * data.balance  # (n,)
-        self.u = step_inputs(model, data)  # (N, m)
+        self.u = step_inputs(model, data, grid) if u is None else u  # (N, m), or (S, K, m) of a grid
 
     def loss(self, *residuals: Tensor) -> Tensor:
         """Σ ρ(r) over all residuals, a scalar."""
@@ -72,22 +75,21 @@ class StatesProblem(LeastSquares, ABC):
     """
 
     def __init__(self, model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, **settings: Any):
-        super().__init__(model, data, **settings)
+        super().__init__(model, data, grid=grid, **settings)
         self.grid = grid
         self.d = states_of(model)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())
-        # The masses need the inputs at the samples, (N, m); after that u is per model step.
         self.mass = self._masses(model)  # (n,)
-        self.u = step_inputs(model, data, grid)  # (S, K, m)
 
     def _masses(self, model: ContactLagrangian) -> Tensor:
         """Median of h · diag(mixed Hessian) over steps of the data, (n,); 1 if that is 0 or infinite."""
-        steps, u = self.data.steps(), self.u
+        steps = self.data.steps()
         some = torch.linspace(0, len(steps.h) - 1, min(MASS_STEPS, len(steps.h)), device=steps.h.device).round().long()
         i, h = steps.index[some], steps.h[some]
+        u = self.data.inputs_of_steps(i) if model.inputs else None
         with torch.no_grad():
-            P = partials(model if u is None else model.at(u[i]), self.data.q[i], self.data.q[i + 1], 0 * h, h, 2)
+            P = partials(model if u is None else model.at(u), self.data.q[i], self.data.q[i + 1], 0 * h, h, 2)
             mass = (h[:, None] * mixed_hessian(P).diagonal(0, -2, -1)).abs().median(0).values
         return torch.where(mass.isfinite() & (mass > 0), mass, 1.0)
 
