@@ -14,9 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.data.column_roles import kind_of, name_and_unit
+from herglotz.data.column_roles import kind_of
 from herglotz.data.csv_columns import is_number
 from herglotz.data.gaps import complete
+from herglotz.data.header_cells import name_and_unit
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import check_coordinates, refuse
 from herglotz.least_squares import least_squares
@@ -104,7 +105,8 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
     constant distance decides. The centre of another recording is kept unless a new centre is better by the Bayesian
     information criterion. Raise InputError if a pair does not name coordinates, or momenta are recorded.
     """
-    pairs = [pair for pair in pairs if not pair.inherited or set(pair.columns) <= set(data.names)]
+    names = {f"{name}_{unit}": name for name, unit in zip(data.names, data.units, strict=True)}
+    pairs = [_by_name(pair, names) for pair in pairs if not pair.inherited or set(pair.columns) <= set(data.names)]
     if not pairs:
         return data
     _check(data, pairs)
@@ -137,6 +139,12 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
         data, q=torch.stack(q, 1), observed=None if data.observed is None else torch.stack(observed, 1), v=None,
         names=names, units=units, angles=angles, columns=(*columns, *rows), notes=(*data.notes, *notes),
     )  # fmt: skip
+
+
+def _by_name(pair: Pair, names: dict[str, str]) -> Pair:
+    """The pair with the name of each column that the user gives as its whole cell, `x_m`."""
+    centre = pair.centre and tuple(names.get(c, c) if isinstance(c, str) else c for c in pair.centre)
+    return replace(pair, x=names.get(pair.x, pair.x), y=names.get(pair.y, pair.y), centre=centre)
 
 
 def _check(data: Trajectories, pairs: Sequence[Pair]) -> None:
