@@ -40,7 +40,7 @@ ENDS = (
 # What a unit of two parts begins with, beside lengths and angles: turns in French and German, litres, newtons.
 PARTS = re.compile(r"tr|U|m?[lL]|[km]?N")
 # Units that are letters of bodies or words as well.
-AMBIGUOUS = re.compile(r"[mNAV]|in|cm|km|psi|bar")
+AMBIGUOUS = re.compile(r"[mNAV]|cm|km|psi|bar")
 INDEX = re.compile(r"[^\W_]|\d+")
 
 
@@ -102,7 +102,8 @@ def _may_have(name: str, unit: str) -> bool:
     timed = is_time(name, "") or is_timed(words_of(name))
     length = part == "position" and not ANGLES.fullmatch(base)
     letter = len(unit) == 1 and unit.isalpha() and not AMBIGUOUS.fullmatch(unit)
-    if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed):
+    # x_in is the input beside x_out.
+    if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or base == "in":
         return False
     # A run in mA would number the trajectories.
     return role_of(name, unit).role not in ("trajectory", "action", "momentum", "counter")

@@ -26,7 +26,7 @@ UNITS = {
     # Indices and words. Roles are those of the whole names.
     "theta_m": ("theta_m", "", "coordinate"), "x_A": ("x_A", "", "coordinate"), "q_s": ("q_s", "", "coordinate"),
     "x_g": ("x_g", "", "coordinate"), "x_min": ("x_min", "", "coordinate"), "phi_bar": ("phi_bar", "", "coordinate"),
-    "tau_m": ("tau_m", "", "input"), "voltage_in": ("voltage_in", "", "input"), "motor_cm": ("motor_cm", "", "input"),
+    "tau_m": ("tau_m", "", "input"), "y_in": ("y_in", "", "coordinate"), "motor_cm": ("motor_cm", "", "input"),
     "speed_m": ("speed_m", "", "left aside"), "i_m": ("i_m", "", "coordinate"), "s_A": ("s_A", "", "coordinate"),
     "frame_mm": ("frame_mm", "", "coordinate"), "arm_bar_s": ("arm_bar_s", "", "coordinate"),
 }  # fmt: skip

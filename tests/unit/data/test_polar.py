@@ -1,6 +1,7 @@
 """Positions of bodies on circles become angles: one body, chains, centres that are found, given or known."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ CENTRE = np.array([0.3, 0.8])
 NOISE = 0.001 * np.random.default_rng(0).standard_normal((2, len(T), 2))
 
 
-def arm(angle, length=0.8):
+def arm(angle, length: Any = 0.8):
     return length * np.stack([np.sin(angle), -np.cos(angle)], 1)
 
 

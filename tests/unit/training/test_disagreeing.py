@@ -1,6 +1,7 @@
 """A recording of something else among good ones is left out whole, and named."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -58,10 +59,11 @@ class Fall(torch.nn.Module):
 def test_without_a_search_an_outlier_is_named(given, capsys):
     # fails if a bad recording that nobody looks for is not said, or a good one is said to be bad
     good, data = _drops(2, 6, 13, bad=-1), _drops(0, 6, 13, bad=4)
-    found = fit(good, progress=False, **({"model": Fall()} if given == "model" else {}))
+    own: dict[str, Any] = {"model": Fall()} if given == "model" else {}
+    found = fit(good, progress=False, **own)
     assert not found.metrics["outlying"]
     assert "something else" not in capsys.readouterr().err
-    found = fit(data, progress=False, **({"model": Fall()} if given == "model" else {"plan": found}))
+    found = fit(data, progress=False, **(own or {"plan": found}))
     assert [one["recording"] for one in found.metrics["outlying"]] == [4]
     assert "warning: trajectory 4, counted from 0, may be of something else" in capsys.readouterr().err
     assert "fit once more without it" in " ".join(found.summary().split())
