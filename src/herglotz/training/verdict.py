@@ -92,11 +92,11 @@ def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: flo
     return stages.fit(stages.lengths[0], fitted.sigma, freedom, None)
 
 
-def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool) -> str:
-    """The reason in words that residuals above the noise (`missed`) or else the inputs show; "" if neither does."""
+def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: str = "") -> str:
+    """The reason that residuals above the noise (`missed`) or else the inputs show, or ""; `longer` is a remedy too."""
     reason = _reason_of_residuals(task, fitted, seen.train) if missed else ""
     known = fitted.states[~seen.spikes]
-    return reason or reason_of_inputs(fitted.model, task.data, known, task.base.model_step, missed)
+    return reason or reason_of_inputs(fitted.model, task.data, known, task.base.model_step, missed, longer)
 
 
 def _reason_of_residuals(task: Task, fitted: Fitted, train: Trajectories) -> str:
@@ -267,7 +267,7 @@ def in_words(
     errors: Errors,
     ahead: Foresight | None,
     metrics: dict[str, Any],
-    shown: Callable[[bool], str] = lambda _: "",
+    shown: Callable[..., str] = lambda *_: "",
     bound: str = "",
 ) -> str:
     """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
@@ -310,7 +310,7 @@ def _worse(errors: Errors) -> str:
     return f"{WORSE}{known} by a factor of {errors.worst / errors.limit:.2g}: {errors}"
 
 
-def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[[bool], str]) -> str:
+def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[..., str]) -> str:
     """The verdict on a model that the data do not determine, with the recording that would help."""
     over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.windows > AT_THE_NOISE * errors.limit
     if not ahead.reached:
@@ -321,17 +321,18 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown:
     changes = f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread"
     if missed:
         return f"a force is missing, and others are left open; {errors}. {changes}. {_remedy(metrics, True, shown)}"
-    if reason := shown(False):
-        return f"the inputs leave it open; {errors}. {changes}. {reason}"
     # The uncertainty falls with the root of the number of samples.
     times = (ahead.open / UNCERTAIN) ** 2
-    if times > MAX_ROOT_OF_RECORDINGS**2:
+    enough = times <= MAX_ROOT_OF_RECORDINGS**2
+    longer = f"a recording {max(2, math.ceil(times))} times as long, or several from other starts" if enough else ""
+    if reason := shown(False, longer):
+        return f"the inputs leave it open; {errors}. {changes}. {reason}"
+    if not enough:
         return f"such motions do not tell, however many; {errors}. {changes}. Try other motions: starts, inputs, speeds"
-    longer = f"a recording {max(2, math.ceil(times))} times as long, or several from other starts"
     return f"too little was recorded to tell; {errors}. {changes}. Try {longer}"
 
 
-def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[[bool], str]) -> str:
+def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str]) -> str:
     """The remedy, after the reason if one is shown; `missed`: the training error exceeds the noise."""
     if reason := shown(missed):
         return reason

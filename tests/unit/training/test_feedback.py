@@ -71,8 +71,10 @@ def test_the_reason_is_what_is_measured(stiffness, moved, missed, expected):
 
 
 def test_inputs_that_follow():  # fails if a motion is not the state's, or a signal of its own counts as following
-    _, data, states = balanced(9.0, moved=0.0)
+    model, data, states = balanced(9.0, moved=0.0)
     assert unexplained(data, states) < 0.05
+    said = reason_of_inputs(model, data, states, H, False, "a longer one")
+    assert said.endswith("Try a small random signal on the inputs, or set points that jump, or a longer one")
     signal = torch.randn(K, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert unexplained(replace(data, u=signal), states) > 0.9
 
@@ -81,10 +83,12 @@ def test_the_verdict_says_what_the_inputs_leave():
     # fails if the recording of a balanced motion is said to be too short, or the unseen part to differ from the other
     ahead = Foresight(start=0.0, parameters=0.4, hidden=0.02, name="q1^3", horizon=7.0, reached=True)
     good = {"follows_data": True, "objective": "trajectory"}
-    unstable = lambda _: "It is unstable. Try shorter ones"  # noqa: E731
+    unstable = lambda *_: "It is unstable. Try shorter ones"  # noqa: E731
     said = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), ahead, good, unstable)
     assert said.startswith("does not fit: the inputs leave it open; ")
     assert said.endswith("It is unstable. Try shorter ones")
+    told = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), ahead, good, lambda _, longer: f"Try {longer}")
+    assert told.endswith("Try a recording 16 times as long, or several from other starts")
     lost = in_words(Errors(0.01, 0.01, 2.0, noise=0.01, spread=1.0), ahead, good, unstable)
     assert lost.startswith("does not fit beyond the recording: ")
     assert lost.endswith("It is unstable. Try shorter ones")
