@@ -48,7 +48,7 @@ def reason_of_inputs(
         return ""
     growth = growth_of_noise(model, data, states, max_step)
     lost, unit = growth >= 1, "" if data.time_unit == "1" else data.time_unit
-    if bool(lost.any()) and _held(model, data, states, max_step):
+    if bool(lost.any()) and leaves_without_inputs(model, data, states, max_step):
         since = data.t - data.t[list(data.offsets)][data.trajectory]
         return (
             "The motion is unstable and its inputs hold it: with the inputs as recorded an error of the start as small "
@@ -82,7 +82,7 @@ def growth_of_noise(model: ContactLagrangian, data: Trajectories, states: Tensor
     return (grid.at_samples(moved) / _spread(data)[:, None]).square().sum((1, 2)).div(n).sqrt().nan_to_num(torch.inf)
 
 
-def _held(model: ContactLagrangian, data: Trajectories, states: Tensor, max_step: float) -> bool:
+def leaves_without_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor, max_step: float) -> bool:
     """Whether a run with the mean of the inputs leaves the recorded range by the spread of a coordinate, or fails."""
     assert data.u is not None
     grid, mean = segment_grid(data, data.samples, max_step), replace(data, u=data.u.mean(0).expand_as(data.u))

@@ -10,7 +10,7 @@ import torch
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
-from herglotz.training.feedback import growth_of_noise, reason_of_inputs, unexplained
+from herglotz.training.feedback import growth_of_noise, leaves_without_inputs, reason_of_inputs, unexplained
 from herglotz.training.foresight import Foresight
 from herglotz.training.verdict import Errors, in_words
 
@@ -68,6 +68,13 @@ def test_the_reason_is_what_is_measured(stiffness, moved, missed, expected):
         assert said == pytest.approx(t, rel=0.05)
     assert reason_of_inputs(model, replace(data, u=None), states, H, missed) == ""
     assert reason_of_inputs(model, data, states * math.nan, H, missed) == ""
+
+
+def test_inputs_that_hold_a_motion():
+    # fails if a motion that stays without its inputs, as chaotic ones do, is said to be held by them
+    for stiffness, leaves in ((-9.0, True), (9.0, False)):
+        model, data, states = balanced(stiffness)
+        assert leaves_without_inputs(model, data, states, H) is leaves
 
 
 def test_inputs_that_follow():  # fails if a motion is not the state's, or a signal of its own counts as following
