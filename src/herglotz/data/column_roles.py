@@ -13,17 +13,12 @@ KINDS = {
     "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
     "time": re.compile(r"s|ms|us|µs|μs|ns|min|h|secs?|seconds?|msec|usec"),
     "effort": re.compile(r"[kmMµμ]?N([ *·.⋅]?[cm]?m)?|lbf|kgf"),
-    "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|%|percent"),
+    "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|volts?|amps?|%|percent"),
+    "pressure": re.compile(r"[kMh]?Pa|m?bar|psi|s?lpm|gpm|(m?[lL]|m3|m³)/ ?(s|min|h)"),
     "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
     "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|.+[ ·*]s(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
-    "pressure": re.compile(r"[kMh]?Pa|m?bar|psi"),
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
 }
-HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
-# A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
-TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
-# A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
-SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
 NUMBERED = r"(_?\d+|_.*)?"
 # Names that have a role whatever their words, unless the unit is of another kind.
 ROLES = {
@@ -63,7 +58,7 @@ _WORDS = {
             "comando",
     "side": "error err std sd stderr variance var covariance cov uncertainty residual quality confidence likelihood "
             "temperature temp temperatur temperatura battery batt supply humidity status statusword statuswort valid "
-            "checksum crc leistung puissance potencia potenza fehler regelabweichung erreur errore reward done",
+            "checksum crc power leistung puissance potencia potenza fehler regelabweichung erreur errore reward done",
     "rate": "velocity velocities vel speed rate acceleration acc accel omega gyro jerk dot ddot rpm "
             "geschwindigkeit drehzahl beschleunigung vitesse velocidad aceleracion velocita accelerazione",
     "position": "position positions pos angle angles displacement height elongation location coordinate "
@@ -108,20 +103,6 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     if not kind:
         return _by_words(key, words, others)
     return _in_place(key, unit, words, others) if kind == "position" else _by_unit(key, kind, words)
-
-
-def name_and_unit(cell: str) -> tuple[str, str] | None:
-    """Name and unit of a header's cell, `x[m]`, `x (m)` or `x_deg`; None for any other text."""
-    match = HEADER_CELL.fullmatch(cell)
-    if not match or not cell.isprintable():
-        return None
-    if match[2] is not None or match[3] is not None:
-        return match[1], (match[2] or match[3]).strip()
-    if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
-        return tight[1], tight[2]
-    if ends := SUFFIX.fullmatch(match[1]):
-        return ends[1] or ends[3], (ends[2] or ends[4]).lower().replace("_", "/")
-    return match[1], ""
 
 
 def kind_of(unit: str) -> str:

@@ -19,10 +19,10 @@ from herglotz.data.column_roles import (
     is_timed,
     is_usual,
     kind_of,
-    name_and_unit,
     role_of,
     words_of,
 )
+from herglotz.data.header_cells import heads_of
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
@@ -144,7 +144,7 @@ def assign(cells: Sequence[str], where: str, wanted: Wanted = HEADER_DECIDES) ->
     Raise InputError, which begins with `where` (file and row), if a cell cannot be read, a name comes twice, time or
     all coordinates are missing, or a named column is absent.
     """
-    names, units = _parse(cells, where)
+    names, units = _parse(cells, where, wanted)
     place = {name: i for i, name in enumerate(names)}
     wanted = wanted.by_name(cells, names)
     every = ", ".join(names)
@@ -299,28 +299,23 @@ def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:
     return found[0]
 
 
-def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _parse(cells: Sequence[str], where: str, wanted: Wanted) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names and units of all columns; raise InputError for a cell without a name, and for a name that comes twice."""
-    found = []
-    for i, cell in enumerate(cells):
-        # pandas writes the numbers of the rows into a first column without a name.
-        head = name_and_unit(cell if cell or i else "index" if "index" not in cells else "unnamed: 0")
+    # pandas writes the numbers of the rows into a first column without a name.
+    first = "index" if "index" not in cells else "unnamed: 0"
+    texts = [cell if cell or i else first for i, cell in enumerate(cells)]
+    found = heads_of(texts, {name for name, _, _ in wanted.known})
+    for i, head in enumerate(found):
         if head is None:
-            raise InputError(f"{where}, column {i + 1}: {quote(cell)} is not a header cell; write name or name[unit]")
-        found.append(head)
-    count = Counter(name for name, _ in found)
-    found = [_whole(cell, head[1]) if count[head[0]] > 1 else head for cell, head in zip(cells, found, strict=True)]
-    names, units = tuple(name for name, _ in found), tuple(unit for _, unit in found)
+            raise InputError(
+                f"{where}, column {i + 1}: {quote(cells[i])} is not a header cell; write name or name[unit]"
+            )
+    names, units = (tuple(head[k] for head in found if head) for k in (0, 1))
     for name, count in Counter(names).items():
         refuse({f"{where}: the column {quote(name)} comes twice; rename or delete one": count > 1})
     if all(is_number(name) for name in names):
         raise InputError(f"{where}: the header is missing (only numbers there); add a first line such as t[s],q[rad]")
     return names, units
-
-
-def _whole(cell: str, unit: str) -> tuple[str, str]:
-    """Name and unit of a cell whose name repeats: the brackets of `x (raw)` hold no unit, and `x_deg` is a name."""
-    return (cell.strip(), "" if cell.endswith(")") else unit) if not cell.endswith("]") else (cell.split("[")[0], unit)
 
 
 def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from herglotz.data.column_roles import is_time, kind_of, name_and_unit
+from herglotz.data.column_roles import is_time, kind_of
 from herglotz.data.csv_columns import is_number
+from herglotz.data.header_cells import name_and_unit
 from herglotz.data.rows import MISSING
 from herglotz.errors import InputError
 

@@ -1,7 +1,7 @@
 """Positions x, y of bodies on circles, as cameras see them: one angle for each body, also of chains of bodies.
 
 The angle is θ = atan2(x − x_c, −(y − y_c)): 0 towards −y, growing towards +x, so that a body that hangs from the centre
-is at 0 where y grows upwards.
+is at 0 where y grows upwards. The distance from the centre may be kept as a second coordinate, r.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.data.column_roles import kind_of, name_and_unit
+from herglotz.data.column_roles import kind_of
 from herglotz.data.csv_columns import is_number
 from herglotz.data.gaps import complete
+from herglotz.data.header_cells import name_and_unit
+from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import check_coordinates, refuse
 from herglotz.least_squares import least_squares
@@ -38,7 +40,7 @@ class Pair:
     """Two columns that hold the position of a body, and the centre of its circle.
 
     A sign is −1 if its axis grows the other way. The centre is two columns, two numbers in the unit of the columns, or
-    None: to be found. `inherited` marks a centre from another recording.
+    None: to be found. `inherited` marks a centre from another recording; `distance`: r is a coordinate too.
     """
 
     x: str
@@ -46,6 +48,7 @@ class Pair:
     signs: tuple[float, float] = (1.0, 1.0)
     centre: tuple[str, str] | tuple[float, float] | None = None
     inherited: bool = False
+    distance: bool = False
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -55,7 +58,7 @@ class Pair:
     def spec(self, centre: Sequence[str | float]) -> str:
         """The pair as text for `polar=`, with this centre."""
         (x, y), ends = self.axes(), map(str, centre)
-        return ",".join([x.removeprefix("+"), y.removeprefix("+"), *ends])
+        return ",".join([x.removeprefix("+"), y.removeprefix("+"), *ends, *["r"] * self.distance])
 
     def axes(self) -> tuple[str, str]:
         """Both columns with their signs."""
@@ -65,7 +68,8 @@ class Pair:
 def pairs_of(polar: str | Sequence[str] | None, like: Trajectories | None = None) -> list[Pair]:
     """The pairs of the user, `x,y` or `x,y,CENTRE_X,CENTRE_Y` each, or the pairs of another recording.
 
-    Raise InputError if a text does not name two columns.
+    `x,y,CENTRE_X,CENTRE_Y,r` keeps the distance from the centre, which no circle then shows. Raise InputError if a text
+    does not name two columns.
     """
     if polar is None:
         specs = [] if like is None else [unit for _, role, unit in like.columns if role == POLAR]
@@ -82,9 +86,11 @@ def named_by(polar: str | Sequence[str] | None) -> tuple[str, ...]:
 def _pair(text: str) -> Pair:
     """The pair that a text names; raise InputError if the text is no pair of columns."""
     parts = [part.strip() for part in text.split(",")]
+    distance = len(parts) == 5 and parts[-1] == "r"
+    parts = parts[: len(parts) - distance]
     signs = tuple(-1.0 if part.startswith("-") else 1.0 for part in parts[:2])
     axes = [name_and_unit(part.removeprefix("-")) for part in parts[:2]]
-    how = "write x,y or, with the centre of the circle in numbers or columns, x,y,X,Y"
+    how = "write x,y or, with the centre of the circle in numbers or columns, x,y,X,Y; x,y,X,Y,r keeps the distance"
     refuse({f"polar: {text!r} is no pair of columns; {how}": len(parts) not in (2, 4) or None in axes
             or axes[0] == axes[-1]})  # fmt: skip
     x, y = (name for name, _ in filter(None, axes))
@@ -94,7 +100,7 @@ def _pair(text: str) -> Pair:
         return Pair(x, y, signs)  # type: ignore[arg-type]
     heads = [(name_and_unit(part) or (part, ""))[0] for part in parts[2:]]
     centre = tuple(map(float, parts[2:])) if numbers[0] else tuple(heads)
-    return Pair(x, y, signs, centre)  # type: ignore[arg-type]
+    return Pair(x, y, signs, centre, distance=distance)  # type: ignore[arg-type]
 
 
 def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
@@ -104,7 +110,8 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
     constant distance decides. The centre of another recording is kept unless a new centre is better by the Bayesian
     information criterion. Raise InputError if a pair does not name coordinates, or momenta are recorded.
     """
-    pairs = [pair for pair in pairs if not pair.inherited or set(pair.columns) <= set(data.names)]
+    names = {f"{name}_{unit}": name for name, unit in zip(data.names, data.units, strict=True)}
+    pairs = [_by_name(pair, names) for pair in pairs if not pair.inherited or set(pair.columns) <= set(data.names)]
     if not pairs:
         return data
     _check(data, pairs)
@@ -113,7 +120,8 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
     new: dict[str, tuple[str, Tensor, str, bool, Tensor]] = {}
     bodies: list[tuple[Pair, Tensor]] = []
     rows, notes = [], []
-    for pair, name in zip(pairs, _names(data, pairs), strict=True):
+    named = zip(pairs, _names(data, pairs, "theta"), _names(data, pairs, "r"), strict=True)
+    for pair, name, radius in named:
         body = _positions(data, pair, (pair.x, pair.y))
         centre, spec, where = _centre(data, pair, body, bodies)
         arm = body - centre
@@ -126,6 +134,12 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
         new[pair.x] = (name, angle, "rad", True, read)
         rows.append((name, POLAR, spec))
         notes.append(_note(data, pair, name, where, r[data.complete], angle))
+        unit = data.units[data.names.index(pair.x)]
+        if pair.distance:
+            new[pair.y] = (radius, r, unit, False, read)
+            rows.append((radius, "distance", unit))
+        else:
+            notes += _changes(data, pair, r, read)
         bodies.append((pair, body))
     # A column that is both a position and a centre belongs to the pair of the position.
     angle_of = {column: new[pair.x][0] for pair in pairs for column in pair.columns}
@@ -137,6 +151,12 @@ def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
         data, q=torch.stack(q, 1), observed=None if data.observed is None else torch.stack(observed, 1), v=None,
         names=names, units=units, angles=angles, columns=(*columns, *rows), notes=(*data.notes, *notes),
     )  # fmt: skip
+
+
+def _by_name(pair: Pair, names: dict[str, str]) -> Pair:
+    """The pair with the name of each column that the user gives as its whole cell, `x_m`."""
+    centre = pair.centre and tuple(names.get(c, c) if isinstance(c, str) else c for c in pair.centre)
+    return replace(pair, x=names.get(pair.x, pair.x), y=names.get(pair.y, pair.y), centre=centre)
 
 
 def _check(data: Trajectories, pairs: Sequence[Pair]) -> None:
@@ -168,7 +188,7 @@ def _centre(
         return _positions(data, pair, names), pair.spec(names), ", ".join(names)
     found: list[tuple[float, Tensor, str, str]] = []
     read = body[data.complete]
-    if pair.centre is None or pair.inherited:
+    if pair.centre is None or (pair.inherited and not pair.distance):
         fixed = circle(read)
         found.append((_criterion(read - fixed, 2), fixed, *_words(data, pair, fixed)))
     if pair.centre is not None:
@@ -208,11 +228,26 @@ def _note(data: Trajectories, pair: Pair, name: str, where: str, r: Tensor, angl
     return f"{name} is the angle of {pair.x}, {pair.y} about {where}, at {size}; {zero}"
 
 
-def _names(data: Trajectories, pairs: Sequence[Pair]) -> list[str]:
+def _changes(data: Trajectories, pair: Pair, r: Tensor, read: Tensor) -> list[str]:
+    """A warning if the distances (N,) move by more than their noise; `read` (N,) is 0 where there is none."""
+    one = replace(data, q=r[:, None], names=("r",), units=("1",), angles=(False,), v=None,
+                  observed=None if data.observed is None else read[:, None])  # fmt: skip
+    noise, moved = precision(one), float(r[data.complete].std(correction=0))
+    if moved <= max(AT_THE_NOISE * noise, ROUNDING * float(r.mean())):
+        return []
+    unit, spec = _unit(data, pair), replace(pair, distance=True).spec(pair.centre or ("X", "Y"))
+    where = "" if pair.centre else ", with the centre in numbers or columns,"
+    return [
+        f"warning: the distance of {pair.x}, {pair.y} from there changes by {moved:.2g}{unit}, and its noise is "
+        f"{noise:.2g}{unit}; if a length changes: --polar {spec}{where} keeps it as a coordinate r"
+    ]
+
+
+def _names(data: Trajectories, pairs: Sequence[Pair], usual: str) -> list[str]:
     """`theta`, or `theta1`, `theta2`, … for several pairs; extended by the name of x if a coordinate has that name."""
     others = set(data.names) - {name for pair in pairs for name in pair.columns}
-    usual = ["theta"] if len(pairs) == 1 else [f"theta{k + 1}" for k in range(len(pairs))]
-    return [name if name not in others else f"{name}_{pair.x}" for name, pair in zip(usual, pairs, strict=True)]
+    found = [usual] if len(pairs) == 1 else [f"{usual}{k + 1}" for k in range(len(pairs))]
+    return [name if name not in others else f"{name}_{pair.x}" for name, pair in zip(found, pairs, strict=True)]
 
 
 def circle(x: Tensor) -> Tensor:

@@ -88,7 +88,7 @@ def load(
     polar
         Pairs of positions that become one angle each (`herglotz.data.polar`): "x,y" of a body on a circle, or
         ["x1,y1", "x2,y2"] of a chain, the second body on the first; "x,y,X,Y" with the centre in numbers or columns;
-        "x,-y" where y grows downwards. Left out: as in `like`; () for none.
+        "x,y,X,Y,r" keeps the distance r; "x,-y" where y grows downwards. Left out: as in `like`; () for none.
     input_terms
         Further inputs made of the recorded inputs (`herglotz.data.input_terms`): "V^2", "|V|", "V'", "sat(V/2)",
         "tanh(V/2)". Left out: as in `like`; () for none.

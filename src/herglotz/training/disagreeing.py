@@ -6,6 +6,9 @@ that more than half of its samples are. A bad recording may have bent the model 
 model is not at the noise, the recording whose accelerations are least like the others' is left out if the whole
 dictionary would follow the others to their noise. The model is then found anew. What is left out stays so if the others
 agree, whose model is at their noise, and if it is an outlier of that model. Most recordings have to agree.
+
+Where no terms are searched (more than three coordinates, a given plan, own terms) nothing is left out: an outlier of
+the finished model is named (`outlying`).
 """
 
 from __future__ import annotations
@@ -76,6 +79,22 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
     return whole, ()
 
 
+def searched(seen: Look) -> bool:
+    """Whether a search found named terms, by which recordings can be left out."""
+    return seen.found is not None and seen.found.sigma is not None
+
+
+def outlying(seen: Look, model: ContactLagrangian, sigma: float) -> tuple[LeftOut, ...]:
+    """The recording that a finished model misses most, if it is an outlier; () if none is, or of two recordings."""
+    if len(seen.data) < 3:
+        return ()
+    missed = _missed_by(seen, model, sigma, _followed(seen.data, seen.settings))
+    scale = [scale_of(own) for own in missed]
+    worst = max(range(len(scale)), key=lambda b: scale[b])
+    least = _scale(missed, [b for b in range(len(scale)) if b != worst], seen)
+    return (LeftOut(worst, scale[worst], least),) if scale[worst] > TAIL * least else ()
+
+
 def _scale(missed: Sequence[Tensor], recordings: Sequence[int], seen: Look) -> float:
     """The scale of the misfit of these recordings; smaller errors than the verdict counts are none."""
     return max(scale_of(torch.cat([missed[b] for b in recordings])), EXACT_ENOUGH * relative_spread(seen.data))
@@ -119,9 +138,14 @@ def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] 
     """
     if len(data) < 3 or seen.found is None or seen.found.sigma is None or (out and seen.zeros):
         return None
-    read, model = _followed(read_like(data, seen), seen.settings), seen.task(Stages()).build("none")
-    together = _misfit(seen, model, read)
-    each = [_misfit(seen, model, one) for one in read] if together is None else together.split(read.lengths)
+    read = _followed(read_like(data, seen), seen.settings)
+    return _missed_by(seen, seen.task(Stages()).build("none"), seen.found.sigma, read)
+
+
+def _missed_by(seen: Look, model: ContactLagrangian, sigma: float, read: Trajectories) -> list[Tensor]:
+    """The same of a model and of recordings as the look has read its own."""
+    together = _misfit(seen, model, sigma, read)
+    each = [_misfit(seen, model, sigma, one) for one in read] if together is None else together.split(read.lengths)
     known = read.complete.split(read.lengths)
     return [
         read.q.new_full((1,), torch.inf) if own is None else (own / read.balance)[there].flatten().abs()
@@ -137,10 +161,9 @@ def _followed(data: Trajectories, settings: FitConfig) -> Trajectories:
     return data.keep(leading(data.lengths, kept).to(data.q.device))
 
 
-def _misfit(seen: Look, model: ContactLagrangian, data: Trajectories) -> Tensor | None:
+def _misfit(seen: Look, model: ContactLagrangian, sigma: float, data: Trajectories) -> Tensor | None:
     """Misfit of segments that start anew, (N, n) in units of q; None if a step fails."""
-    assert seen.found is not None
     config = replace(seen.settings, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(seen.task(Stages()), data=data, config=config), model, frozen=True)
-    found = stages.fit(stages.lengths[0], seen.found.sigma or 0.0, FREEDOM, None)
+    found = stages.fit(stages.lengths[0], sigma, FREEDOM, None)
     return None if found is None else found.problem.misfit(found.path) * data.balance

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
-from herglotz.training.disagreeing import look_at_agreeing
+from herglotz.training.disagreeing import look_at_agreeing, outlying, searched
 from herglotz.training.distributed import is_first
 from herglotz.training.equation import equation_of
 from herglotz.training.equation_notes import notes_of
@@ -40,7 +41,7 @@ from herglotz.training.push import pushes
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages
-from herglotz.training.summary import left_out_of
+from herglotz.training.summary import left_out_of, outlying_of
 from herglotz.training.tensorboard import log_result, tensorboard_log
 from herglotz.training.uncertainty import laplace
 
@@ -167,6 +168,7 @@ def _fit_own(
     started = time.perf_counter()
     run = fit_own(data, model, config, Stages(progress))
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
+    _tell_outlying(run.metrics, data)
     return replace(run, reading=reading_told(reading, data.names))
 
 
@@ -193,7 +195,10 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         plan = plan or choose(seen, config)
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
-        run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
+        fitted = OBJECTIVES[plan.objective](task, seen, plan)
+        found["outlying"] = [] if searched(seen) else [x._asdict() for x in outlying(seen, fitted.model, fitted.sigma)]
+        _tell_outlying(found, data)
+        run = evaluate(task, seen, plan, fitted, config)
     if seen.found is not None and plan.network == "none":
         run.metrics["compared"] = list(seen.found.compared)
     run.metrics.update(found)
@@ -202,6 +207,11 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
     run.metrics["verdict"] = ". ".join(filter(None, (run.metrics["verdict"], pushes(run, joint))))
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
+
+
+def _tell_outlying(metrics: Mapping[str, Any], data: Trajectories) -> None:
+    for words in outlying_of(metrics, data):
+        tell(f"{data.source or 'data'}: warning: {words}")
 
 
 def _joint(run: Run, plan: Plan, least: float) -> Joint | None:

@@ -17,6 +17,7 @@ from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.models import OwnLagrangian
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.disagreeing import outlying
 from herglotz.training.evaluate import evaluate
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.look import Look, split
@@ -48,7 +49,8 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
         _try_derivatives(model, task.data)
         fitted = _fitted(replace(task, data=task.data.to(device=config.device)), model.to(device=config.device))
         run = evaluate(task, seen, None, fitted, replace(config, objective=fitted.objective))
-    run.metrics.update(level=model.config.level, own=model.config.name)
+        found = [one._asdict() for one in outlying(seen, fitted.model, fitted.sigma)]
+    run.metrics.update(level=model.config.level, own=model.config.name, outlying=found)
     return run
 
 

@@ -27,6 +27,7 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
     found = [
         ("data", as_recorded(data)[0].summary()),
         ("left out", "; ".join(left_out_of(m, data))),
+        ("outlier", "; ".join(outlying_of(m, data))),
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {level}"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
@@ -37,6 +38,17 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
         ("time", _told(m.get("seconds"), "s")),
     ]
     return [(name, value) for name, value in found if value]
+
+
+def outlying_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
+    """The recording that stands out where none was left out, with what to do."""
+    unit = common_unit(data.units)
+    return [
+        f"trajectory {one['recording']}, counted from 0, may be of something else: the model misses it by "
+        f"{size(one['missed'], unit, digits=2)}, and the others by {size(one['others'], unit, digits=2)}; without a "
+        "search for terms nothing is left out: fit once more without it"
+        for one in metrics.get("outlying", ())
+    ]
 
 
 def left_out_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -30,6 +31,7 @@ from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, coarse, precision, pr
 from herglotz.data.splits import enough
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
+from herglotz.training.feedback import HALF, reason_of_inputs
 from herglotz.training.flow import motion
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.look import Look
@@ -54,8 +56,6 @@ LOST = ((0.1, 3.0), (0.05, 10.0))
 APART = 20.0
 # Standard deviations of a free run, by the uncertainty of its start, within which a loss of the motion is no error.
 CHANCE = 3.0
-# Share of the spread. Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
-HALF = 0.5
 # Standard errors by which a free run has to be better than the mean of the data.
 CLEARLY = 2.0
 # Most recordings of the same kind, as the root of their number: nobody records 900 times as much.
@@ -92,7 +92,14 @@ def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: flo
     return stages.fit(stages.lengths[0], fitted.sigma, freedom, None)
 
 
-def _shown_reason(task: Task, fitted: Fitted, train: Trajectories) -> str:
+def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: str = "") -> str:
+    """The reason that residuals above the noise (`missed`) or else the inputs show, or ""; `longer` is a remedy too."""
+    reason = _reason_of_residuals(task, fitted, seen.train) if missed else ""
+    known = fitted.states[~seen.spikes]
+    return reason or reason_of_inputs(fitted.model, task.data, known, task.base.model_step, missed, longer)
+
+
+def _reason_of_residuals(task: Task, fitted: Fitted, train: Trajectories) -> str:
     """The reason of a misfit in words, from the residuals of the training part; "" if they show none.
 
     If steps are so short that noise hides the curvature, every second, fourth, … sample is tried.
@@ -238,7 +245,7 @@ def judged(
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)
     kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
-    shown = lambda: _shown_reason(task, fitted, seen.train)  # noqa: E731
+    shown = partial(_shown_reason, task, fitted, seen)
     return {"verdict": in_words(errors, ahead, metrics, shown, bound(kept))} | kept_numbers
 
 
@@ -260,13 +267,13 @@ def in_words(
     errors: Errors,
     ahead: Foresight | None,
     metrics: dict[str, Any],
-    shown: Callable[[], str] = lambda: "",
+    shown: Callable[..., str] = lambda *_: "",
     bound: str = "",
 ) -> str:
     """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
 
-    `shown` gives the reason that the residuals show, with a remedy (`herglotz.training.missed`); `bound` names two
-    positions with one degree of freedom.
+    `shown` gives the reason of a model that misses the training data, or of one that does not, with a remedy
+    (`herglotz.training.missed`, `herglotz.training.feedback`); `bound` names two positions with one degree of freedom.
     """
     free, missed = errors.free or 0.0, not errors.windows <= AT_THE_NOISE * errors.limit
     if bound:
@@ -274,6 +281,7 @@ def in_words(
     follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"
+    # Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: {_unseen_motion(errors)}"
     # Two motions of one kind that know nothing of each other differ by √2 of their spread.
@@ -284,7 +292,7 @@ def in_words(
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
     if errors.worst <= AT_THE_NOISE * errors.limit:
         return f"{FITS}: {errors}"
-    return ". ".join(filter(None, (_worse(errors), shown() if missed else "")))
+    return ". ".join(filter(None, (_worse(errors), shown(True) if missed else "")))
 
 
 def _unseen_motion(errors: Errors) -> str:
@@ -302,7 +310,7 @@ def _worse(errors: Errors) -> str:
     return f"{WORSE}{known} by a factor of {errors.worst / errors.limit:.2g}: {errors}"
 
 
-def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[[], str]) -> str:
+def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[..., str]) -> str:
     """The verdict on a model that the data do not determine, with the recording that would help."""
     over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.windows > AT_THE_NOISE * errors.limit
     if not ahead.reached:
@@ -315,18 +323,21 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown:
         return f"a force is missing, and others are left open; {errors}. {changes}. {_remedy(metrics, True, shown)}"
     # The uncertainty falls with the root of the number of samples.
     times = (ahead.open / UNCERTAIN) ** 2
-    if times > MAX_ROOT_OF_RECORDINGS**2:
+    enough = times <= MAX_ROOT_OF_RECORDINGS**2
+    longer = f"a recording {max(2, math.ceil(times))} times as long, or several from other starts" if enough else ""
+    if reason := shown(False, longer):
+        return f"the inputs leave it open; {errors}. {changes}. {reason}"
+    if not enough:
         return f"such motions do not tell, however many; {errors}. {changes}. Try other motions: starts, inputs, speeds"
-    longer = f"a recording {max(2, math.ceil(times))} times as long, or several from other starts"
     return f"too little was recorded to tell; {errors}. {changes}. Try {longer}"
 
 
-def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[[], str]) -> str:
-    """The remedy, after the reason if the residuals show one; `missed`: the training error exceeds the noise."""
+def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str]) -> str:
+    """The remedy, after the reason if one is shown; `missed`: the training error exceeds the noise."""
+    if reason := shown(missed):
+        return reason
     if not missed:
         return "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
-    if reason := shown():
-        return reason
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
     return "A force is missing. Try --objective smoothing, another --level (herglotz select), or a --feature for it"

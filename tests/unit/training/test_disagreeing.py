@@ -1,6 +1,7 @@
 """A recording of something else among good ones is left out whole, and named."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -41,6 +42,31 @@ def test_good_recordings_all_stay():
     run = fit(_drops(2, 6, 13, bad=-1), progress=False)
     assert run.metrics["left_out"] == []
     assert len(run.data) == 6
+
+
+class Fall(torch.nn.Module):
+    """L_d of q″ = a: h (v²/2 + a (q0 + q1)/2)."""
+
+    def __init__(self):
+        super().__init__()
+        self.a = torch.nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
+
+    def forward(self, q0, q1, s0, h):
+        return (q1 - q0).square().sum(-1) / (2 * h) + h * self.a * (q0 + q1).sum(-1) / 2 + 0 * s0
+
+
+@pytest.mark.parametrize("given", ["plan", "model"])
+def test_without_a_search_an_outlier_is_named(given, capsys):
+    # fails if a bad recording that nobody looks for is not said, or a good one is said to be bad
+    good, data = _drops(2, 6, 13, bad=-1), _drops(0, 6, 13, bad=4)
+    own: dict[str, Any] = {"model": Fall()} if given == "model" else {}
+    found = fit(good, progress=False, **own)
+    assert not found.metrics["outlying"]
+    assert "something else" not in capsys.readouterr().err
+    found = fit(data, progress=False, **(own or {"plan": found}))
+    assert [one["recording"] for one in found.metrics["outlying"]] == [4]
+    assert "warning: trajectory 4, counted from 0, may be of something else" in capsys.readouterr().err
+    assert "fit once more without it" in " ".join(found.summary().split())
 
 
 def test_without_a_majority_nothing_is_left_out():

@@ -171,7 +171,7 @@ def test_a_verdict_gives_the_reason(errors, told):
     # fails if a misfit of the training data is blamed on the unseen part, or a reason is looked for where none is asked
     all_errors: Any = {"windows": 0.01, "unseen": 0.01, "free": 0.01, "noise": 0.01, "spread": 1.0} | errors
     metrics = {"follows_data": True, "objective": "trajectory"}
-    text = in_words(Errors(**all_errors), None, metrics, lambda: "It is late. Try earlier")
+    text = in_words(Errors(**all_errors), None, metrics, lambda missed: "It is late. Try earlier" if missed else "")
     assert text.endswith("It is late. Try earlier") is told
     assert ("the unseen part differs from the training part" in text) is not told
     assert ("A force is missing. Try " in in_words(Errors(**all_errors), None, metrics)) is told

@@ -1,0 +1,109 @@
+"""Motion that a controller holds: what a free run of its model, and its numbers, cannot tell.
+
+Two facts are measured on the training part:
+
+* The motion is unstable and its inputs hold it. An error of a start of the size of the noise, carried on by the
+  linearised steps along the recorded motion with the inputs as recorded, grows to the spread of the motion; and with
+  the mean of the inputs in their place the model leaves the recorded range by its spread. A free run then tells no
+  longer whether its start or its forces are wrong.
+* The inputs follow from the state: a linear function of positions and velocities leaves less than half of their spread.
+  The map of the inputs and the other forces then make up for each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import precisions
+from herglotz.data.units import size
+from herglotz.least_squares import least_squares
+from herglotz.models import ContactLagrangian
+from herglotz.training.free_run import continued
+from herglotz.training.problems.grid import segment_grid, step_inputs
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.lifted_newton import linear_recurrence, linear_steps
+
+# Share of the spread that separates what follows from what does not.
+HALF = 0.5
+
+
+def reason_of_inputs(
+    model: ContactLagrangian,
+    data: Trajectories,
+    states: Tensor,  # (N, 2n+1) of the fit at the samples
+    max_step: float,
+    missed: bool,
+    longer: str = "",
+) -> str:
+    """The fact in the head of this module that the training part shows, and what to try, in sentences; "" for none.
+
+    `missed`: the model misses the training part by more than the noise, which inputs that follow do not explain.
+    `longer` is a recording, in words, that would tell as well what inputs do that follow.
+    """
+    if data.u is None or not model.inputs or not bool(torch.isfinite(states).all()):
+        return ""
+    growth = growth_of_noise(model, data, states, max_step)
+    lost, unit = growth >= 1, "" if data.time_unit == "1" else data.time_unit
+    if bool(lost.any()) and leaves_without_inputs(model, data, states, max_step):
+        since = data.t - data.t[list(data.offsets)][data.trajectory]
+        return (
+            "The motion is unstable and its inputs hold it: with the inputs as recorded an error of the start as small "
+            f"as the noise grows to the spread of the motion within {size(float(since[lost].min()), unit, digits=2)}, "
+            "and longer runs tell a wrong start from a wrong force no more. Try several recordings, each no longer "
+            "than that"
+        )
+    if not missed and (left := unexplained(data, states)) < HALF:
+        ways = filter(None, ("a small random signal on the inputs", "set points that jump", longer))
+        return (
+            f"The inputs follow from positions and velocities, all but {100 * left:.2g} % of their spread, as those of "
+            f"a controller do: what they do and other forces make up for each other. Try {', or '.join(ways)}"
+        )
+    return ""
+
+
+def growth_of_noise(model: ContactLagrangian, data: Trajectories, states: Tensor, max_step: float) -> Tensor:
+    """RMS of δq over the spread of q, (N,), of an error of the start: δq₀ the noise of q, δp₀ = 0, δX_{k+1} = A_k δX_k.
+
+    A_k are the derivatives of the model's steps at `states`, (N, 2n+1).
+    """
+    grid, n = segment_grid(data, data.samples, max_step), data.dof
+    problem = ShootingProblem(model, data, grid, sigma=1.0, compiled=False)
+    problem.guess_from_states(states)
+    assert problem.path is not None
+    x = problem.path.x
+    _, A = linear_steps(problem.parameters.at(problem.parameters.get(), problem.u), x, grid.h)
+    first = x.new_zeros(*x[:, 0].shape, n)
+    first[:, :n] = (precisions(data).to(x) * data.balance).diag()
+    moved = linear_recurrence(A.detach(), x.new_zeros(*A.shape[:-1], n), first)[..., :n, :]
+    return (grid.at_samples(moved) / _spread(data)[:, None]).square().sum((1, 2)).div(n).sqrt().nan_to_num(torch.inf)
+
+
+def leaves_without_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor, max_step: float) -> bool:
+    """Whether a run with the mean of the inputs leaves the recorded range by the spread of a coordinate, or fails."""
+    assert data.u is not None
+    grid, mean = segment_grid(data, data.samples, max_step), replace(data, u=data.u.mean(0).expand_as(data.u))
+    run = continued(model, states[grid.start_sample], grid.h, step_inputs(model, mean, grid))
+    q, low, high = grid.at_samples(run[..., : data.dof]), data.q.amin(0), data.q.amax(0)
+    return not bool(((q > low - _spread(data)) & (q < high + _spread(data))).all())
+
+
+def unexplained(data: Trajectories, states: Tensor) -> float:
+    """The part of the inputs that is no linear function of q and q̇, RMS over the spread of each input."""
+    assert data.u is not None
+    q, parts = states[:, : data.dof], []
+    for first, length in zip(data.offsets, data.lengths, strict=True):
+        own = slice(first, first + length)
+        parts.append(torch.gradient(q[own], spacing=(data.t[own].contiguous(),), dim=0)[0])
+    x, u = torch.cat([q, torch.cat(parts)], 1), data.u.to(q)
+    x, u = x - x.mean(0), u - u.mean(0)
+    x, u = (y / y.square().mean(0).sqrt().clamp_min(1e-300) for y in (x, u))
+    return float((u - x @ least_squares(x.T @ x, x.T @ u)).square().mean().sqrt())
+
+
+def _spread(data: Trajectories) -> Tensor:
+    """Standard deviation of each coordinate, (n,)."""
+    return data.q.std(0, correction=0).clamp_min(1e-300)

@@ -1,0 +1,76 @@
+"""Units at the end of names without brackets, and ends that are indices of bodies."""
+
+import math
+
+import pytest
+
+from herglotz.data import load
+from herglotz.data.csv_columns import assign
+from herglotz.data.header_cells import heads_of
+
+# Cells, and name, unit and role of each.
+UNITS = {
+    "tip_um": ("tip", "um", "coordinate"), "pos_mm": ("pos", "mm", "coordinate"), "x_m": ("x", "m", "coordinate"),
+    "cart_x_m": ("cart_x", "m", "coordinate"), "hub_m": ("hub", "m", "coordinate"),
+    "theta_rad": ("theta", "rad", "coordinate"), "motor_deg": ("motor", "deg", "coordinate"),
+    "angleDeg": ("angle", "deg", "coordinate"), "armPosMm": ("armPos", "mm", "coordinate"),
+    "drive_voltage_V": ("drive_voltage", "V", "input"), "motor_current_mA": ("motor_current", "mA", "input"),
+    "force_N": ("force", "N", "input"), "load_N": ("load", "N", "input"), "i_A": ("i", "A", "input"),
+    "valve_mA": ("valve", "mA", "input"), "pump_V": ("pump", "V", "input"), "duty_%": ("duty", "%", "input"),
+    "arm_N_m": ("arm", "N m", "input"), "cart_vx_m_s": ("cart_vx", "m/s", "left aside"),
+    "motor_rpm": ("motor", "rpm", "left aside"), "qd1_rad_s": ("qd1", "rad/s", "left aside"),
+    "acc_m_s2": ("acc", "m/s2", "left aside"), "shaft_tr_min": ("shaft", "tr/min", "left aside"),
+    "omega_rad_per_s": ("omega", "rad/s", "left aside"), "housing_degC": ("housing", "degC", "left aside"),
+    "pos_V": ("pos", "V", "left aside"), "flow_lpm": ("flow", "lpm", "left aside"),
+    "pressure_bar": ("pressure", "bar", "left aside"), "power_W": ("power_W", "", "left aside"),
+    # Indices and words. Roles are those of the whole names.
+    "theta_m": ("theta_m", "", "coordinate"), "x_A": ("x_A", "", "coordinate"), "q_s": ("q_s", "", "coordinate"),
+    "x_g": ("x_g", "", "coordinate"), "x_min": ("x_min", "", "coordinate"), "phi_bar": ("phi_bar", "", "coordinate"),
+    "tau_m": ("tau_m", "", "input"), "y_in": ("y_in", "", "coordinate"), "motor_cm": ("motor_cm", "", "input"),
+    "speed_m": ("speed_m", "", "left aside"), "i_m": ("i_m", "", "coordinate"), "s_A": ("s_A", "", "coordinate"),
+    "frame_mm": ("frame_mm", "", "coordinate"), "arm_bar_s": ("arm_bar_s", "", "coordinate"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("cell", UNITS)
+def test_the_end_of_a_name_is_its_unit_or_its_index(cell):
+    # fails if volts are a coordinate, degrees are no angle, or a motor's angle or torque is a length
+    found = assign(["t[s]", "z[m]", cell], "header")
+    assert found.roles()[2] == (UNITS[cell][0], UNITS[cell][2], UNITS[cell][1])
+
+
+@pytest.mark.parametrize(
+    ("cells", "names"),
+    [
+        ("i_A,i_B,v_A,v_B", "i_A,i_B,v_A,v_B"),  # two bodies
+        ("joint_A,joint_1", "joint_A,joint_1"),
+        ("F_N,F_T", "F_N,F_T"),  # normal and tangential
+        ("x_m,x_l,x_s", "x_m,x_l,x_s"),
+        ("x_m,x_s[m]", "x_m,x_s"),
+        ("pump_A,pump_V", "pump_A,pump_V"),  # one name for both
+        ("pump_A,fan_V", "pump,fan"),
+        ("x_m,y_m,p_x_m,p_y_m", "x_m,y_m,p_x_m,p_y_m"),  # momenta have the names of their coordinates
+    ],
+)
+def test_a_letter_is_an_index_beside_another_index(cells, names):  # fails if the current of body A is in amperes
+    assert [head and head[0] for head in heads_of(cells.split(","))] == names.split(",")
+
+
+def test_names_of_another_table_stay():
+    # fails if a run of x_A and x_B, or of hub_m, does not know the same column in a table with other columns
+    assert [head and head[0] for head in heads_of(["hub_A", "arm_m"], {"hub_A", "arm"})] == ["hub_A", "arm"]
+    assert [head and head[0] for head in heads_of(["arm_m", "arm_l"], {"arm"})] == ["arm", "arm_l"]
+
+
+def test_units_at_the_ends_of_a_log(tmp_path):
+    # fails if degrees stay, or a column is not found by the name that it has in the table
+    path, rows = tmp_path / "log.csv", "\n".join(f"{20 * k},{k},{30 * k},{k % 3}" for k in range(8))
+    path.write_text(f"time_ms,tip_m,angleDeg,drive_V\n{rows}\n")
+    data = load(path)
+    assert (data.names, data.units, data.time_unit) == (("tip", "angle"), ("m", "rad"), "s")
+    assert data.q[3].tolist() == pytest.approx([3, math.pi / 2])
+    assert data.input_labels == (("drive", "V"),)
+    assert load(path, coordinates="angleDeg", inputs="drive_V").names == ("angle",)
+    circle = "\n".join(f"{k},{math.sin(k)},{-math.cos(k)}" for k in range(8))
+    path.write_text(f"t,x_m,y_m\n{circle}\n")
+    assert load(path, polar="x_m,y_m").names == load(path, polar="x,y").names == ("theta",)

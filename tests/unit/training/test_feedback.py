@@ -1,0 +1,101 @@
+"""Motion that a controller holds: the growth of errors with the inputs as recorded, and inputs that follow."""
+
+import math
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import Stepper
+from herglotz.training.feedback import growth_of_noise, leaves_without_inputs, reason_of_inputs, unexplained
+from herglotz.training.foresight import Foresight
+from herglotz.training.verdict import Errors, in_words
+
+H, K, NOISE = 0.02, 300, 1e-3
+
+
+def balanced(stiffness, moved=0.15):
+    """q″ = −stiffness q − 0.1 q′ + u with u = −25 (q − goal) − 8 q′ at the last sample; model, data, states."""
+    one = (1.0,)
+    config = ModelConfig(
+        (False,), "forced", one, one, (stiffness,), (0.0,), potential_width=0, inputs=1, input_map=one, rate=0.1
+    )
+    model, random = ContactLagrangian(config), torch.Generator().manual_seed(0)
+    x, states, inputs, goal = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), [], [], 0.0
+    for k in range(K):
+        goal = moved * (2 * float(torch.rand((), generator=random)) - 1) if k % 50 == 0 else goal
+        u = -25 * (x[0] - goal) - 8 * x[1]
+        states, inputs = [*states, x], [*inputs, u]
+        with torch.no_grad():
+            q, p, s = x[None, :1], x[None, 1:2], x[2:3]
+            x = Stepper(model).rollout(q, p, s, h=H, inputs=u.reshape(1, 1, 1)).states.joined[0, -1]
+    states, u = torch.stack(states), torch.stack(inputs)[:, None]
+    t, noise = H * torch.arange(K, dtype=torch.float64), torch.randn(K, 1, generator=random, dtype=torch.float64)
+    return model, Trajectories.of(t, states[:, :1] + NOISE * noise, u=u, hold="zero"), states
+
+
+def test_noise_of_a_start_grows_as_the_unstable_motion_does():
+    # fails if the growth is that of the recorded, balanced motion, or is not over the spread
+    model, data, states = balanced(-9.0)
+    growth = growth_of_noise(model, data, states, H)
+    expected = NOISE / float(data.q.std(correction=0)) * torch.exp(-0.05 * data.t) * torch.cosh(3 * data.t)
+    assert (growth / expected).tolist() == pytest.approx([1.0] * K, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "moved", "missed", "expected"),
+    [
+        (-9.0, 0.15, False, "The motion is unstable and its inputs hold it: "),
+        (-9.0, 0.15, True, "The motion is unstable and its inputs hold it: "),
+        (9.0, 0.15, False, ""),  # it is stable, and the goals act
+        (9.0, 0.0, False, "The inputs follow from positions and velocities, "),
+        (9.0, 0.0, True, ""),  # what follows is no reason of a misfit
+    ],
+)
+def test_the_reason_is_what_is_measured(stiffness, moved, missed, expected):
+    # fails if a controller's recording is told to be longer, or a stable motion, or inputs of their own, to be shorter
+    model, data, states = balanced(stiffness, moved=moved)
+    reason = reason_of_inputs(model, data, states, H, missed)
+    assert reason.startswith(expected)
+    assert bool(reason) == bool(expected)
+    if stiffness < 0:
+        # exp(2.95 t)/2 = spread / noise
+        t = math.log(2 * float(data.q.std(correction=0)) / NOISE) / 2.95
+        said = float(re.findall(r"within ([\d.]+)", reason)[0])
+        assert said == pytest.approx(t, rel=0.05)
+    assert reason_of_inputs(model, replace(data, u=None), states, H, missed) == ""
+    assert reason_of_inputs(model, data, states * math.nan, H, missed) == ""
+
+
+def test_inputs_that_hold_a_motion():
+    # fails if a motion that stays without its inputs, as chaotic ones do, is said to be held by them
+    for stiffness, leaves in ((-9.0, True), (9.0, False)):
+        model, data, states = balanced(stiffness)
+        assert leaves_without_inputs(model, data, states, H) is leaves
+
+
+def test_inputs_that_follow():  # fails if a motion is not the state's, or a signal of its own counts as following
+    model, data, states = balanced(9.0, moved=0.0)
+    assert unexplained(data, states) < 0.05
+    said = reason_of_inputs(model, data, states, H, False, "a longer one")
+    assert said.endswith("Try a small random signal on the inputs, or set points that jump, or a longer one")
+    signal = torch.randn(K, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert unexplained(replace(data, u=signal), states) > 0.9
+
+
+def test_the_verdict_says_what_the_inputs_leave():
+    # fails if the recording of a balanced motion is said to be too short, or the unseen part to differ from the other
+    ahead = Foresight(start=0.0, parameters=0.4, hidden=0.02, name="q1^3", horizon=7.0, reached=True)
+    good = {"follows_data": True, "objective": "trajectory"}
+    unstable = lambda *_: "It is unstable. Try shorter ones"  # noqa: E731
+    said = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), ahead, good, unstable)
+    assert said.startswith("does not fit: the inputs leave it open; ")
+    assert said.endswith("It is unstable. Try shorter ones")
+    told = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), ahead, good, lambda _, longer: f"Try {longer}")
+    assert told.endswith("Try a recording 16 times as long, or several from other starts")
+    lost = in_words(Errors(0.01, 0.01, 2.0, noise=0.01, spread=1.0), ahead, good, unstable)
+    assert lost.startswith("does not fit beyond the recording: ")
+    assert lost.endswith("It is unstable. Try shorter ones")
