@@ -42,9 +42,14 @@ def step_parts(equations: Equations) -> Graph:
 
 
 def pushed(model: ContactLagrangian) -> ContactLagrangian:
-    """The model with generalised forces as inputs: G becomes the unit matrix, u₀ becomes 0. Changed in place."""
+    """The model with generalised forces as inputs: G becomes the unit matrix, u₀ becomes 0. Changed in place.
+
+    Where inputs act through the position they remain the inputs, and u₀ alone becomes 0.
+    """
     friction, n = model.friction, model.config.dof
-    if model.config.inputs and friction is not None:
+    if model.config.inputs and friction is not None and model.inputs_by_position:
+        friction.input_zero = None
+    elif model.config.inputs and friction is not None:
         model.config = replace(model.config, inputs=n, input_map=())
         eye = torch.eye(n, dtype=friction.viscous.dtype, device=friction.viscous.device)
         friction.inputs, friction.input_zero = n, None

@@ -138,6 +138,11 @@ class ContactLagrangian(nn.Module):
         return self.config.inputs
 
     @property
+    def inputs_by_position(self) -> bool:
+        """Whether an input acts through the position."""
+        return self.drag is not None and self.drag.driven
+
+    @property
     def s_enters_motion(self) -> bool:
         """Whether the positions depend on s, as at the affine and full levels."""
         return self.capabilities.carries_s
@@ -255,9 +260,10 @@ class ContactLagrangian(nn.Module):
 
     def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
         terms, friction = self.terms(phase), self.friction
-        if self.action is not None and friction is not None and u is not None:
-            terms, u = self._driven(terms, phase, friction.applied(u)), None
-        return self._assembled(terms, phase, s0, self._forces(phase, u))
+        in_L = self.action is not None and u is not None
+        if in_L and friction is not None:
+            terms = self._driven(terms, phase, friction.applied(u))
+        return self._assembled(terms, phase, s0, self._forces(phase, u, in_L))
 
     def _driven(self, t: Terms, phase: Phase, f: Tensor) -> Terms:
         """The terms with the potential −f·q of the inputs' force f (..., n), so that L has the work of the inputs."""
@@ -312,7 +318,8 @@ class ContactLagrangian(nn.Module):
         rate = torch.zeros((), dtype=phase.q0.dtype, device=phase.q0.device) if damping is None else damping.rate
         return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 
-    def _forces(self, phase: Phase, u: Tensor | None) -> Forces | None:
+    def _forces(self, phase: Phase, u: Tensor | None, in_L: bool) -> Forces | None:
+        """The forces; with `in_L` without those of inputs that do not act through the position."""
         if self.friction is None:
             return None
         assert isinstance(self.damping, LinearDamping)
@@ -320,13 +327,14 @@ class ContactLagrangian(nn.Module):
         c = torch.ones_like(h) if self.action is not None else self.damping(phase).exp()
         smooth = self.friction.dry and not self.friction.sticking
         more = None if smooth or self.drag is None else self.drag.held(phase.q0)
-        forces = self.friction(v, c, h, phase.order, u, more)
+        forces = self.friction(v, c, h, phase.order, None if in_L else u, more)
         for term in self.forces_between:
             forces = with_force(forces, *term.force(v), c, h)
         if self.drag is None:
             return forces
         widths = self.friction.widths[0] if smooth else None
-        return self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces, widths)
+        acting = self.friction.acting(u) if self.inputs_by_position and u is not None else None
+        return self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces, widths, acting)
 
 
 def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping | AffineDamping | None:
