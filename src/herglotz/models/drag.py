@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,6 +41,7 @@ _PAIR = r"v\d+ - v\d+"
 _SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
 _WAVE = r"(?P<wave>cos|sin)\((?:(?P<rate>\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?)?"
 _AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
+_DRIVEN = rf"u(?P<input>\d+) {_AT}(?: on q(?P<driven>\d+))?"
 _TEXTS = [
     re.compile(text)
     for text in (
@@ -49,7 +50,7 @@ _TEXTS = [
         rf"{_AT} sgn\((?P<dry>v\d+)\)",
         r"load (?P<load>\d+)",
         r"\|(?P<even>v\d+)\|",
-        rf"u(?P<input>\d+) {_AT}(?: on q(?P<driven>\d+))?",
+        _DRIVEN,
     )
 ]
 AIR = "|v| v"
@@ -61,7 +62,8 @@ class DragFeature:
 
     b is 0 or 1, and with b = c = 0 the force is constant. A `dry` feature is q_at^a sgn(v). A `wave`, cos or sin, of
     rate · q_at replaces the power of q_at; with `of_speed` the wave of rate · v is the whole feature. `air` is |v| v of
-    the whole velocity, on every coordinate. With an `input`, a column of u, the factor −u takes the place of those of v: the force drives `on`.
+    the whole velocity, on every coordinate. With an `input`, a column of u, −u takes the place of the factors of v: the
+    force drives `on`.
     """
 
     on: int
@@ -244,9 +246,9 @@ class Drag(nn.Module):
         return -theta * size * v, -theta * slope
 
 
-def input_forces(drag: Sequence[str]) -> tuple[str, ...]:
+def input_forces(texts: Iterable[str]) -> tuple[str, ...]:
     """Return those of these texts that are forces of inputs."""
-    return tuple(text for text in drag if text.split()[0].startswith("u"))
+    return tuple(text for text in texts if re.fullmatch(_DRIVEN, text))
 
 
 def _power(x: Tensor, k: int) -> Tensor:
