@@ -103,7 +103,8 @@ MODELS: dict[str, tuple[dict[str, Any], dict[str, list[float]]]] = {
         {"damping.drag": [0.1]},
     ),
 }  # fmt: skip
-LONG = ("springs", "waves", "order 4", "joints", "damping by position")  # in steps that show in the motion
+# In steps that show in the motion.
+LONG = ("springs", "waves", "order 4", "joints", "inputs by position", "damping by position")
 
 
 def run_of(settings, numbers, *, h=H, count=3, steps=160, hold="zero"):
