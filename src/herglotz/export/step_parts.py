@@ -47,7 +47,7 @@ def pushed(model: ContactLagrangian) -> ContactLagrangian:
     Where inputs act through the position they remain the inputs, and u₀ alone becomes 0.
     """
     friction, n = model.friction, model.config.dof
-    if model.config.inputs and friction is not None and model.inputs_by_position:
+    if model.config.inputs and friction is not None and model.capabilities.inputs_by_position:
         friction.input_zero = None
     elif model.config.inputs and friction is not None:
         model.config = replace(model.config, inputs=n, input_map=())

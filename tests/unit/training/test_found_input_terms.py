@@ -99,13 +99,13 @@ def test_an_accelerated_pivot_is_found():
     run = hz.fit(data, train_fraction=1, progress=False)
     assert run.metrics["plan"]["drag"] == ("u1 cos(q1)",)
     assert run.data.input_labels == data.input_labels
-    assert run.model.drag.coefficient.item() == pytest.approx(-5, abs=2e-3)
+    assert run.model.get_parameter("drag.coefficient").item() == pytest.approx(-5, abs=2e-3)
     assert run.metrics["verdict"].startswith("fits to the noise")
     assert "u cos(q) − 19.99" in str(run.equation())
     missed, moved = compared(run)
     assert moved < missed / 5  # the rule's error at this step is 0.12
     later = lambda s: sway(s + 20)  # noqa: E731
-    assert run.predict(recorded(on_a_crane(later), later, -0.3, True, noise=0)).rms < 1e-3
+    assert (run.predict(recorded(on_a_crane(later), later, -0.3, True, noise=0)).rms or 1) < 1e-3
 
 
 class Asked:

@@ -61,7 +61,7 @@ def _taken(model: ContactLagrangian) -> tuple[Tensor, Tensor]:
     friction, m = model.friction, model.config.inputs
     if friction is None:
         return torch.eye(m), torch.zeros(m)
-    if not model.inputs_by_position:
+    if not model.capabilities.inputs_by_position:
         return friction.input_map, friction.offset()
     eye = torch.eye(m, dtype=friction.viscous.dtype, device=friction.viscous.device)
     return eye, friction.acting(eye.new_zeros(m))
@@ -79,7 +79,8 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
 
     def forces(u: Tensor) -> tuple[Tensor, ...]:
         shared = _taken(equations.model)
-        taken = friction.acting(u) if equations.model.inputs_by_position else friction.applied(u)
+        by_position = equations.model.capabilities.inputs_by_position
+        taken = friction.acting(u) if by_position else friction.applied(u)
         return *(x.expand(len(u), *x.shape) for x in shared), taken
 
     at = equations.of_numbers(forces)
