@@ -157,7 +157,7 @@ class ModelConfig:
         refuse({
             f"drag '{', '.join(dry)}' is of dry friction; set coulomb=True": dry and not self.coulomb,
             f"drag '{', '.join(beyond)}': the model has {self.inputs} input{'' if self.inputs == 1 else 's'}, counted "
-            "from u1; set inputs to their number, or name one of them": beyond,
+            "from u1; name one that it has, or give it more inputs": beyond,
             f"coulomb and inputs are forces; {instead}":
                 not forced and (self.coulomb or self.inputs or self.input_map),
             "sticking is of dry friction; set coulomb=True": self.sticking and not self.coulomb,

@@ -1,5 +1,6 @@
 """The search for inputs that act by their square, their size or their rate."""
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -11,15 +12,19 @@ from printed_check import compared
 import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import saturation
+from herglotz.models import ModelConfig
 from herglotz.training import questions
 from herglotz.training.acting_inputs import beside, offered_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.dictionary import by_position, dictionary
+from herglotz.training.foresight import _with_absent_terms
 from herglotz.training.look import look
 from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.plan import Plan
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
+from herglotz.training.task import Task, build_model
 from herglotz.training.trials import Trial
 
 H = 0.04
@@ -106,6 +111,37 @@ def test_an_accelerated_pivot_is_found():
     assert moved < missed / 5  # the rule's error at this step is 0.12
     later = lambda s: sway(s + 20)  # noqa: E731
     assert (run.predict(recorded(on_a_crane(later), later, -0.3, True, noise=0)).rms or 1) < 1e-3
+
+
+def test_forces_of_inputs_are_offered_on_the_angle_and_on_lengths():
+    # fails if a thruster's force on a length is no offer, or the numbers of an arm grow with the square of its joints
+    assert by_position((False, True), [2]) == (
+        "u2 cos(q2) on q1", "u2 sin(q2) on q1", "u2 cos(q2)", "u2 sin(q2)",
+    )  # fmt: skip
+    assert len(by_position((True, True), [1, 2])) == 8
+    assert by_position((False,), [1]) == ()
+
+
+def test_one_kernel_serves_all_forces_of_an_input():
+    # fails if each subset of the forces is compiled anew, or models without such a force carry the numbers of all
+    plain = ModelConfig(level="forced", alike=True, stiffness=(0.0,), potential_width=0, inputs=2)
+    wholes = [dictionary(replace(plain, drag=drag)) for drag in ((), ("u2 sin(q1)",), ("u2 cos(q1)", "load 1"))]
+    drags = [whole.drag for whole in wholes if whole is not None]
+    assert drags[1] == drags[2] == (*drags[0], "u2 cos(q1)", "u2 sin(q1)")
+
+
+def test_foresight_knows_a_model_with_a_force_of_the_position():
+    # fails if a model with such a force is no model of named terms, and no absent term widens its forecast
+    data = driven(CASES["u^2"], sway, samples=40)
+    data = replace(data, angles=(True,), units=("rad",))
+    config = FitConfig(
+        level="forced", objective="trajectory", alike=True, features=("cos(q1)",), drag=("u1 cos(q1)",)
+    )  # fmt: skip
+    base = estimate_baseline(data)
+    more, _, absent = _with_absent_terms(Task(data, base, config, Stages()), build_model(base, config, "none"))
+    assert "u1 cos(q1)" in more.config.drag
+    assert {"sin(q1)", "|v1| v1"} <= set(absent)
+    assert "u1 cos(q1)" not in absent
 
 
 class Asked:
