@@ -175,7 +175,7 @@ class Drag(nn.Module):
     f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters of either sign that start at 0: van der
     Pol's oscillator has negative viscous friction and the term q² v. The part of dry friction that depends on the
     position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; set-valued friction takes the part `held` at q0.
-    An input u_k, less the zero of its sensor, that acts through the position is θ u_k q̄_j^a, or θ u_k cos q̄_j.
+    An input that acts through the position is θ u_k q̄_j^a, or θ u_k cos q̄_j; a potential stands for its sensor's zero.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):
@@ -206,7 +206,7 @@ class Drag(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return φ_g, ∂φ_g/∂q̄_j and ∂φ_g/∂v, each (..., G).
 
-        Dry terms have the `widths` (n,), those of inputs u (..., m) less its zero, and are 0 without.
+        Dry terms have the `widths` (n,), those of inputs u (..., m), and are 0 without.
         """
         x, y = q @ self.at.T, v @ self.on.T
         columns = []
@@ -227,7 +227,7 @@ class Drag(nn.Module):
     ) -> Forces:  # fmt: skip
         """Return the forces `own` plus the drag at the mean position q and the velocity v, with derivatives if any.
 
-        `widths` (n,) are those of smooth dry friction, u (..., m) the inputs less their zeros.
+        `widths` (n,) are those of smooth dry friction, u (..., m) the inputs.
         """
         value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v, widths, u))
         slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.on), (by_q, self.at)))

@@ -118,13 +118,9 @@ class Friction(nn.Module):
 
     def applied(self, u: Tensor) -> Tensor:
         """Return G (u − u₀), (..., n)."""
-        return self.acting(u) @ self.input_map.T
-
-    def acting(self, u: Tensor) -> Tensor:
-        """Return u − u₀, (..., m)."""
         if not self.inputs or u.shape[-1:] != (self.inputs,):
             raise InputError(f"u needs shape (..., {self.inputs}), got {tuple(u.shape)}")
-        return u if self.input_zero is None else u - self.input_zero
+        return (u if self.input_zero is None else u - self.input_zero) @ self.input_map.T
 
     def offset(self) -> Tensor:
         """Return the force of inputs that are recorded as 0: −G u₀, (n,)."""

@@ -328,8 +328,7 @@ class ContactLagrangian(nn.Module):
         if self.drag is None:
             return forces
         widths = self.friction.widths[0] if smooth else None
-        acting = self.friction.acting(u) if self.drag.driven and u is not None else None
-        return self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces, widths, acting)
+        return self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces, widths, u)
 
 
 def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping | AffineDamping | None:

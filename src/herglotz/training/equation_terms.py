@@ -167,7 +167,7 @@ class Reader:
             f = parse_drag(text, self.config.angles)
             for i in (i for i in range(len(self.names)) if f.air or i in (f.on, f.of)):
                 value = self.model.drag.coefficient[g] * (1.0 if f.of == i or f.input is not None else -1.0)
-                words = self._sign(f.on) if f.dry else "" if f.input is None else self._input(f.input)
+                words = self._sign(f.on) if f.dry else "" if f.input is None else self.data.input_labels[f.input][0]
                 size = unit_of(self.data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)
                 size = size if f.input is None else ""
                 yield Line(self.own[i], drag_in_words(f, i, self.names, words), size, value)
@@ -200,23 +200,19 @@ class Reader:
         return f"tanh({name}′/{width})"
 
     def _inputs(self) -> Iterator[Line]:
-        """Inputs that do not act through the position."""
+        """Each input less the zero of its sensor, where it does not act through the position."""
         friction = self.model.friction
         for j in range(self.config.inputs):
             assert friction is not None
-            what = self._input(j)
+            zero = None if friction.input_zero is None else friction.input_zero[j]
+            what = self.data.input_labels[j][0]
+            if zero is not None and float(zero.detach()):
+                text = self.shown(zero, f"the zero of {what}")
+                what = f"({what} {f'+ {text[1:]}' if text.startswith('−') else f'− {text}'})"
             for i, left in enumerate(self.own):
                 # With an action, the work of inputs is part of L.
                 at, text = (left, what) if self.model.action is None else ("L", f"{what} {self.names[i]}")
                 yield Line(at, text, "", friction.input_map[i, j])
-
-    def _input(self, j: int) -> str:
-        """An input less the zero of its sensor."""
-        what, zeros = self.data.input_labels[j][0], getattr(self.model.friction, "input_zero", None)
-        if zeros is None or not float(zeros[j].detach()):
-            return what
-        text = self.shown(zeros[j], f"the zero of {what}")
-        return f"({what} {f'+ {text[1:]}' if text.startswith('−') else f'− {text}'})"
 
     def _springs(self) -> Iterator[Line]:
         """The baseline's k (1 − cos x) + b sin x or k x²/2 + b x; x is a coordinate, with translations a difference."""

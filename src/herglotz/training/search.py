@@ -244,7 +244,7 @@ class Search:
             return False
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        line = Search(data, base, self.config, outliers=self.freedom is not None)
+        line = Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
         if trial is not None and trial.whole and (line.first is None or trial.replaces(line.first)):
             return False  # the motion is followed as it is, and no worse model is worth a search
         other = line.run()

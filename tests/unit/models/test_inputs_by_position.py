@@ -52,7 +52,7 @@ LAWS = {
 
 @pytest.mark.parametrize("law", LAWS)
 def test_the_motion_is_that_of_the_law_to_order_two(law):
-    # fails if a sign, the coordinate or the zero of a sensor is another one, or F⁻ is not c (h/2) f at the midpoint
+    # fails if a sign, the coordinate or the input is another one, or F⁻ is not c (h/2) f at the midpoint
     angles, drag, coefficients, force = LAWS[law]
     n, spring = len(angles), torch.tensor(angles)
 
@@ -65,8 +65,8 @@ def test_the_motion_is_that_of_the_law_to_order_two(law):
     x = torch.cat([x, 0.4 * x])
     for _ in range(400):
         x = runge_kutta(rate, x, 2.0 / 400)
-    model = body(angles, drag, coefficients, zero=0.4)
-    coarse, fine = (end(model, steps, U + 0.4) - x for steps in (40, 80))
+    model = body(angles, drag, coefficients)
+    coarse, fine = (end(model, steps, U) - x for steps in (40, 80))
     assert float(fine.abs().max()) < 1e-3
     assert float(coarse.norm() / fine.norm()) == pytest.approx(4, abs=0.3)
 
@@ -82,13 +82,13 @@ def test_where_s_has_powers_the_force_is_the_same():
     assert float((x[2] - end(model, 96, 0.0)).norm()) > 0.1
 
 
-def test_without_inputs_no_force_acts():
-    # fails if the zero of a sensor pushes where nothing is driven
-    model = body((True,), ("u1 cos(q1)",), [-0.8], zero=0.4)
+def test_the_zero_of_a_sensor_is_that_of_the_inputs_map_alone():
+    # fails if a zero stands for the weight of a pendulum on a shaken pivot: no weight would act where nothing is driven
     q = torch.tensor([0.3], dtype=torch.float64)
-    still = body((True,), ("u1 cos(q1)",), [0.0])
-    alone, other = (Stepper(x).rollout(q, q, h=0.1, steps=5).final.q for x in (model, still))
-    assert torch.equal(alone, other)
+    ends = [end(body((True,), ("u1 sin(q1)",), [-0.8], zero=zero), 20, U) for zero in (0.0, 0.4)]
+    assert torch.equal(*ends)
+    alone, still = (body((True,), ("u1 sin(q1)",), [x], zero=0.4) for x in (-0.8, 0.0))
+    assert torch.equal(*(Stepper(x).rollout(q, q, h=0.1, steps=5).final.q for x in (alone, still)))
 
 
 @pytest.mark.parametrize(

@@ -57,14 +57,14 @@ def inputs_constants(model: ContactLagrangian, dtype: str) -> str:
 
 
 def _taken(model: ContactLagrangian) -> tuple[Tensor, Tensor]:
-    """G and −G u₀; 1 and −u₀ where inputs act through the position, 1 and 0 for an L_d that takes u itself."""
+    """G and −G u₀, below 1 and 0 where inputs act through the position; 1 and 0 for an L_d that takes u itself."""
     friction, m = model.friction, model.config.inputs
     if friction is None:
         return torch.eye(m), torch.zeros(m)
+    G, offset = friction.input_map, friction.offset()
     if not model.capabilities.inputs_by_position:
-        return friction.input_map, friction.offset()
-    eye = torch.eye(m, dtype=friction.viscous.dtype, device=friction.viscous.device)
-    return eye, friction.acting(eye.new_zeros(m))
+        return G, offset
+    return torch.cat([torch.eye(m).to(G), G]), torch.cat([offset.new_zeros(m), offset])
 
 
 def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables: dict[tuple[float, ...], str]) -> str:
@@ -79,9 +79,8 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
 
     def forces(u: Tensor) -> tuple[Tensor, ...]:
         shared = _taken(equations.model)
-        by_position = equations.model.capabilities.inputs_by_position
-        taken = friction.acting(u) if by_position else friction.applied(u)
-        return *(x.expand(len(u), *x.shape) for x in shared), taken
+        own = [u] if equations.model.capabilities.inputs_by_position else []
+        return *(x.expand(len(u), *x.shape) for x in shared), torch.cat([*own, friction.applied(u)], -1)
 
     at = equations.of_numbers(forces)
 
