@@ -66,6 +66,9 @@ MODELS = {
         2, features=("cos(q1 - q2) v1 v2", "q2 v1", "q2^3"), level="forced", coupled=True
     ),
     "drag": config(1, (False,), level="forced", drag=("|v1| v1", "q1^2 v1", "v1^3", "sin(2.5 v1)")),
+    "inputs by position": config(
+        2, (False, True), level="forced", inputs=2, drag=("u1 sin(q2) on q1", "u2 cos(q2)", "u2 q1", "|v1| v1")
+    ),
     "dry friction of position": config(
         2,
         (False, True),

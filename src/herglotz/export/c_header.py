@@ -83,7 +83,7 @@ TOP = """\
 /* Sizes and kinds of the model, for the preprocessor. */
 #define hz_N {n} /* coordinates */
 #define hz_M {m} /* inputs */
-#define hz_INPUTS {inputs} /* numbers that a step takes of the inputs: generalised forces, or the inputs themselves */
+#define hz_INPUTS {inputs} /* numbers that a step takes of the inputs: these themselves, generalised forces, or both */
 #define hz_SINGLE {single} /* float, not double */
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
 #define hz_STICKING {sticking} /* dry friction can hold a coordinate still */

@@ -42,14 +42,17 @@ def step_parts(equations: Equations) -> Graph:
 
 
 def pushed(model: ContactLagrangian) -> ContactLagrangian:
-    """The model with generalised forces as inputs: G becomes the unit matrix, u₀ becomes 0. Changed in place."""
+    """The model with generalised forces as inputs: G becomes the unit matrix, u₀ becomes 0. Changed in place.
+
+    Where inputs act through the position, they stand before the forces.
+    """
     friction, n = model.friction, model.config.dof
     if model.config.inputs and friction is not None:
-        model.config = replace(model.config, inputs=n, input_map=())
-        eye = torch.eye(n, dtype=friction.viscous.dtype, device=friction.viscous.device)
-        friction.inputs, friction.input_zero = n, None
+        m = model.config.inputs if model.capabilities.inputs_by_position else 0
+        model.config = replace(model.config, inputs=m + n, input_map=())
+        friction.inputs, friction.input_zero = m + n, None
         del friction.input_map
-        friction.register_buffer("input_map", eye)
+        friction.register_buffer("input_map", torch.eye(m + n).to(friction.viscous)[m:])
     return model
 
 

@@ -33,6 +33,8 @@ class Capabilities:
         Dry friction is set-valued.
     coupling
         A force that depends on the velocities of other joints, or on the position.
+    inputs_by_position
+        An input acts through the position.
     """
 
     order: int
@@ -45,6 +47,7 @@ class Capabilities:
     nonlinear_force: bool
     sticking: bool
     coupling: bool
+    inputs_by_position: bool = False
 
     @property
     def carries_s(self) -> bool:

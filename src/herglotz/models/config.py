@@ -60,8 +60,8 @@ class ModelConfig:
     alike, diagonal
         One mass for all coordinates and a potential of features alone; a diagonal mass matrix.
     coupled, drag
-        Friction of velocity differences; further friction forces such as "|v1| v1" (`herglotz.models.drag`). Both need
-        the forced level.
+        Friction of velocity differences; further forces such as "|v1| v1", and "u1 cos(q1)" of an input
+        (`herglotz.models.drag`). Both need the forced level.
     order
         Order of the rule, 2 or 4; at 4 L_d has the error term of the rule, from the features
         (`herglotz.models.order4`). Forces stay of order 2.
@@ -151,9 +151,13 @@ class ModelConfig:
     def _check_forces(self) -> None:
         forced, wanted = self.level == "forced", self.dof * self.inputs
         instead = f"set level='forced', not '{self.level}'"
-        dry = [text for text in (self.drag if forced else ()) if parse_drag(text, self.angles).dry]
+        drag = {text: parse_drag(text, self.angles) for text in (self.drag if forced else ())}
+        dry = [text for text, f in drag.items() if f.dry]
+        beyond = [text for text, f in drag.items() if f.input is not None and f.input >= self.inputs]
         refuse({
             f"drag '{', '.join(dry)}' is of dry friction; set coulomb=True": dry and not self.coulomb,
+            f"drag '{', '.join(beyond)}': the model has {self.inputs} input{'' if self.inputs == 1 else 's'}, counted "
+            "from u1; name one that it has, or give it more inputs": beyond,
             f"coulomb and inputs are forces; {instead}":
                 not forced and (self.coulomb or self.inputs or self.input_map),
             "sticking is of dry friction; set coulomb=True": self.sticking and not self.coulomb,

@@ -1,4 +1,4 @@
-"""Named friction forces of one joint or between two: |v| v, v³, q² v, and so on, with a learned coefficient each.
+"""Named forces beside L, with a learned coefficient each: friction |v| v, v³, q² v and so on, and inputs times u cos q.
 
 The text of a force is a product: a power or a wave of a position (optional), |v|, and a power of the same speed v, the
 speed of a joint or the relative speed of two joints with a damper between them:
@@ -12,13 +12,20 @@ which no periodic potential of an angle gives. `|v1|` is the difference of visco
 that changes with the position, or with the load that a position puts on a bearing, is written as
 
     q1^2 sgn(v1)        cos(q1) sgn(v1)        sin(q2) sgn(v1)
+
+An input that acts through the position drives the coordinate that it names, or another one:
+
+    u1 cos(q1)        u2 sin(q1)        u1 q1        u1 sin(q2) on q1
+
+A pendulum on a pivot with the horizontal acceleration u1 has −u1 cos(q1)/l, and a force u1 with a fixed direction on a
+crank u1 cos(q1). A thruster of a body with the heading q2 pushes the length q1 by u1 sin(q2).
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -34,6 +41,7 @@ _PAIR = r"v\d+ - v\d+"
 _SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
 _WAVE = r"(?P<wave>cos|sin)\((?:(?P<rate>\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?)?"
 _AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
+_DRIVEN = rf"u(?P<input>\d+) {_AT}(?: on q(?P<driven>\d+))?"
 _TEXTS = [
     re.compile(text)
     for text in (
@@ -42,6 +50,7 @@ _TEXTS = [
         rf"{_AT} sgn\((?P<dry>v\d+)\)",
         r"load (?P<load>\d+)",
         r"\|(?P<even>v\d+)\|",
+        _DRIVEN,
     )
 ]
 AIR = "|v| v"
@@ -53,7 +62,8 @@ class DragFeature:
 
     b is 0 or 1, and with b = c = 0 the force is constant. A `dry` feature is q_at^a sgn(v). A `wave`, cos or sin, of
     rate · q_at replaces the power of q_at; with `of_speed` the wave of rate · v is the whole feature. `air` is |v| v of
-    the whole velocity, on every coordinate.
+    the whole velocity, on every coordinate. With an `input`, a column of u, −u takes the place of the factors of v: the
+    force drives `on`.
     """
 
     on: int
@@ -67,6 +77,7 @@ class DragFeature:
     wave: str = ""
     rate: float = 1.0
     of_speed: bool = False
+    input: int | None = None
 
     @property
     def even(self) -> bool:
@@ -97,9 +108,9 @@ class DragFeature:
 
 
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
-    """Read the text of a friction force.
+    """Read the text of a force.
 
-    Raise InputError if the text is no friction force, or names a coordinate that the model does not have.
+    Raise InputError if the text is no force, or names a coordinate that the model does not have.
     """
     plain, n = " ".join(text.split()), len(angles)
     if plain == AIR:
@@ -108,34 +119,40 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     found = _parts(text, plain)
     of_speed, dry = "of_speed" in found, "dry" in found
     speed = found["v"] or found["pair"]
-    on, *of = map(int, re.findall(r"\d+", speed or found["dry"] or found["load"] or found["even"]))
-    at = int(found["angle"] or found["q"] or on)
+    place = found["angle"] or found["q"]
+    on, *of = map(
+        int, re.findall(r"\d+", speed or found["dry"] or found["load"] or found["even"] or found["driven"] or place)
+    )
+    at, given = int(place or on), int(found["input"]) - 1 if found["input"] else None
     a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
     rate, b, second = float(found["rate"] or 1), int(bool(found["size"] or found["even"])), of[0] - 1 if of else None
     refuse({
         f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
         f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
         f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in ("", speed),
+        f"drag '{text}': inputs are numbered from 1": given == -1,
     })  # fmt: skip
-    feature = DragFeature(on - 1, at - 1, a, b, c, second, dry=dry, wave=found["wave"], rate=rate, of_speed=of_speed)
+    feature = DragFeature(
+        on - 1, at - 1, a, b, c, second, dry=dry, wave=found["wave"], rate=rate, of_speed=of_speed, input=given
+    )
     _check_periods(text, feature, angles[at - 1])
     _check_powers(text, feature, of_a_speed=bool(speed))
     return feature
 
 
 def _parts(text: str, plain: str) -> Mapping[str, str]:
-    """The named parts of a friction text, "" for those that it does not have."""
+    """The named parts of the text of a force, "" for those that it does not have."""
     match = next(filter(None, (pattern.fullmatch(plain) for pattern in _TEXTS)), None)
     if match is None:
         raise InputError(
-            f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1' or "
-            "'cos(q1) sgn(v1)'"
+            f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1', "
+            "'cos(q1) sgn(v1)' or 'u1 cos(q1)'"
         )
     return defaultdict(str, {name: part for name, part in match.groupdict().items() if part is not None})
 
 
 def _check_periods(text: str, f: DragFeature, angle: bool) -> None:
-    """Raise InputError if the friction of an angle does not repeat with every turn."""
+    """Raise InputError if a force does not repeat with every turn of an angle."""
     refuse({
         f"drag '{text}': a power of an angle is not periodic; write 'cos(q{f.at + 1})' instead": f.a and angle,
         f"drag '{text}': a wave of an angle is periodic; write a whole number before q{f.at + 1}":
@@ -146,7 +163,8 @@ def _check_periods(text: str, f: DragFeature, angle: bool) -> None:
 def _check_powers(text: str, f: DragFeature, *, of_a_speed: bool) -> None:
     """Raise InputError if a power of a position or of a speed is too high, or 0."""
     of_the_speed = 1 <= f.c <= MAX_POWER or not of_a_speed or f.of_speed
-    fit = f.a <= MAX_POWER and (f.a >= 1 or bool(f.wave) if f.dry else of_the_speed)
+    by_position = f.dry or f.input is not None
+    fit = f.a <= MAX_POWER and (f.a >= 1 or bool(f.wave) if by_position else of_the_speed)
     refuse({f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not fit})
 
 
@@ -157,6 +175,7 @@ class Drag(nn.Module):
     f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters of either sign that start at 0: van der
     Pol's oscillator has negative viscous friction and the term q² v. The part of dry friction that depends on the
     position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; set-valued friction takes the part `held` at q0.
+    An input that acts through the position is θ u_k q̄_j^a, or θ u_k cos q̄_j; a potential stands for its sensor's zero.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):
@@ -167,6 +186,7 @@ class Drag(nn.Module):
         eye = torch.eye(dof + 1, dof, dtype=torch.float64)
         on, of = [f.on for f in features], [f.on if f.air else dof if f.of is None else f.of for f in features]
         self.air, self.dry = ([g for g, f in enumerate(features) if getattr(f, kind)] for kind in ("air", "dry"))
+        self.driven = any(f.input is not None for f in features)
         self.register_buffer("on", eye[on] - eye[of], persistent=False)
         self.register_buffer("at", eye[[f.at for f in features]], persistent=False)
         self.on: Tensor
@@ -181,23 +201,35 @@ class Drag(nn.Module):
         value, slope = (torch.stack(y, -1) * self.coefficient[self.dry] for y in zip(*columns, strict=True))
         return value @ self.on[self.dry], self.on[self.dry].T @ (slope[..., None] * at)
 
-    def terms(self, q: Tensor, v: Tensor, widths: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return φ_g, ∂φ_g/∂q̄_j and ∂φ_g/∂v, each (..., G); dry terms have the `widths` (n,), or are 0 without."""
+    def terms(
+        self, q: Tensor, v: Tensor, widths: Tensor | None = None, u: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return φ_g, ∂φ_g/∂q̄_j and ∂φ_g/∂v, each (..., G).
+
+        Dry terms have the `widths` (n,), those of inputs u (..., m), and are 0 without.
+        """
         x, y = q @ self.at.T, v @ self.on.T
         columns = []
         for g, f in enumerate(self.features):
             position, by_q = f.position(x[..., g])
-            speed, by_v = f.speed(y[..., g], None if widths is None else widths[f.on])
-            columns.append((position * speed, by_q * speed, position * by_v))
+            if f.input is None:
+                factor, by_v = f.speed(y[..., g], None if widths is None else widths[f.on])
+            else:
+                by_v = torch.zeros_like(position)
+                factor = by_v if u is None else by_v - u[..., f.input]
+            columns.append((position * factor, by_q * factor, position * by_v))
         value, by_q, by_v = (torch.stack(x, -1) for x in zip(*columns, strict=True))
         return value, by_q, by_v
 
-    def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces, widths: Tensor | None = None) -> Forces:
+    def forward(
+        self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces, widths: Tensor | None = None,
+        u: Tensor | None = None,
+    ) -> Forces:  # fmt: skip
         """Return the forces `own` plus the drag at the mean position q and the velocity v, with derivatives if any.
 
-        `widths` (n,) are those of smooth dry friction.
+        `widths` (n,) are those of smooth dry friction, u (..., m) the inputs.
         """
-        value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v, widths))
+        value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v, widths, u))
         slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.on), (by_q, self.at)))
         f = -value @ self.on
         if self.air:
@@ -212,6 +244,11 @@ class Drag(nn.Module):
         size = ((v * v).sum(-1, keepdim=True) + torch.finfo(torch.float32).tiny).sqrt()
         slope = size[..., None] * eye + v[..., None] * (v / size)[..., None, :]
         return -theta * size * v, -theta * slope
+
+
+def input_forces(texts: Iterable[str]) -> tuple[str, ...]:
+    """Return those of these texts that are forces of inputs."""
+    return tuple(text for text in texts if re.fullmatch(_DRIVEN, text))
 
 
 def _power(x: Tensor, k: int) -> Tensor:

@@ -158,6 +158,7 @@ class ContactLagrangian(nn.Module):
             or not all(term.linear for term in self.forces_between),
             sticking=self.friction is not None and self.friction.sticking,
             coupling=bool(self.forces_between) or self.drag is not None,
+            inputs_by_position=self.drag is not None and self.drag.driven,
         )
 
     def terms(self, phase: Phase, instant: bool = False) -> Terms:
@@ -254,10 +255,10 @@ class ContactLagrangian(nn.Module):
         return Phase(q0, q1, h, order, self.config, delta)
 
     def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
-        terms, friction = self.terms(phase), self.friction
+        terms, friction, own = self.terms(phase), self.friction, u
         if self.action is not None and friction is not None and u is not None:
-            terms, u = self._driven(terms, phase, friction.applied(u)), None
-        return self._assembled(terms, phase, s0, self._forces(phase, u))
+            terms, own = self._driven(terms, phase, friction.applied(u)), None
+        return self._assembled(terms, phase, s0, self._forces(phase, own, u))
 
     def _driven(self, t: Terms, phase: Phase, f: Tensor) -> Terms:
         """The terms with the potential −f·q of the inputs' force f (..., n), so that L has the work of the inputs."""
@@ -312,7 +313,8 @@ class ContactLagrangian(nn.Module):
         rate = torch.zeros((), dtype=phase.q0.dtype, device=phase.q0.device) if damping is None else damping.rate
         return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 
-    def _forces(self, phase: Phase, u: Tensor | None) -> Forces | None:
+    def _forces(self, phase: Phase, own: Tensor | None, u: Tensor | None) -> Forces | None:
+        """The forces, with G `own` of the inputs, and those of u that act through the position."""
         if self.friction is None:
             return None
         assert isinstance(self.damping, LinearDamping)
@@ -320,13 +322,13 @@ class ContactLagrangian(nn.Module):
         c = torch.ones_like(h) if self.action is not None else self.damping(phase).exp()
         smooth = self.friction.dry and not self.friction.sticking
         more = None if smooth or self.drag is None else self.drag.held(phase.q0)
-        forces = self.friction(v, c, h, phase.order, u, more)
+        forces = self.friction(v, c, h, phase.order, own, more)
         for term in self.forces_between:
             forces = with_force(forces, *term.force(v), c, h)
         if self.drag is None:
             return forces
         widths = self.friction.widths[0] if smooth else None
-        return self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces, widths)
+        return self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces, widths, u)
 
 
 def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping | AffineDamping | None:

@@ -8,7 +8,7 @@ that were taken is fitted at other levels; the level with the least misfit is ta
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -19,7 +19,9 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import SATURATIONS, all_input_terms, saturation
 from herglotz.data.smoothing import smoothed
 from herglotz.least_squares import least_squares
+from herglotz.models.drag import input_forces
 from herglotz.training.acceleration_terms import acceleration_terms, for_each
+from herglotz.training.dictionary import by_position
 from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.trials import Trial, Variant
 
@@ -43,7 +45,9 @@ class Driven(Protocol):
 
 
 def offered_terms(data: Trajectories) -> tuple[str, ...]:
-    """Squares, sizes and rates of the inputs, and both saturations of each at the level that accelerations ask for."""
+    """Squares, sizes and rates of the inputs, both saturations of each at the level that accelerations ask for, and
+    their forces that depend on the position.
+    """
     plain = all_input_terms(data)
     if not plain or data.u is None:
         return ()
@@ -56,7 +60,13 @@ def offered_terms(data: Trajectories) -> tuple[str, ...]:
         for kind, shape in SATURATIONS.items() if levels else ():
             left = [_left(found.columns, shape(u / level), a) for level in levels]
             terms.append(f"{kind}({name}/{levels[left.index(min(left))]:.4g})")
-    return (*plain, *terms)
+    return (*plain, *terms, *by_position(data.angles, range(1, len(data.input_labels) + 1)))
+
+
+def columns_of(terms: Iterable[str]) -> tuple[str, ...]:
+    """Those of these terms that are further columns of u, and no forces that depend on the position."""
+    terms = tuple(terms)
+    return tuple(term for term in terms if term not in input_forces(terms))
 
 
 def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
@@ -78,10 +88,10 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
     found = _with(search, every, trial)
     if found is None or not found.replaces(trial):
         return ()
-    if any(map(saturation, _taken(found, every))):
+    if any(map(saturation, taken_terms(found, every))):
         every = _sharpened(search, found, every)
     # Without the terms that left, terms that made up for these may leave, too.
-    while 0 < len(taken := _taken(found, every)) < len(every):
+    while 0 < len(taken := taken_terms(found, every)) < len(every):
         fewer = _with(search, taken, trial)
         if fewer is None or found.replaces(fewer):
             break
@@ -92,11 +102,14 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
 def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
     """A model with these terms of the inputs among its offers.
 
-    The terms join a trial that is near the data, or else the simplest model over ever longer segments.
+    The terms join a trial that is near the data, or else the simplest model over ever longer segments. So do forces of
+    the position where the trial is no better with them: it may have several terms in the place of one.
     """
     other = search.driven_by(terms)
-    if trial.near and (same := other.again(beside(trial, len(terms)))) is not None:
-        return other.settled(other.finer(same), swapped=True)
+    if trial.near and (same := other.again(beside(trial, len(columns_of(terms))))) is not None:
+        found = other.settled(other.finer(same), swapped=True)
+        if found.replaces(trial) or not input_forces(terms):
+            return found
     fitter = other.fitter(Variant(search.order))
     return other.climbed(fitter, fitter.simple, {})
 
@@ -104,6 +117,8 @@ def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
 def beside(trial: Trial, more: int) -> Trial:
     """The trial with its input coefficients renamed for so many more inputs."""
     columns = len(trial.fitter.data.input_labels)
+    if not more:
+        return trial
 
     def renamed(name: str) -> str:
         stem, _, place = name.partition("[")
@@ -114,18 +129,19 @@ def beside(trial: Trial, more: int) -> Trial:
     return replace(trial, taken=frozenset(map(renamed, trial.taken)), values=values)
 
 
-def _taken(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
-    """Those terms of `every` whose gains a model has taken; the last inputs of its data are these terms."""
-    columns = len(found.fitter.data.input_labels)
+def taken_terms(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
+    """Those terms of `every` that a model has taken; the last inputs of its data are those that are columns."""
+    columns, own = len(found.fitter.data.input_labels), columns_of(every)
     gains = (int(name.partition("[")[2].rstrip("]")) % columns for name in found.taken if name.startswith(INPUTS))
-    recorded = columns - len(every)
-    return tuple(every[k - recorded] for k in sorted(set(gains)) if k >= recorded)
+    recorded, forces = columns - len(own), set(input_forces(every)) & found.taken
+    taken = {own[k - recorded] for k in gains if k >= recorded} | forces
+    return tuple(term for term in every if term in taken)
 
 
 def _sharpened(search: Driven, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     """The terms; those that a model has taken have the levels at which the model misses the data least."""
     terms = list(every)
-    for term in _taken(found, every):
+    for term in taken_terms(found, every):
         if (of := saturation(term)) is None:
             continue
         kind, level, name = of

@@ -130,10 +130,10 @@ class FitConfig:
         Symmetries of L_d, each a set of coordinates that move together: `"q1 + q2"`, or `"q1"` alone. No learned term
         depends on their common position. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
-        Friction forces beside viscous friction, each with a learned coefficient (forced level): "|v1| v1", "q1^2 v1",
-        "|v1|" (viscous friction that differs by direction), "|v| v" (a body in air), "(v1 - v2)" (a damper between two
-        coordinates), "load 1", and "cos(q1) sgn(v1)" (dry friction that changes with the position). See
-        `herglotz.models.drag`.
+        Forces beside viscous friction, each with a learned coefficient (forced level): "|v1| v1", "q1^2 v1", "|v1|"
+        (viscous friction that differs by direction), "|v| v" (a body in air), "(v1 - v2)" (a damper between two
+        coordinates), "load 1", "cos(q1) sgn(v1)" (dry friction that changes with the position), and "u1 cos(q1)" (an
+        input that acts through the position). See `herglotz.models.drag`.
     order
         4: a rule of order 4 from the features, without networks. The parameters are then those of the continuous
         motion, and remain valid at other steps.

@@ -7,12 +7,13 @@ the dictionary, with 0 for the absent numbers; any other model has a kernel of i
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import combinations
 
 from herglotz.models import ModelConfig
 from herglotz.models.config import POWERS
-from herglotz.models.drag import AIR
+from herglotz.models.drag import AIR, parse_drag
 from herglotz.models.features import expand, lengths, revolute, slides, spherical
 
 # Highest power of a length in the potential of one coordinate: forces up to x⁵.
@@ -30,7 +31,7 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
     # Joints without coupling have a mass matrix whose other entries are 0.
     if any(c.angles) and n > 1 and c.diagonal and not c.coupled:
         c = replace(c, diagonal=False)
-    features, drag = features_of(c.angles), drag_of(c.angles)
+    features, drag = features_of(c.angles), (*drag_of(c.angles), *_inputs_by_position(c))
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
     whole = replace(
         c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
@@ -69,6 +70,19 @@ def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
         drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(len(angles)), 2)]
         drag += [AIR]
     return tuple(drag)
+
+
+def by_position(angles: tuple[bool, ...], inputs: Iterable[int]) -> tuple[str, ...]:
+    """Forces u cos q and u sin q of these inputs, counted from 1, and all angles, on the angle and on every length."""
+    to = [(j, "" if i == j else f" on q{i}") for j, angle in enumerate(angles, 1) if angle
+          for i, other in enumerate(angles, 1) if i == j or not other]  # fmt: skip
+    return tuple(f"u{k} {f}(q{j}){on}" for k in inputs for j, on in to for f in ("cos", "sin"))
+
+
+def _inputs_by_position(c: ModelConfig) -> tuple[str, ...]:
+    """All these forces of the inputs that a model has some of."""
+    forces = (parse_drag(text, c.angles).input for text in c.drag)
+    return by_position(c.angles, sorted({k + 1 for k in forces if k is not None}))
 
 
 def keys_of(numbers: list[str], config: ModelConfig) -> list[str]:

@@ -99,8 +99,8 @@ def _steps(run: FittedRun) -> str:
     if newtonian(model):
         rate = 0.0 if model.damping is None else float(model.damping.rate.detach())  # type: ignore[operator]
         loads = ", constants on angles among them" if any(text.startswith("load") for text in model.config.drag) else ""
-        parts = f"L = K − V − γ s, γ = {plain(rate, DIGITS)}, V of the forces by position, f the others without −γ m v"
-        parts += loads
+        parts = f"L = K − V − γ s, γ = {plain(rate, DIGITS)}, V of the forces by position alone, f the others "
+        parts += f"without −γ m v{loads}"
     dry = DRY if model.friction is not None and model.friction.sticking else ""
     return f"{told}: {RULE.format(parts=parts, L_d=OF_ORDER[model.config.order], dry=dry)}"
 

@@ -161,15 +161,16 @@ class Reader:
             yield from (Line(left, f"{self.names[j]}′", per_time, -between[i, j]) for j in others)
 
     def _drag(self) -> Iterator[Line]:
-        """Drag terms of one coordinate, between two, or of a body in air."""
+        """Drag of one coordinate, between two, or of a body in air, and inputs that act through the position."""
         for g, text in enumerate(self.config.drag):
             assert self.model.drag is not None
             f = parse_drag(text, self.config.angles)
             for i in (i for i in range(len(self.names)) if f.air or i in (f.on, f.of)):
+                value = self.model.drag.coefficient[g] * (1.0 if f.of == i or f.input is not None else -1.0)
+                words = self._sign(f.on) if f.dry else "" if f.input is None else self.data.input_labels[f.input][0]
                 size = unit_of(self.data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)
-                value = self.model.drag.coefficient[g] * (1.0 if f.of == i else -1.0)
-                words = drag_in_words(f, i, self.names, self._sign(f.on) if f.dry else "")
-                yield Line(self.own[i], words, size, value)
+                size = size if f.input is None else ""
+                yield Line(self.own[i], drag_in_words(f, i, self.names, words), size, value)
 
     def _dry(self, i: int, left: str) -> Iterator[Line]:
         """Dry friction of one coordinate; a set-valued friction force below 0 counts as 0."""
@@ -199,7 +200,7 @@ class Reader:
         return f"tanh({name}′/{width})"
 
     def _inputs(self) -> Iterator[Line]:
-        """Each input less the zero of its sensor."""
+        """Each input less the zero of its sensor, where it does not act through the position."""
         friction = self.model.friction
         for j in range(self.config.inputs):
             assert friction is not None

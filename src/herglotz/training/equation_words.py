@@ -34,8 +34,8 @@ def own_term(name: str, angle: bool, power: int, newton: bool) -> tuple[str, flo
     return raised(name, power), -0.5 if power == 2 else -1.0
 
 
-def drag_in_words(f: DragFeature, i: int, names: Sequence[str], sign: str = "") -> str:
-    """A friction force on coordinate i with the names of coordinates; `sign` is the text of a direction."""
+def drag_in_words(f: DragFeature, i: int, names: Sequence[str], given: str = "") -> str:
+    """A force on coordinate i with the names of coordinates; `given` is the text of a direction, or of an input."""
     if f.air:
         return f"√({' + '.join(f'{name}′²' for name in names)}) {names[i]}′"
     speed = f"{names[f.on]}′" if f.of is None else f"({names[f.on]}′ − {names[f.of]}′)"
@@ -45,7 +45,9 @@ def drag_in_words(f: DragFeature, i: int, names: Sequence[str], sign: str = "") 
         form = names[f.at] if not f.of_speed else speed if f.of is None else speed[1:-1].replace("− ", f"− {own}")
         position = [f"{f.wave}({own}{form})"]
     if f.dry:
-        return f"{position[0]} {sign}"
+        return f"{position[0]} {given}"
+    if f.input is not None:
+        return f"{given} {position[0]}"
     return " ".join([*position, *size, *([raised(speed, f.c)] if f.c else [])])
 
 

@@ -22,6 +22,7 @@ from herglotz.data import Trajectories
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.models import ContactLagrangian
 from herglotz.models.config import POWERS
+from herglotz.models.drag import input_forces
 from herglotz.progress import beat
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
@@ -236,6 +237,7 @@ def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> Named
     if network or told or c.objective != "trajectory" or not by_name or data.dof > MOST:
         return None
     every, rare = candidates(data, c.translations), set(special(data))
+    every = every.joined(NamedTerms(drag=input_forces(c.drag)))
     every = replace(every, dissipation=tuple(POWERS) if c.dissipation else ())
     if not rare & set(own.features):
         every = every.only(set(every.names) - rare)

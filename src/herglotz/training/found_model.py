@@ -22,13 +22,14 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     bare = replace(base, start={})
     own = set(trial.problem.parameters.numbers)
     keys = [fitter.keys[name] for name in fitter.start if name in own]
-    every = fitter.terms
+    every = replace(fitter.terms, drag=fitter.settings.drag)
     terms = every.only(keys)
     dry = any(key.startswith(("friction.coulomb", "friction.breakaway")) for key in keys)
     forces = [key for key in keys if key.startswith(("friction.", "coupling."))]
     between = any(key in keys for key in ("kinetic.off_diagonal", "coupling.viscous"))
     terms = replace(terms, dry=dry, apart=not between, one_rate=every.one_rate or not forces)
     variant = trial.fitter.variant
+    config = replace(config, drag=())
     of = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking and dry)
     names = ParameterVector(build_model(bare, of, "none"))
     absent = [

@@ -213,7 +213,7 @@ def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
 
 
 def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:
-    """The settings of a model with these terms."""
+    """The settings of a model with these terms, beside the drag of the settings."""
     driven = data.u is not None and config.use_inputs
     forced = bool(terms.drag) or terms.dry or driven or (data.dof > 1 and not terms.one_rate)
     lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
@@ -222,7 +222,8 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     several, apart = data.dof > 1, lengths or terms.apart
     level = "forced" if forced else "full" if terms.dissipation else "linear"
     return replace(
-        config, level=level, features=terms.features, drag=terms.drag, coulomb=terms.dry,
+        config, level=level, features=terms.features, coulomb=terms.dry,
+        drag=tuple(dict.fromkeys((*terms.drag, *config.drag))),
         diagonal=several and apart, coupled=forced and several and not apart, order=2 if terms.dissipation else order,
         substeps=substeps, objective="trajectory", absent=terms.absent, dissipation=terms.dissipation,
         alike=data.dof == 1,

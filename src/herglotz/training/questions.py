@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from herglotz.training.acting_inputs import columns_of, taken_terms
 from herglotz.training.dissipation import with_dissipation
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
@@ -59,15 +60,27 @@ class Questions:
     def how_inputs_act(self) -> None:
         """Terms anew with other terms of the inputs, where the model asks for some; then the hold once more.
 
-        A hold may have stood for the term that was missing.
+        A hold may have stood for the term that was missing, and some of the terms for the hold.
         """
         if self.best is None or not (terms := self.read.input_terms(self.best)):
             return
+        recorded = self.wanted, self.read
         read = self.read.driven_by(terms)
         found = _searched(read)
-        if found is not None and found.replaces(self.best) and read.finalist(found, (self.best, found)) is found:
-            self.input_terms, self.wanted, self.read, self.best = terms, self.wanted.driven_by(terms), read, found
-            self.how_inputs_hold()
+        if found is None or not found.replaces(self.best) or read.finalist(found, (self.best, found)) is not found:
+            return
+        self._drive(terms, self.wanted, read, found)
+        if self.how_inputs_hold():
+            left = taken_terms(self.read.settled(self.best, swapped=True), terms)
+            wanted, read = (x.of(replace(x.data, hold=self.hold)) for x in recorded)
+            found = _searched(read := read.driven_by(left)) if left != terms else None
+            if found is not None and not self.best.replaces(found):
+                self._drive(left, wanted, read, found)
+
+    def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
+        """The inputs act by these terms as well, in all data and in the search of a model."""
+        self.input_terms, self.wanted = columns_of(terms), wanted.driven_by(terms)
+        self.read, self.best = read, found
 
     def functions(self) -> None:
         """A model of functions, where it is better; then holds and zeros once more.

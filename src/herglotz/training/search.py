@@ -18,14 +18,15 @@ from herglotz.data.input_terms import with_input_terms
 from herglotz.data.roughness import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
+from herglotz.models.drag import input_forces
 from herglotz.models.features import spherical
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
-from herglotz.training.acting_inputs import asked_terms
+from herglotz.training.acting_inputs import asked_terms, columns_of
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
-from herglotz.training.named_terms import DRY, candidates, special, started
+from herglotz.training.named_terms import DRY, NamedTerms, candidates, special, started
 from herglotz.training.offers import standing
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
@@ -161,6 +162,7 @@ class Search:
         """
         local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
         every = every.only(set(every.names).difference(special(self.data), spherical(self.data.angles)))
+        every = every.joined(NamedTerms(drag=self.config.drag))
         start = None if local is None else start_of(self.data, self.base, every, local)
         if start is None:
             return None
@@ -242,7 +244,7 @@ class Search:
             return False
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        line = Search(data, base, self.config, outliers=self.freedom is not None)
+        line = Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
         if trial is not None and trial.whole and (line.first is None or trial.replaces(line.first)):
             return False  # the motion is followed as it is, and no worse model is worth a search
         other = line.run()
@@ -296,10 +298,11 @@ class Search:
         return found
 
     def driven_by(self, terms: Sequence[str]) -> Search:
-        """The same of data whose inputs act by these terms as well."""
-        data = with_input_terms(self.data, terms)
+        """The same of data whose inputs act by these terms as well: columns of u, and forces of the position."""
+        forces = input_forces(terms)
+        data = with_input_terms(self.data, columns_of(terms))
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        other = Search(data, base, self.config, outliers=self.freedom is not None)
+        other = Search(data, base, replace(self.config, drag=forces), outliers=self.freedom is not None)
         other.order = self.order
         return other
 

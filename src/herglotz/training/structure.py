@@ -175,12 +175,13 @@ def search(
         again = Questions(wanted.of(measured(data, drifts=found)), holds)
         if again.best is not None and again.best.at_the_noise and again.best.fits_better(best, len(found)):
             asked, rates, why["drifts"] = again, found, f"rates {sure(*drift)}"
+    asked.how_inputs_act()
     # With positions on a line, whose inputs and sizes differ, `look` searches again.
     if asked.read.better_on_a_line(asked.best):
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if asked.best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")
-    for question in (asked.how_inputs_act, asked.functions, asked.all_data):
+    for question in (asked.functions, asked.all_data):
         question()
     found, differ, zeros = asked.best, asked.differ, ()
     if found is None:

@@ -33,10 +33,12 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
     "affine": (1, {"level": "affine", "damping_width": 2}),
     "full": (1, {"level": "full", "action_width": 1}),
     "viscous, motors": (2, {"level": "forced", "inputs": 2, "input_zero": True, "coupled": True}),
+    "inputs by position": (1, {"level": "forced", "inputs": 1, "input_zero": True, "drag": ("u1 cos(q1)",)}),
     "dry, drag": (2, {"level": "forced", "inputs": 1, "coulomb": True, "drag": ("|v1| v1", "load 2")}),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
 }
-QUICK = ("conservative", "affine", "viscous, motors", "sticking")  # the others take 5 s and more each
+# The others take 5 s and more each.
+QUICK = ("conservative", "affine", "viscous, motors", "inputs by position", "sticking")
 
 
 def address(x):

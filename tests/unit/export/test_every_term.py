@@ -60,6 +60,10 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "forced", "diagonal": True, "features": ("cos(q2) v1 v2", "q1^3", "sin(q2) v1^2"), "coulomb": True,
         "inputs": 1, "input_map": (1.0, 0.0), "drag": ("load 2", "|v2| v2", "q1 sgn(v2)", "sin(q2) sgn(v1)"),
     }),
+    "inputs by position": ("la", {
+        "level": "forced", "diagonal": True, "inputs": 2, "input_zero": True,
+        "drag": ("u1 sin(q2) on q1", "u2 cos(q2)", "u1 q1"),
+    }),
     "a turning joint": ("aa", {"level": "forced", "features": ("spherical",), "inputs": 1, "input_map": (1.0, 0.0)}),
     "a slide that turns": ("la", {"level": "forced", "features": ("slides",), "inputs": 1, "input_map": (0.0, 1.0)}),
     "lengths": ("ll", {
@@ -212,7 +216,7 @@ def kinds(config: ModelConfig) -> Iterator[tuple]:
             yield "feature", x.function, x.power < 0, len(x.velocities), len(set(x.velocities))
     for text in config.drag:
         f = parse_drag(text, config.angles)
-        yield "drag", f.dry, f.wave, f.of_speed, f.air, f.a > 0, f.b, min(f.c, 2), f.of is None
+        yield "drag", f.dry, f.wave, f.of_speed, f.air, f.a > 0, f.b, min(f.c, 2), f.of is None, f.input is None
 
 
 def recordings() -> Iterator[Trajectories]:

@@ -75,6 +75,12 @@ MODELS: dict[str, tuple[dict[str, Any], dict[str, list[float]]]] = {
         {"friction.coulomb": [0.15], "friction.breakaway": [0.1], "friction.log_stribeck": [-1.0],
          "friction.input_map": [0.9], "friction.input_zero": [0.3], "drag.coefficient": [0.05, 0.1]},
     ),
+    "inputs by position": (
+        {"angles": (False, True), "level": "forced", "diagonal": True, "inputs": 2, "input_zero": True,
+         "drag": ("u1 sin(q2) on q1", "u2 cos(q2)", "u2 q1^2")},
+        {"kinetic.log_diagonal": [0.3], "friction.viscous": [0.05, 0.1], "friction.input_zero": [0.0, 0.3],
+         "friction.input_map": [0.2, 0.0, 0.0, 0.4], "drag.coefficient": [0.7, -0.8, 0.3]},
+    ),
     "joints": (
         {"angles": (True, True), "level": "forced", "coupled": True, "inputs": 2, "input_map": (1.0, 0.2, -0.3, 0.8),
          "features": ("cos(q1 - q2) v1 v2",), "stiffness": (1.0, 0.7)},
@@ -97,7 +103,8 @@ MODELS: dict[str, tuple[dict[str, Any], dict[str, list[float]]]] = {
         {"damping.drag": [0.1]},
     ),
 }  # fmt: skip
-LONG = ("springs", "waves", "order 4", "joints", "damping by position")  # in steps that show in the motion
+# In steps that show in the motion.
+LONG = ("springs", "waves", "order 4", "joints", "inputs by position", "damping by position")
 
 
 def run_of(settings, numbers, *, h=H, count=3, steps=160, hold="zero"):

@@ -212,8 +212,8 @@ def test_the_zeros_of_a_part_are_those_of_all(asked):
     found, seen = asked(long=True, zeros=zeros)
     assert found.zeros == pytest.approx((0.0, 0.1))
     assert seen == [
-        ("part", "zeros"), ("part'", "hold of full"), ("part'", "run"), ("part", "drifts"), ("part'", "line"),
-        ("part'", "terms"), ("part'", "functions"), ("whole", "of_part, True"),
+        ("part", "zeros"), ("part'", "hold of full"), ("part'", "run"), ("part", "drifts"), ("part'", "terms"),
+        ("part'", "line"), ("part'", "functions"), ("whole", "of_part, True"),
     ]  # fmt: skip
     on_a_line, seen = asked(zeros=zeros, line=True)
     assert not on_a_line.turning
@@ -302,13 +302,13 @@ def test_the_hold_of_samples_far_apart_is_asked_of_all_samples(asked):
 
 
 def test_terms_of_inputs_are_those_of_all_data(asked):
-    # fails if functions are asked for where a term of the input is what is missing, the part alone is driven by it, or
-    # a hold that stood for the term stays
+    # fails if functions, or terms on a line, are asked for before a term of the input that is what is missing, the part
+    # alone is driven by it, or a hold that stood for the term stays
     found, seen = asked(long=True, terms=("u^2",))
     assert found.input_terms == ("u^2",)
-    assert seen[-6:] == [
+    assert seen[-7:] == [
         ("part", "terms"), ("part", "driven by u^2"), ("part'", "run"), ("whole", "driven by u^2"),
-        ("part'", "hold of cos(q1)"), ("part'", "functions"),
+        ("part'", "hold of cos(q1)"), ("part'", "line"), ("part'", "functions"),
     ]  # fmt: skip
 
 

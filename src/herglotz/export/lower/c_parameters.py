@@ -47,19 +47,28 @@ def identifier(name: str) -> str:
 
 
 def inputs_constants(model: ContactLagrangian, dtype: str) -> str:
-    """The matrix G of the inputs and −G u₀; 1 and 0 for an L_d that takes u itself; empty without inputs."""
-    if not (m := model.config.inputs):
+    """The matrix and the offset of what a step takes of the inputs; empty without inputs."""
+    if not model.config.inputs:
         return ""
-    friction = model.friction
-    given = (torch.eye(m), torch.zeros(m)) if friction is None else (friction.input_map, friction.offset())
-    map_, offset = (numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype) for x in given)
+    map_, offset = (numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype) for x in _taken(model))
     lines = ["/* Inputs u act as input_map u + input_offset. */"]
     lines.append(f"static const hz_real hz_input_map[hz_INPUTS * hz_M] = {{{map_}}};")
     return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_INPUTS] = {{{offset}}};\n"])
 
 
+def _taken(model: ContactLagrangian) -> tuple[Tensor, Tensor]:
+    """G and −G u₀, below 1 and 0 where inputs act through the position; 1 and 0 for an L_d that takes u itself."""
+    friction, m = model.friction, model.config.inputs
+    if friction is None:
+        return torch.eye(m), torch.zeros(m)
+    G, offset = friction.input_map, friction.offset()
+    if not model.capabilities.inputs_by_position:
+        return G, offset
+    return torch.cat([torch.eye(m).to(G), G]), torch.cat([offset.new_zeros(m), offset])
+
+
 def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables: dict[tuple[float, ...], str]) -> str:
-    """The matrix G of the inputs and −G u₀, and the derivative of G (u − u₀) by θ, as functions of θ."""
+    """The matrix and the offset of what a step takes of the inputs, and its derivative by θ, as functions of θ."""
     if not model.inputs:
         return ""
     equations = Equations.of(model, values)
@@ -69,8 +78,9 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
     assert friction is not None
 
     def forces(u: Tensor) -> tuple[Tensor, ...]:
-        shared = (friction.input_map, friction.offset())
-        return *(x.expand(len(u), *x.shape) for x in shared), friction.applied(u)
+        shared = _taken(equations.model)
+        own = [u] if equations.model.capabilities.inputs_by_position else []
+        return *(x.expand(len(u), *x.shape) for x in shared), torch.cat([*own, friction.applied(u)], -1)
 
     at = equations.of_numbers(forces)
 
@@ -87,8 +97,8 @@ def inputs_source(model: ContactLagrangian, values: Mapping[str, float], tables:
 
 
 INPUTS_AT = """
-/* The forces of inputs u are map u + offset. */
+/* A step takes map u + offset of inputs u. */
 static inline void FN_inputs_at(const REAL theta[hz_P], REAL map[hz_INPUTS * hz_M], REAL offset[hz_INPUTS])"""
 PUSH_SLOPES = """
-/* Their derivatives by theta, row by row. */
+/* The derivatives of what a step takes of u by theta, row by row. */
 static inline void FN_push_slopes(const REAL *u, const REAL theta[hz_P], REAL slopes[hz_INPUTS * hz_P])"""
