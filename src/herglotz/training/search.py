@@ -131,9 +131,12 @@ class Search:
         fitter = self.fitter(found.fitter.variant.crossing(self.data.typical_step / found.fitter.data.typical_step))
         if found.fitter.data.lengths == self.data.lengths:
             return fitter.fit(found.taken, found.values, found.length, found, 2 * ITERATIONS)
+        whole = fitter.fit(found.taken, found.values, fitter.lengths[-1], None, 2 * ITERATIONS)
+        if whole is not None and whole.near:
+            return self.finer(whole)
         first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
         other = fitter.fit(found.taken, found.values, first, None)
-        return None if other is None else self.finer(fitter.leap(other))
+        return other and self.finer(fitter.leap(other))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
         """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
