@@ -132,7 +132,7 @@ def test_the_prefix_of_a_header(tiny_run, tmp_path, capsys):
     assert "arm_step(" in out.read_text()
     assert read_header(out)[1]["name"] == "arm"
     assert main(["export", str(tiny_run), "--out", str(tmp_path / "a.onnx"), "--name", "arm"]) == 2
-    assert "is of C headers only" in capsys.readouterr().err
+    assert "setting name is of c, casadi, acados, fmu, fmu2 only, not of onnx" in capsys.readouterr().err
     assert main(["export", str(tiny_run), "--out", str(out), "--force", "--name", "2 arms"]) == 2
     assert "must be a C identifier" in capsys.readouterr().err
 
@@ -146,7 +146,7 @@ def test_the_numbers_of_a_header(tiny_run, tmp_path, capsys):
     plain = read_header(out)[1]
     assert plain["dtype"] == "float32"
     assert main(["export", str(tiny_run), "--out", str(tmp_path / "a.onnx"), "--dtype", "float32"]) == 2
-    assert "is of C headers only" in capsys.readouterr().err
+    assert "setting dtype is of c, casadi, acados, fmu, fmu2 only" in capsys.readouterr().err
     tuned = load_run(tiny_run)
     tuned.metrics["tuned"] = {"chosen": {"dtype": "float64", "tol": 1e-12}}
     export_run(tuned, out, dtype="float32")
@@ -240,7 +240,7 @@ def test_parameters_and_extras_of_a_header(tiny_run, tmp_path, capsys):
         assert name in text
     capsys.readouterr()
     assert main(["export", str(tiny_run), "--out", str(tmp_path / "arm.onnx"), *asked]) == 2
-    assert "C headers only" in capsys.readouterr().err
+    assert "is of c only, not of onnx" in capsys.readouterr().err
 
 
 def test_a_number_between_two_runs(tiny_run, tmp_path, capsys):
