@@ -22,20 +22,6 @@ def wild(name):
     return build(noise, draw=1, **settings)
 
 
-@pytest.mark.parametrize("name", WILD)
-def test_a_failed_sample_is_named_and_alone(name):
-    # fails if one sample's failed Newton changes a neighbour by a bit
-    model, start = wild(name), starts(16)
-    with torch.no_grad():
-        out = Stepper(model, max_iterations=12).rollout(*start, h=0.5, steps=1)
-        ok = out.ok
-        assert 0 < int(ok.sum()) < 16
-        assert_nothing_silent(out)
-        alone = Stepper(model, max_iterations=12).rollout(*(x[ok] for x in start), h=0.5, steps=1)
-    assert torch.equal(alone.q[:, 1], out.q[ok][:, 1])
-    assert torch.equal(alone.p[:, 1], out.p[ok][:, 1])
-
-
 def test_the_first_failed_sample_is_named():
     # fails if a step that fails names another sample, or no reason
     model, start = wild("forced"), starts(16)
