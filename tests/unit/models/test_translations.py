@@ -14,6 +14,7 @@ from herglotz.models.translations import directions, unchanged
 from herglotz.stepping import State, Stepper
 from herglotz.theory import symmetries
 from herglotz.training.named_terms import candidates
+from tests.lagrangians import random_model
 
 F64 = torch.float64
 
@@ -25,11 +26,7 @@ def config(**settings):
 
 
 def model(**settings):
-    made, make = ContactLagrangian(config(**settings)), torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for x in made.parameters():
-            x.add_(0.2 * torch.randn(x.shape, generator=make, dtype=F64))
-    return made.requires_grad_(False)
+    return random_model(config(**settings), spread=0.2, seed=0).requires_grad_(False)
 
 
 def states(n):
