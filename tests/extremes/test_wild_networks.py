@@ -5,9 +5,8 @@ import torch
 from extreme_cases import LEVELS, TOLD, assert_nothing_silent, build, starts
 
 import herglotz
-from herglotz.codegen.c_compiler import compiler
-from herglotz.errors import InputError
 from herglotz.stepping import StepError, Stepper, explain_step
+from tests.compilers import needs_compiler
 
 WILD = {
     "mass": (100.0, {"mass_width": 6}),
@@ -71,12 +70,9 @@ def test_weights_that_overflow_end_with_a_status(level):
 
 
 @pytest.mark.parametrize("name", ["forced", "correction"])
+@needs_compiler
 def test_lanes_of_the_compiled_step_are_apart(name):
     # fails if the samples that C steps side by side, in the registers of the processor, share a failure
-    try:
-        compiler()
-    except InputError as error:
-        pytest.skip(str(error))
     stepper, start = herglotz.compile(wild(name)), starts(60)
     out = stepper.rollout(*start, h=0.5, steps=1)
     assert_nothing_silent(out)

@@ -24,6 +24,7 @@ from herglotz.export.metadata import KEY
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of, with_values
 from herglotz.training import load_run, save_run
+from tests.compilers import needs_compiler
 
 pytest.importorskip("onnxruntime")
 
@@ -101,7 +102,7 @@ def test_rollout_of_the_file_is_that_of_the_run(tiny_onnx, tiny_run, tmp_path):
     assert (one.names, one.units, one.angles, one.time_unit) == (two.names, two.units, two.angles, two.time_unit)
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+@needs_compiler
 def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
     # fails if a run or a file steps at any h in silence, or a motion leaves the data in silence
     out, motion = str(tmp_path / "a.h"), ["--steps", "3", "--out", str(tmp_path / "a.csv"), "--force"]
@@ -200,7 +201,7 @@ def test_a_file_made_by_hand_is_one_message(tiny_onnx, tmp_path, capsys):
     assert said.endswith("export the model again")
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+@needs_compiler
 @pytest.mark.parametrize("form", ["casadi", "acados", "fmu", "fmu2"])
 def test_files_around_the_header(form, tiny_run, tmp_path, capsys):
     # fails if a file lacks the run's names, start or prefix, or what compiles the header in it does not find it

@@ -1,6 +1,5 @@
 """Arguments that no format steps from: an error in one line, whatever file they are given to (states: unit/trust)."""
 
-import shutil
 from typing import Any
 
 import pytest
@@ -11,10 +10,8 @@ import herglotz
 from herglotz.errors import InputError
 from herglotz.export import export_aoti, export_c, export_onnx, export_pt2, load_exported
 from herglotz.stepping import State
+from tests.compilers import needs_compiler
 
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH"
-)
 FORMATS = [
     pytest.param("pt2", marks=pytest.mark.slow),  # 10 s to write
     "onnx",

@@ -14,11 +14,10 @@ from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compile_c, export_c, load_c, weights_digest
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
+from tests.compilers import CC, needs_compiler
 from tests.lagrangians import even_model, random_model, states as normal_states
 
-CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
 CXX = next((c for c in ("c++", "g++", "clang++") if shutil.which(c)), None)
-needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
 BOX = {"q_low": [-1.0], "q_high": [1.0], "p_low": [-1.0], "p_high": [1.0], "s_low": [-5.0], "s_high": [5.0]}
 KINDS = {"linear": ("linear", 0, True), "affine": ("affine", 0, True), "correction": ("linear", 6, True)}
 KINDS |= {"both": ("affine", 3, True), "alone": ("linear", 6, False)}

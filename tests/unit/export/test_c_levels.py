@@ -1,7 +1,6 @@
 """C for every level of the ladder: it computes what the eager stepper does, in float64 and in float32."""
 
 import functools
-import shutil
 from typing import Any
 
 import pytest
@@ -14,10 +13,9 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import ActionFlow
 from herglotz.models.mass import PositionKinetic
 from herglotz.stepping import State, Stepper
+from tests.compilers import needs_compiler
 
-pytestmark = pytest.mark.skipif(
-    not any(shutil.which(c) for c in ("cc", "gcc", "clang")), reason="no C compiler in the PATH"
-)
+pytestmark = needs_compiler
 H = 0.1
 CASES: dict[str, dict[str, Any]] = {
     "conservative": {"level": "conservative"},

@@ -1,6 +1,5 @@
 """Translations that a model has by construction, at every weight of its networks."""
 
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -14,6 +13,7 @@ from herglotz.models.translations import directions, unchanged
 from herglotz.stepping import State, Stepper
 from herglotz.theory import symmetries
 from herglotz.training.named_terms import candidates
+from tests.compilers import needs_compiler
 from tests.lagrangians import random_model
 
 F64 = torch.float64
@@ -132,7 +132,7 @@ def test_what_would_see_a_translation_is_refused(settings, message):
         config(**settings)
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
+@needs_compiler
 def test_translations_hold_in_c():
     # fails if a traced network reads features without the projection
     made, x = model(level="linear", correction_width=5, translations=("q1 + q2",)), states(2)
