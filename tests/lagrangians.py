@@ -29,8 +29,8 @@ def scene_states(system: Scene, count: int = 3, seed: int = 0, dtype: torch.dtyp
     for limits in (system.q_range, system.v_range):
         low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
         draws.append(low + (high - low) * torch.rand(count, system.dof, generator=make, dtype=torch.float64))
-    s = 2 * torch.rand(count, generator=make, dtype=torch.float64) - 1
-    return State(*(x.to(dtype) for x in (draws[0], system.momentum(*draws, s), s)))
+    (q, v), s = draws, 2 * torch.rand(count, generator=make, dtype=torch.float64) - 1
+    return State(*(x.to(dtype) for x in (q, system.momentum(q, v, s), s)))
 
 
 def nonlinear(q0, q1, s0, h):
