@@ -1,7 +1,8 @@
 """What all benchmarks share: flags, the machine, C files, one JSON file that runs add to, tables and pictures.
 
 Every command writes `NAME.json`, what was measured, and `NAME.md`, the table made from it. What an earlier run measured
-is kept, so that parts can be run alone and an interrupted run goes on where it stopped.
+is kept, so that parts can be run alone and an interrupted run goes on where it stopped. Nothing here imports torch
+before torch is used: the memory of the judge must not count for a fit.
 """
 
 from __future__ import annotations
@@ -22,11 +23,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from herglotz.codegen.c_compiler import compiler
-from herglotz.data.files import write_atomically
-
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DATA = ROOT.parent / "shared" / "data"  # measured recordings; data/README.md says where to get them
@@ -39,6 +35,8 @@ def parser(text: str | None, *, quick: bool = False) -> argparse.ArgumentParser:
 
     Small matrices on several threads only wait for one another; OMP_NUM_THREADS sets another number.
     """
+    import torch
+
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--out", type=Path, help="the JSON file, or a folder for it (default benchmarks/results)")
@@ -72,11 +70,18 @@ def commit() -> str:
 
 def conditions(*packages: str) -> dict[str, Any]:
     """Commit, machine with its load, and versions of torch, python and these packages."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    processor = next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), platform.machine())
-    machine = {"processor": processor, "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+    import torch
+
+    machine = {"processor": processor(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
     versions = {"python": platform.python_version()} | {name: _version(name) for name in ("torch", *packages)}
     return {"commit": commit(), "machine": machine | {"load": os.getloadavg()}, "versions": versions}
+
+
+def processor() -> str:
+    """Name of the processor."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), platform.machine())
 
 
 def _version(package: str) -> str:
@@ -88,6 +93,8 @@ def _version(package: str) -> str:
 
 def compiled(source: str, header: str, text: str, *flags: str) -> ctypes.CDLL:
     """A C file of this folder as a library; `text` is the header that it includes by the name `header`."""
+    from herglotz.codegen.c_compiler import compiler
+
     with tempfile.TemporaryDirectory(prefix="herglotz-bench-") as folder:
         Path(folder, header).write_text(text)
         library = Path(folder, "library.so")
@@ -98,6 +105,8 @@ def compiled(source: str, header: str, text: str, *flags: str) -> ctypes.CDLL:
 
 def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> float:
     """Processor time of all threads: what another program takes from this one does not count."""
+    import torch
+
     begin = clock()
     with torch.no_grad():
         run()
@@ -111,9 +120,15 @@ def load(path: Path, empty: dict[str, Any]) -> dict[str, Any]:
 
 def store(path: Path, result: dict[str, Any], text: str | None = None) -> None:
     """Write the JSON, and the table beside it; each file appears whole or not at all."""
-    write_atomically(path, (_json(result, 0) + "\n").encode())
+    _write(path, (_json(result, 0) + "\n").encode())
     if text is not None:
-        write_atomically(path.with_suffix(".md"), (text.rstrip("\n") + "\n").encode())
+        _write(path.with_suffix(".md"), (text.rstrip("\n") + "\n").encode())
+
+
+def _write(path: Path, content: bytes) -> None:
+    part = path.with_name(f"{path.name}.part")
+    part.write_bytes(content)
+    part.replace(path)
 
 
 def _json(value: Any, depth: int) -> str:
@@ -143,7 +158,7 @@ def _rounded(value: Any) -> Any:
 def table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:
     """Lines of a markdown table."""
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    return lines + [f"| {' | '.join(map(str, row))} |" for row in rows]
+    return lines + [f"| {' | '.join(str(x).replace('|', '/') for x in row)} |" for row in rows]
 
 
 def spread(values: Iterable[float | None]) -> str:
@@ -184,4 +199,4 @@ def picture(figure: Any, path: Path) -> None:
     figure.savefig(whole, format="png", dpi=DPI)
     image = Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
     image.save(small, format="png", optimize=True)
-    write_atomically(path, small.getvalue())
+    _write(path, small.getvalue())

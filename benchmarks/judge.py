@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 import threading
@@ -27,11 +26,12 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
 from benchmarks.judging import catalogue, tables
 from benchmarks.judging.catalogue import Row
 from benchmarks.judging.running import ROOT, Judge, environment
 
-RESULTS, PREPARED = ROOT / "benchmarks" / "results", ROOT / "runs" / "judge" / "prepared"
+PREPARED = ROOT / "runs" / "judge" / "prepared"
 
 
 def commit_of(source: Path | None) -> str:
@@ -46,14 +46,6 @@ def commit_of(source: Path | None) -> str:
         ["git", *words], cwd=package, capture_output=True, text=True, check=False
     ).stdout.strip()
     return git("rev-parse", "--short=8", "HEAD") + "+" * bool(git("status", "--short", "."))
-
-
-def machine() -> str:
-    """Processor and number of cores."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    name = next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), platform.machine())
-    return f"{name}, {os.cpu_count()} cores"
 
 
 def kept(path: Path, commit: str | None = None) -> dict[str, dict[str, Any]]:
@@ -108,19 +100,6 @@ def line(row: dict[str, Any]) -> str:
     return f"{row['name']:42} {error:26} {row['cpu_s']:6.1f} s {row['peak_mb']:6d} MB  {notes}"
 
 
-def store(path: Path, result: dict[str, Any]) -> None:
-    """Write the JSON, a row a line, and the table beside it; each file appears whole or not at all."""
-    as_line = lambda value: json.dumps(value, ensure_ascii=False)  # noqa: E731
-    head = [f"{as_line(key)}: {as_line(value)}" for key, value in result.items() if key != "rows"]
-    rows = ",\n".join(map(as_line, result["rows"]))
-    texts = {path: "{\n" + ",\n".join(head) + ',\n"rows": [\n' + rows + "\n]}\n"}
-    texts[path.with_suffix(".md")] = tables.report(result)
-    for file, text in texts.items():
-        part = file.with_name(f"{file.name}.part")
-        part.write_text(text, encoding="utf-8")
-        part.replace(file)
-
-
 def opened(path: Path) -> dict[str, Any]:
     """A table, or the rows of a run that goes on."""
     if path.suffix != ".jsonl":
@@ -169,7 +148,7 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.compare:
         return compare(arguments.compare[0], arguments.compare[1], arguments.floor, asked)
     source = arguments.source.resolve() if arguments.source else None
-    commit, out = commit_of(source), (arguments.out or RESULTS).resolve()
+    commit, out = commit_of(source), (arguments.out or harness.RESULTS).resolve()
     name = f"judge_quick_{commit}" if arguments.quick else f"judge_{commit}"
     path = out if out.suffix == ".json" else out / f"{name}.json"
     # Rows and runs stand beside a table that was asked for; the results folder of the repository has tables alone.
@@ -180,9 +159,10 @@ def main(argv: list[str] | None = None) -> int:
     rows = kept(beside / "rows.jsonl", commit)
     judge = Judge(arguments.prepared.resolve(), beside / "work", arguments.limit, environment(source))
     measure(wanted, rows, beside / "rows.jsonl", arguments.workers, judge.row, commit)
-    result = {"commit": commit, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "machine": machine()}
+    machine = f"{harness.processor()}, {os.cpu_count()} cores"
+    result = {"commit": commit, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "machine": machine}
     result |= {"limit_s": arguments.limit, "rows": [rows[row.name] for row in wanted]}
-    store(path, result)
+    harness.store(path, result, tables.report(result))
     print(path.with_suffix(".md"))
     return 0
 

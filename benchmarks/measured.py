@@ -21,6 +21,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness, measured_sets as sets
+from benchmarks.judging import recorded
 from herglotz.plots import style
 
 COVERED = (0.80, 0.97)  # share of samples inside a band of nominal 0.9 that counts as kept
@@ -49,16 +50,16 @@ ROWS: dict[str, tuple[tuple[str, ...], Callable[..., dict[str, Any]]]] = {
     "one_trajectory": ((), partial(sets.noise, trajectories=1)),
     "outliers": ((), sets.outliers),
     "disturbed": ((), sets.disturbed),
-    "real_pendulum": ((sets.PENDULUM,), sets.extrapolation(sets.PENDULUM)),
-    "real_pendulum_network": ((sets.PENDULUM,), sets.extrapolation(sets.PENDULUM, "trajectory")),
-    "air_track": ((sets.AIR_TRACK,), sets.extrapolation(sets.AIR_TRACK)),
-    "driven_pendulum": (sets.DFKI, sets.driven_pendulum),
-    "motor_axis": ((sets.MOTOR_AXIS,), sets.motor_axis),
-    "duffing_circuit": ((sets.DUFFING_CIRCUIT,), sets.duffing_circuit),
-    "two_joints": ((sets.TWO_JOINTS,), sets.two_joints),
-    "two_motors": (sets.TWO_MOTORS, sets.two_motors),
+    "real_pendulum": ((recorded.PENDULUM,), sets.extrapolation(recorded.PENDULUM)),
+    "real_pendulum_network": ((recorded.PENDULUM,), sets.extrapolation(recorded.PENDULUM, "trajectory")),
+    "air_track": ((recorded.AIR_TRACK,), sets.extrapolation(recorded.AIR_TRACK)),
+    "driven_pendulum": (recorded.ONE_MOTOR, sets.driven_pendulum),
+    "motor_axis": ((recorded.MOTOR_AXIS,), sets.motor_axis),
+    "duffing_circuit": ((recorded.DUFFING_CIRCUIT,), sets.duffing_circuit),
+    "two_joints": ((recorded.TWO_JOINTS,), sets.two_joints),
+    "two_motors": (recorded.TWO_MOTORS, sets.two_motors),
     "coverage_simulated": ((), sets.coverage_simulated),
-    "coverage_real": ((sets.PENDULUM,), sets.coverage_real),
+    "coverage_real": ((recorded.PENDULUM,), sets.coverage_real),
 }
 CURVES = {
     "simulated, Laplace": ("coverage_simulated", "laplace_measured"),

@@ -28,16 +28,26 @@ the recording: their models, of named terms, start from a linear problem and do 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.judging.recorded import (
+    DUFFING_CIRCUIT,
+    MOTOR_AXIS,
+    ONE_MOTOR,
+    PENDULUM,
+    TWO_JOINTS,
+    TWO_MOTORS,
+    WINDOWS,
+    parted_windows,
+    rows,
+)
+from benchmarks.judging.simulated import with_outliers
 from benchmarks.peers.rollouts import rk4
 from herglotz.data import Trajectories, load, simulate
 from herglotz.least_squares import least_squares
@@ -46,12 +56,6 @@ from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import Bands, FitConfig, Run, ensemble_bands, fit, laplace
 
-PENDULUM = "schmidt_lipson_2009/real_pend_h_1.txt"
-AIR_TRACK = "schmidt_lipson_2009/real_linear_h_1.txt"
-DFKI = tuple(
-    f"dfki_pendulum/control_method_{name}__data_measured.csv"
-    for name in ("energy_shaping", "pd__system_identification", "sac")
-)
 # The authors' identification: tau = J q'' + mgl sin q + b q' + c atan(100 q') + offset.
 J, MGL, VISCOUS, COULOMB, OFFSET = 6.259e-2, 1.022e-1 * 9.81, 4.707e-2, 1.839e-1, -7.586e-2
 
@@ -83,13 +87,7 @@ def noise(seed: int, _folder: Path, trajectories: int = 40) -> dict[str, float]:
 
 
 def outliers(seed: int, _folder: Path) -> dict[str, float]:
-    clean = simulate(scene("damped_pendulum"), trajectories=6, steps=60, h=0.2, noise=0.01, seed=seed)
-    make = torch.Generator().manual_seed(seed + 100)
-    bad = torch.rand(clean.samples, generator=make) < 0.02
-    size = 0.5 + torch.rand(clean.samples, generator=make, dtype=clean.q.dtype)
-    sign = torch.where(torch.rand(clean.samples, generator=make) < 0.5, -1.0, 1.0)
-    dirty = replace(clean, q=clean.q + (bad * sign * size)[:, None])
-    found = {}
+    (clean, dirty), found = with_outliers(seed), {}
     for name, data, robust in (("clean", clean, "auto"), ("robust", dirty, "auto"), ("plain", dirty, "off")):
         run = fit(data, FitConfig(train_fraction=1.0, seed=seed, robust=robust), progress=False)
         found[name] = rollout_rms(run.model, 60, seed)
@@ -151,7 +149,7 @@ def window_rows(data: Trajectories, steps: int) -> Tensor:
 
 def driven_pendulum(seed: int, folder: Path) -> dict[str, float]:
     every = (4, 6, 4)  # 20 ms, as far as a step is 5 or 3.3 ms
-    runs = [load(folder / name).with_angles("position").thinned(m) for name, m in zip(DFKI, every, strict=True)]
+    runs = [load(folder / name).with_angles("position").thinned(m) for name, m in zip(ONE_MOTOR, every, strict=True)]
     *train, test = runs
     run = fit(Trajectories.cat(train), FitConfig(train_fraction=1.0, seed=seed), progress=False)
     found: dict[str, float] = {"segment_steps": run.metrics["segment_steps"]}
@@ -250,25 +248,9 @@ def coverage_real(seed: int, folder: Path) -> dict[str, Any]:
     )
 
 
-MOTOR_AXIS = "emps/emps_estimation.csv"
-DUFFING_CIRCUIT = "silverbox/silverbox_estimation.csv"
-TWO_JOINTS = "uw_double_pendulum/uw_double_pendulum_estimation.csv"
-TWO_MOTORS = tuple(f"dfki_double_pendulum/sys_id_{name}.csv" for name in ("00", "02", "04"))
 AXIS_EVERY, MOTORS_EVERY = 5, 4
 PART, APART = 10_000, 8_000  # samples of the circuit that train; between the starts of two seeds
-LEFT_OUT = 5  # windows of the joints
-WINDOWS, HORIZONS = 120, (0.25, 0.5, 1.0)  # of the motors, s
-
-
-def rows(folder: Path, *parts: tuple[str, slice]) -> Trajectories:
-    """These samples of these files, each a recording, as a user would give them: as a table of its own."""
-    with tempfile.TemporaryDirectory() as made:
-        path, sets = Path(made) / "rows.csv", []
-        for name, which in parts:
-            head, *lines = (folder / name).read_text().splitlines()
-            path.write_text("\n".join([head, *lines[which]]))
-            sets.append(load(path, show=False))
-    return Trajectories.cat(sets)
+HORIZONS = (0.25, 0.5, 1.0)  # of the motors, s
 
 
 def fitted(data: Trajectories) -> Run:
@@ -282,27 +264,26 @@ def scored(run: Run, test: Trajectories, name: str = "rms", **windows: Any) -> d
 
 def motor_axis(seed: int, folder: Path) -> dict[str, Any]:
     every = slice(seed % AXIS_EVERY, None, AXIS_EVERY)
-    data = rows(folder, (MOTOR_AXIS, every))
+    data = rows(folder / MOTOR_AXIS, every)
     train, test = data.split_time(2 / 3)
     return scored(fitted(train), test) | scored(fitted(data), data, "same_part_rms")
 
 
 def duffing_circuit(seed: int, folder: Path) -> dict[str, Any]:
     first = APART * seed
-    train, test = (rows(folder, (DUFFING_CIRCUIT, slice(start, start + PART))) for start in (first, first + PART))
+    train, test = (rows(folder / DUFFING_CIRCUIT, slice(start, start + PART)) for start in (first, first + PART))
     return scored(fitted(train), test)
 
 
 def two_joints(seed: int, folder: Path) -> dict[str, Any]:
-    data = load(folder / TWO_JOINTS, show=False)
-    out = np.random.default_rng(seed).permutation(len(data))[:LEFT_OUT].tolist()
-    return scored(fitted(data.select(b for b in range(len(data)) if b not in out)), data.select(out))
+    train, test = parted_windows(load(folder / TWO_JOINTS, show=False), seed)
+    return scored(fitted(train), test)
 
 
 def two_motors(seed: int, folder: Path) -> dict[str, Any]:
     every = slice(seed % MOTORS_EVERY, None, MOTORS_EVERY)
-    *train, test = ((name, every) for name in TWO_MOTORS)
-    run, found = fitted(rows(folder, *train)), {}
+    *train, test = (rows(folder / name, every) for name in TWO_MOTORS)
+    run, found = fitted(Trajectories.cat(train)), {}
     for horizon in HORIZONS:
-        found |= scored(run, rows(folder, test), f"rms_{horizon:g}s", windows=WINDOWS, horizon=horizon)
+        found |= scored(run, test, f"rms_{horizon:g}s", windows=WINDOWS, horizon=horizon)
     return found

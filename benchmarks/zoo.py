@@ -54,22 +54,19 @@ from benchmarks.zoo_systems.systems import ZooSystem
 
 NOISES = (("exact", 0.0), ("with noise", 0.005))  # of each fixed law
 LEAST = 10.0  # s of processor time that a learned peer has at least
-KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
 
 
 def measure(of: ZooSystem, folder: Path, limit: float, peers: Sequence[str] = tuple(LEARNED)) -> dict[str, Any]:
     """One row of the results."""
-    row = of.facts() | {"beyond": unseen_excess(of)}
     ours = fit_ours(of, folder, limit)
-    kept = {name: ours.metrics[name] for name in KEPT if name in ours.metrics}
-    row["ours"] = {**numbers(of, ours.predictions), "cpu_s": ours.cpu, "said": ours.said, "exit": ours.code, **kept}
-    mine = number(row["ours"]["score"])
-    row["outcome"] = outcome(mine, number(row["ours"]["relative"]), bool(ours.said))
+    row = of.facts() | {"beyond": unseen_excess(of), "ours": ours}
+    mine = number(ours["score"])
+    row["outcome"] = outcome(mine, number(ours["relative"]), bool(ours["said"]))
     if of.attainable is None:
         others = {"known": lambda of: MechanismModel(of.fitted), "sindy": fit_sindy}
     else:
         row["attainable"] = of.attainable
-        others = {name: partial(fit_learned, name=name, budget=max(LEAST, ours.cpu)) for name in peers}
+        others = {name: partial(fit_learned, name=name, budget=max(LEAST, ours["cpu_s"])) for name in peers}
     for name, fit in others.items():
         row[name] = peer(of, fit)
         if name != "known":
@@ -92,11 +89,10 @@ def unseen_excess(of: ZooSystem) -> float:
     return round(max(0.0, float(out.max())), 4)
 
 
-def numbers(of: ZooSystem, found: Predictions | None) -> dict[str, float | None]:
+def numbers(of: ZooSystem, found: Predictions) -> dict[str, float | None]:
     """Errors over the noise, of each part too, and over the size of the motion; None where a sample was not reached."""
-    pair = (math.inf, math.inf) if found is None else (score(of, found), relative(of, found))
-    values = dict(zip(("score", "relative"), pair, strict=True))
-    values |= {f"score_{part}": score(of, {part: pairs}) for part, pairs in (found or {}).items()}
+    values = {"score": score(of, found), "relative": relative(of, found)}
+    values |= {f"score_{part}": score(of, {part: pairs}) for part, pairs in found.items()}
     return {name: x if math.isfinite(x) else None for name, x in values.items()}
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes.scene import Scene
 from herglotz.stepping import State
 
 
@@ -19,6 +20,17 @@ def states_in_turn(n: int = 1, count: int = 9, seed: int = 0, dtype: torch.dtype
     make = torch.Generator().manual_seed(seed)
     q, p = (torch.randn(count, n, generator=make, dtype=torch.float64).to(dtype) for _ in range(2))
     return State(q, p, torch.randn(count, generator=make, dtype=torch.float64).to(dtype))
+
+
+def scene_states(system: Scene, count: int = 3, seed: int = 0, dtype: torch.dtype = torch.float64) -> State:
+    """Uniform positions and velocities in the scene's ranges, and actions in −1 … 1."""
+    make = torch.Generator().manual_seed(seed)
+    draws = []
+    for limits in (system.q_range, system.v_range):
+        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
+        draws.append(low + (high - low) * torch.rand(count, system.dof, generator=make, dtype=torch.float64))
+    (q, v), s = draws, 2 * torch.rand(count, generator=make, dtype=torch.float64) - 1
+    return State(*(x.to(dtype) for x in (q, system.momentum(q, v, s), s)))
 
 
 def nonlinear(q0, q1, s0, h):
@@ -57,13 +69,21 @@ def wavy(q):
     return torch.sin(q[..., 0]) + 0.4 * q[..., 1] ** 3 + q[..., 0] * q[..., 1]
 
 
-def random_model(config: ModelConfig, dtype: torch.dtype = torch.float64, spread: float = 0.3) -> ContactLagrangian:
-    """A model whose parameters are all off their defaults, by normal numbers times `spread`."""
+@torch.no_grad()
+def randomise(model: torch.nn.Module, spread: float, seed: int) -> torch.Generator:
+    """Move every parameter by normal numbers times `spread`; the generator, for what is drawn after them."""
+    make = torch.Generator().manual_seed(seed)
+    for parameter in model.parameters():
+        parameter += spread * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
+    return make
+
+
+def random_model(
+    config: ModelConfig, dtype: torch.dtype = torch.float64, spread: float = 0.3, seed: int = 3
+) -> ContactLagrangian:
+    """A model whose parameters are all off their defaults."""
     model = ContactLagrangian(config)
-    make = torch.Generator().manual_seed(3)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += spread * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
+    randomise(model, spread, seed)
     return model.to(dtype)
 
 

@@ -100,7 +100,7 @@ def as_it_is(_folder: Path, path: str, unit: str) -> Job:
     return Job(str(_here(DATA / path)), unit=unit)
 
 
-def _rows(path: Path, which: slice) -> Trajectories:
+def rows(path: Path, which: slice) -> Trajectories:
     """These rows of a table, as a user would give them: as a table of its own."""
     head, *lines = _here(path).read_text(encoding="utf-8").splitlines()
     with tempfile.TemporaryDirectory() as made:
@@ -128,24 +128,28 @@ def one_motor(folder: Path) -> Job:
 
 def motor_axis(folder: Path) -> Job:
     """Every fifth sample of the axis: the first two thirds train, the rest is one free run."""
-    train, test = _rows(DATA / MOTOR_AXIS, slice(0, None, 5)).split_time(2 / 3)
+    train, test = rows(DATA / MOTOR_AXIS, slice(0, None, 5)).split_time(2 / 3)
     save(folder / "test.csv", test)
     return Job(_saved(folder, "train", [train]), [Trial("test.csv")], flags=EVERYTHING, unit="m")
 
 
 def duffing_circuit(folder: Path) -> Job:
     """10 000 samples of the circuit train, the next 10 000 are predicted."""
-    save(folder / "test.csv", _rows(DATA / DUFFING_CIRCUIT, slice(CIRCUIT, 2 * CIRCUIT)))
-    train = _rows(DATA / DUFFING_CIRCUIT, slice(0, CIRCUIT))
+    save(folder / "test.csv", rows(DATA / DUFFING_CIRCUIT, slice(CIRCUIT, 2 * CIRCUIT)))
+    train = rows(DATA / DUFFING_CIRCUIT, slice(0, CIRCUIT))
     return Job(_saved(folder, "train", [train]), [Trial("test.csv")], flags=EVERYTHING, unit="V")
+
+
+def parted_windows(data: Trajectories, seed: int) -> tuple[Trajectories, Trajectories]:
+    """The windows that train, and the five that are predicted."""
+    out = np.random.default_rng(seed).permutation(len(data))[:LEFT_OUT].tolist()
+    return data.select(b for b in range(len(data)) if b not in out), data.select(out)
 
 
 def two_joints(folder: Path, seed: int) -> Job:
     """21 windows of the double pendulum train, five are predicted."""
-    data = load(_here(DATA / TWO_JOINTS), show=False)
-    out = np.random.default_rng(seed).permutation(len(data))[:LEFT_OUT].tolist()
-    save(folder / "test.csv", data.select(out))
-    train = data.select(b for b in range(len(data)) if b not in out)
+    train, test = parted_windows(load(_here(DATA / TWO_JOINTS), show=False), seed)
+    save(folder / "test.csv", test)
     return Job(_saved(folder, "train", [train]), [Trial("test.csv")], flags=EVERYTHING, unit="rad")
 
 
@@ -156,7 +160,7 @@ def two_joints_whole(_folder: Path) -> Job:
 
 def two_motors(folder: Path, every: int) -> Job:
     """Two runs of the driven double pendulum train, every so many samples; windows of the third are predicted."""
-    *train, test = (_rows(DATA / name, slice(0, None, every)) for name in TWO_MOTORS)
+    *train, test = (rows(DATA / name, slice(0, None, every)) for name in TWO_MOTORS)
     save(folder / "test.csv", test)
     trials = [Trial("test.csv", windows=WINDOWS, horizon=x) for x in (0.25, 0.5, 1.0)]
     return Job(_saved(folder, "train", train), trials, flags=EVERYTHING, unit="rad")

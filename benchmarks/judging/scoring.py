@@ -71,20 +71,23 @@ def scored(of: Job, folder: Path) -> dict[str, Any]:
     n = run.data.dof
     size = _each(of.size, n) if of.size else run.data.q.double().numpy().reshape(-1, n).std(0)
     degrees = math.pi / 180 if of.in_degrees and run.data.units[0] == "rad" else 1.0
-    groups, row["trouble"] = _predicted(of, run)
+    groups, row["trouble"], row["beyond"] = _predicted(of, run)
     groups = {name: pair for name, pair in groups.items() if pair[0]}
     row["groups"] = {name: errors(parts, unit * degrees) for name, (parts, unit) in groups.items()}
-    relative = [rms(errors(parts, size)) for parts, _ in groups.values()]
+    row["relatives"] = {name: rms(errors(parts, size)) for name, (parts, _) in groups.items()}
     worst = [rms(parts) for parts in row["groups"].values()]
     spread = [float(np.sqrt(np.mean(np.square(size / (unit * degrees))))) for _, unit in groups.values()]
     row["spread"] = min(spread, default=None)
-    return row | {"error": max(worst, default=None), "relative": max(relative, default=None)}
+    return row | {"error": max(worst, default=None), "relative": max(row["relatives"].values(), default=None)}
 
 
-def _predicted(of: Job, run: Any) -> tuple[dict[str, tuple[Pairs, Array]], str]:
-    """Predictions of each group with the unit of their errors, and what the last prediction failed by."""
+def _predicted(of: Job, run: Any) -> tuple[dict[str, tuple[Pairs, Array]], str, bool]:
+    """Predictions of each group with the unit of their errors, what the last one failed by, whether one left the range.
+
+    The range is that of the positions and momenta that the model was fitted to.
+    """
     groups: dict[str, tuple[Pairs, Array]] = {}
-    data, n, trouble = run.data, run.data.dof, ""
+    data, n, trouble, beyond = run.data, run.data.dof, "", False
     if of.later:
         groups["later"] = pairs_of(run.prediction, data.q, data.lengths, run.train_lengths), _scale(of, None, n)
     for trial in of.trials:
@@ -92,11 +95,12 @@ def _predicted(of: Job, run: Any) -> tuple[dict[str, tuple[Pairs, Array]], str]:
         try:
             found = run.predict(trial.data, **trial.settings)
             parts = pairs_of(found.prediction, found.data.q, found.data.lengths, found.train_lengths)
+            beyond |= bool(getattr(found, "beyond", ()))
         # Whatever a version of the package raises is a result of this version.
         except Exception as error:
             trouble, parts = f"predict {name}: {error}", [(np.full((1, n), np.nan), np.zeros((1, n)))]
         groups[name] = parts, _scale(of, trial, n)
-    return groups, trouble
+    return groups, trouble, beyond
 
 
 def _scale(of: Job, trial: Trial | None, n: int) -> Array:

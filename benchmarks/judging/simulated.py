@@ -50,14 +50,19 @@ def noise(folder: Path, trajectories: int, seed: int) -> Job:
     return _job(folder, data, _unseen(seed, **starts), NOISE)
 
 
-def outliers(folder: Path, seed: int) -> Job:
-    """The same, 2 % of the samples off by 0.5 to 1.5 rad."""
+def with_outliers(seed: int) -> tuple[Trajectories, Trajectories]:
+    """Six noisy recordings of the damped pendulum; the same with 2 % of the samples off by 0.5 to 1.5 rad."""
     data = simulate(scene("damped_pendulum"), trajectories=6, steps=60, h=0.2, noise=NOISE, seed=seed)
     make = torch.Generator().manual_seed(seed + 100)
     bad = torch.rand(data.samples, generator=make) < 0.02
     size = 0.5 + torch.rand(data.samples, generator=make, dtype=data.q.dtype)
     sign = torch.where(torch.rand(data.samples, generator=make) < 0.5, -1.0, 1.0)
-    return _job(folder, replace(data, q=data.q + (bad * sign * size)[:, None]), _unseen(seed, 60), NOISE)
+    return data, replace(data, q=data.q + (bad * sign * size)[:, None])
+
+
+def outliers(folder: Path, seed: int) -> Job:
+    """The recordings with outliers."""
+    return _job(folder, with_outliers(seed)[1], _unseen(seed, 60), NOISE)
 
 
 def disturbed(folder: Path, seed: int) -> Job:

@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.harness import table
+
 Row = dict[str, Any]
 
 # A row is worse or slower beyond these. Processor time of one fit differs by 10 % between quiet runs, and by up to 30 %
@@ -28,12 +30,6 @@ def number(value: float | None) -> float:
 def shown(value: float | None, digits: int = 3) -> str:
     """A number for people."""
     return "not reached" if value is None or math.isinf(value) else f"{value:.{digits}g}"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
-    """Lines of a markdown table."""
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    return lines + [f"| {' | '.join(str(x).replace('|', '/') for x in row)} |" for row in rows]
 
 
 def measured(rows: Sequence[Row]) -> list[Row]:

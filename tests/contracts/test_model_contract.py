@@ -27,6 +27,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.stepping.equation import model_equation
 from herglotz.stepping.partials_equation import PartialsEquation
+from tests.lagrangians import randomise
 
 
 def config(n, angles=None, **settings):
@@ -118,10 +119,8 @@ MODELS = {
 
 def random_model(settings, spread=0.2, seed=0, dtype=torch.float64) -> Any:
     model: Any = ContactLagrangian(settings)
-    make = torch.Generator().manual_seed(seed)
+    randomise(model, spread, seed)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += spread * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
         if settings.coulomb:  # dry friction that drives has several solutions a step
             model.friction.coulomb.abs_()
     return model.to(dtype)

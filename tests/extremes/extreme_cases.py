@@ -4,8 +4,9 @@ from typing import Any
 
 import torch
 
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ModelConfig
 from herglotz.stepping import State, Status
+from tests.lagrangians import random_model
 
 LEVELS: dict[str, dict[str, Any]] = {
     "explicit": {},
@@ -29,12 +30,7 @@ def build(noise=0.0, *, dtype=torch.float64, draw=0, dof=1, **settings: Any) -> 
         ones = (1.0,) * dof
         sizes: dict[str, Any] = {"scale": ones, "speed": ones, "stiffness": ones, "tilt": (0.0,) * dof}
         settings = {"angles": (True,) * dof} | sizes | settings
-    model = ContactLagrangian(ModelConfig(**settings))
-    make = torch.Generator().manual_seed(draw)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += noise * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
-    return model.to(dtype)
+    return random_model(ModelConfig(**settings), dtype, noise, draw)
 
 
 def state(q, p, s=0.0, dtype=torch.float64) -> State:

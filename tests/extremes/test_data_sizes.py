@@ -24,12 +24,6 @@ def seeded(count, seed=0):
     return torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_two_samples_are_refused():
-    # fails if a trajectory without a single discrete Herglotz equation is accepted
-    with pytest.raises(InputError, match="has 2 samples, at least 3 are needed"):
-        Trajectories.of(*motion([0.0, 0.1]))
-
-
 def test_one_triple_is_data_but_cannot_be_split():
     # fails if one equation crashes the baseline, or is fitted with nothing left to judge by
     data = Trajectories.of(*motion([0.0, 0.1, 0.2]))

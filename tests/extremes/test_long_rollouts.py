@@ -8,15 +8,11 @@ import torch
 from extreme_cases import build, state
 
 import herglotz
-from herglotz.codegen.c_compiler import compiler
-from herglotz.errors import InputError
 from herglotz.stepping import Stepper
+from tests.compilers import needs_compiler
 
 STEPS, H = 1_000_000, 0.1
-try:
-    compiler()
-except InputError as error:
-    pytestmark = pytest.mark.skip(reason=str(error))
+pytestmark = needs_compiler
 
 
 def run(steps=STEPS, **settings):

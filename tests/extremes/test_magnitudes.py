@@ -7,7 +7,7 @@ import torch
 from extreme_cases import assert_nothing_silent, build, starts, state
 
 from herglotz.scenes import scene
-from herglotz.stepping import State, Status, Stepper
+from herglotz.stepping import Status, Stepper
 
 EPS = torch.finfo(torch.float64).eps
 OSCILLATOR = scene("damped_oscillator")
@@ -111,14 +111,3 @@ def test_a_million_turns(explicit, bound):
     assert bool(far.ok.all())
     assert float((far.q - turns - near.q).abs().max()) < bound
     assert float((far.p - near.p).abs().max()) < bound
-
-
-def test_turns_that_are_taken_away_cost_nothing():
-    # fails if the model depends on the number of turns: every angle enters through sin, cos and Δ
-    model = build(0.3, correction_width=4)
-    x = state([0.3], [0.5])
-    with torch.no_grad():
-        near = Stepper(model).step(x, 0.1).state
-        back = Stepper(model).step(State(x.q + 2 * math.pi * 1e6 - 2 * math.pi * 1e6, x.p, x.s), 0.1).state
-    torch.testing.assert_close(back.q, near.q, rtol=0, atol=2e-9)  # what q + turns − turns rounds away, once
-    torch.testing.assert_close(back.p, near.p, rtol=0, atol=2e-9)

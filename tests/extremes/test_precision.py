@@ -4,9 +4,8 @@ from typing import Any
 
 import pytest
 import torch
-from extreme_cases import build, starts, state
+from extreme_cases import build, starts
 
-from herglotz.errors import InputError
 from herglotz.stepping import Stepper
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -65,13 +64,6 @@ def test_errors_grow_with_the_steps_and_no_faster(name):
     coarse = build(0.1, **settings).to(torch.bfloat16).double()
     growth = errors(coarse, build(0.1, **settings), torch.float64, steps=512).cummax(-1).values.median(0).values
     assert float(growth[512]) < 2 * float(growth[128]) < 0.1
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
-def test_half_precision_states_are_refused(dtype):
-    # fails if a state of 8 or 11 bits reaches a solver that has no such type
-    with pytest.raises(InputError, match=r"q must be floating point of 32 or 64 bits, got torch\.\w*float16; convert"):
-        Stepper(build(dtype=dtype)).step(state([0.1], [0.2], dtype=dtype), 0.1)
 
 
 class ByPosition:

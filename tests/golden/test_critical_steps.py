@@ -38,9 +38,3 @@ def test_implicit_midpoint_is_stable_at_any_step():
     system = scene("damped_oscillator")
     for h in (0.5, 2.0, 9.0, 40.0):
         assert multipliers(system, "midpoint", h)[0] < 1
-
-
-def test_conjugate_step():
-    # fails if ω² = Ω² − γ²/4 has another factor: sin ωh vanishes at h = π/ω
-    omega = math.sqrt(1 - 0.2**2 / 4)
-    assert abs(math.pi / omega / 3.15741941699827646 - 1) < 1e-15

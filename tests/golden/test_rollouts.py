@@ -6,6 +6,7 @@ import torch
 from herglotz.mechanics import autograd_partials, partials
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
+from tests.lagrangians import nonlinear
 
 RTOL = 1e-12
 
@@ -51,17 +52,10 @@ def test_rule(name, rule, start, expected):
         assert abs(value.item() - number) < RTOL * abs(number)
 
 
-def nonlinear_in_s(q0, q1, s0, h):
-    (d1, d2), (m1, m2) = ((q1 - q0) / h).unbind(-1), (0.5 * (q0 + q1)).unbind(-1)
-    kinetic = 0.5 * (1 + 0.3 * torch.sin(m1)) * d1**2 + 0.6 * d2**2 + 0.2 * d1 * d2
-    potential = torch.cos(m1 * m2) + 0.25 * (m1**2 + m2**2)
-    return h * (kinetic - potential - 0.3 * s0 - 0.1 * torch.sin(s0) * (1 + 0.2 * m2) - 0.05 * s0 * d1)
-
-
-@pytest.mark.parametrize("L_d", [nonlinear_in_s, scene("nonlinear_action").L_d_rules["midpoint_plain"]])
+@pytest.mark.parametrize("L_d", [nonlinear, scene("nonlinear_action").L_d_rules["midpoint_plain"]])
 def test_two_degrees_of_freedom_nonlinear_in_s(L_d):
     # fails if D12 is transposed or D13, D23 exchanged: neither shows with one degree of freedom or constant c; and if
-    # the scene's L or its plain midpoint is not the one written here
+    # the scene's L or its plain midpoint is not the one of tests/lagrangians.py
     out = Stepper(L_d).rollout(tensor(0.3, -0.5), tensor(0.7, 0.2), scalar(0.4), h=0.2, steps=8)
     expected = (
         (0.790147768842206419, -0.321134983997739986),

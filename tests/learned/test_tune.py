@@ -8,9 +8,7 @@ import pytest
 import torch
 
 from herglotz.cli import main
-from herglotz.codegen.c_compiler import compiler
 from herglotz.data import simulate
-from herglotz.errors import InputError
 from herglotz.export.c_header import read_metadata
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
@@ -18,6 +16,7 @@ from herglotz.training import FitConfig, fit, load_run, save_run
 from herglotz.tune import TuneConfig, tune
 from herglotz.tune.cost import Cost
 from herglotz.tune.reference import draw_starts, record
+from tests.compilers import needs_compiler
 
 QUICK = TuneConfig(
     multiples=(1, 2), widths=(16,), artefacts=("eager",), tolerances=(None,), starts=93, iterations=40, pairs=200
@@ -97,12 +96,9 @@ def test_command_writes_a_run_that_exports(pendulum_run, tmp_path, capsys):
     assert load_run(out).h == pytest.approx(0.1)
 
 
+@needs_compiler
 def test_command_writes_the_kicks_that_win(pendulum_run, tmp_path, capsys):
     # fails if kicks are not among the settings, export writes another step than the chosen one, or the folder is no run
-    try:
-        compiler()
-    except InputError as error:
-        pytest.skip(str(error))
     out = tmp_path / "fast"
     options = ["--widths", "none", "--multiples", "1,4", "--starts", "59", "--json"]
     command = ["tune", str(pendulum_run), "--out", str(out), *options]
@@ -122,13 +118,10 @@ def test_command_writes_the_kicks_that_win(pendulum_run, tmp_path, capsys):
     assert not (out / "kicks.h").exists()
 
 
+@needs_compiler
 def test_export_takes_whatever_was_chosen(pendulum_run, tmp_path, capsys, monkeypatch):
     # fails if the header of a float32 choice is written in float64, or its tolerance or its step is another; or if
     # nobody is told that a file of another format has neither the tolerance nor the kicks
-    try:
-        compiler()
-    except InputError as error:
-        pytest.skip(str(error))
     config = replace(QUICK, widths=(), artefacts=("eager", "c"), tolerances=(None, 1e-7), starts=59, rounds=1)
     found = tune(load_run(pendulum_run), max_error=1.0, horizon=0.4, config=config, progress=False)
     assert len({c.setting for c in found.candidates}) == 8

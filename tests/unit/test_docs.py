@@ -21,7 +21,8 @@ WORDS = set(re.findall(r"\w+", EVERYTHING)) | set(re.findall(r"(?<=_)[A-Za-z]\w+
 FILES = [p.relative_to(ROOT) for room in ("src", "tests", "train", "benchmarks", "tools", "docs", "data", "examples")
          for p in (ROOT / room).rglob("*")] + [p.relative_to(ROOT) for p in ROOT.glob("*")]  # fmt: skip
 # Files that extending.md tells the reader to write, and those of a reader of c.md.
-EXAMPLES = {"src/herglotz/data/whitespace.py", "whitespace.py", "example.c"}
+WRITTEN = ("data/whitespace.py", "plots/misses.py", "export/as_json.py")
+EXAMPLES = {"whitespace.py", "example.c", *(f"src/herglotz/{name}" for name in WRITTEN)}
 by_page = pytest.mark.parametrize("path", PAGES, ids=lambda p: p.name)
 
 

@@ -1,7 +1,6 @@
 """The environments of `hz.VectorEnv`."""
 
 import importlib
-import shutil
 import sys
 from typing import Any
 
@@ -15,8 +14,9 @@ from herglotz.errors import InputError
 from herglotz.export import compile_c, export_c, load_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
+from tests.compilers import needs_compiler
 
-pytestmark = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+pytestmark = needs_compiler
 H, B = 0.05, 7
 BOX = {"q_low": [-1.0], "q_high": [2.0], "p_low": [-3.0], "p_high": [3.0], "s_low": [-1e-3], "s_high": [1e-3]}
 

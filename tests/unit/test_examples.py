@@ -1,12 +1,13 @@
 """Every public name has an example, and the examples run."""
 
 import re
-import shutil
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
 from test_public_surface import GOLDEN
+
+from tests.compilers import CC
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "examples.md"
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.M | re.S)
@@ -22,7 +23,7 @@ def test_every_public_name_has_an_example():  # fails if a name becomes public a
 
 @pytest.mark.parametrize("first", [3, pytest.param(len(BLOCKS), marks=pytest.mark.slow)])  # files take 10 s more
 def test_the_examples_run(tmp_path, monkeypatch, capsys, first):  # fails if an example of the page no longer works
-    if first > 3 and not any(map(shutil.which, ("cc", "gcc", "clang"))):
+    if first > 3 and CC is None:
         pytest.skip("no C compiler in the PATH")
     monkeypatch.chdir(tmp_path)
     names: dict = {}

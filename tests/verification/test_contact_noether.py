@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ModelConfig
 from herglotz.models.network import Network
 from herglotz.scenes import left, midpoint_heun
 from herglotz.stepping import State, Stepper
@@ -15,6 +15,7 @@ from herglotz.theory import (
     momentum_map,
     noether_defect,
 )
+from tests.lagrangians import random_model, states as normal_states
 
 H = 0.1  # the step
 
@@ -41,9 +42,8 @@ def central(q, v, s):
 
 
 def states(batch=8, n=2, seed=0):
-    make = torch.Generator().manual_seed(seed)
-    x = torch.randn(batch, 2 * n + 1, generator=make, dtype=torch.float64)
-    return State(x[:, :n] + 1.0, x[:, n : 2 * n], 0.5 * x[:, -1])
+    q, p, s = normal_states(n, batch, seed)
+    return State(q + 1.0, p, 0.5 * s)
 
 
 def defects(L_d, action, state, shift=None, steps=5):
@@ -142,10 +142,8 @@ def blind_model(level, column=0):
         correction_width=4,
         seed=1,
     )
-    model, make = ContactLagrangian(config), torch.Generator().manual_seed(2)
+    model = random_model(config, spread=0.2, seed=2)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
         model.potential.stiffness[column] = model.potential.tilt[column] = 0.0
         for module in model.modules():
             if isinstance(module, Network):

@@ -8,7 +8,7 @@ import torch
 from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
-from tests.lagrangians import nonlinear
+from tests.lagrangians import nonlinear, states
 
 CASES: dict[str, Any] = {"nonlinear": (nonlinear, 2, 0.2, 0.0)}
 for name, h, shift in (("damped_oscillator", 0.2, 0.0), ("damped_pendulum", 0.3, 0.0), ("parachute", 0.1, 100.0)):
@@ -20,10 +20,10 @@ for name, h, shift in (("damped_oscillator", 0.2, 0.0), ("damped_pendulum", 0.3,
 def pairs(name):
     """(q_k, q_{k+1}, s_k) that belong to no trajectory in particular, and the next position by Φ."""
     L_d, n, h, shift = CASES[name]
-    x = torch.randn(10, 2 * n + 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    q0 = x[:, :n] + shift
+    q, p, s = states(n, 10, seed=1)
+    q0 = q + shift
     # the default tolerance, 64 eps of q ≈ 100 m, over h is 1.8e-12 of the parachute's momentum
-    return Stepper(L_d, tol=4 * torch.finfo(q0.dtype).eps), (q0, q0 + h * x[:, n : 2 * n], x[:, -1]), h
+    return Stepper(L_d, tol=4 * torch.finfo(q0.dtype).eps), (q0, q0 + h * p, s), h
 
 
 def gap(one, two):

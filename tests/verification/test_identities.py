@@ -8,17 +8,16 @@ from herglotz.scenes import scene, scene_names
 from herglotz.stepping import State
 from herglotz.verify import verify
 from herglotz.verify.subject import subject
+from tests.lagrangians import randomise
 
 
 def random_model(n, level, seed, correction=8):
     """A model whose every parameter, zero-initialised ones included, is random; mixed angles and lengths."""
-    ones, make = (1.0,) * n, torch.Generator().manual_seed(seed)
+    ones = (1.0,) * n
     angles = tuple(i % 2 == 0 for i in range(n))
     config = ModelConfig(angles, level, ones, ones, ones, (0.0,) * n, correction_width=correction, seed=seed)
     model = ContactLagrangian(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+    make = randomise(model, 0.2, seed)
     x = torch.randn(32, 2 * n + 1, generator=make, dtype=torch.float64)
     return model, State(x[:, :n], x[:, n : 2 * n], x[:, -1])
 

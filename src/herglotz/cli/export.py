@@ -18,22 +18,13 @@ from herglotz.cli.common import (
 )
 from herglotz.cli.flags import FORCE
 from herglotz.errors import InputError, refuse
+from herglotz.formats import FORMATS, endings, of_ending
 
-# File extension of each format.
-SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
-SUFFIX |= {"casadi": ".c", "acados": ".c", "fmu": ".fmu", "fmu2": ".fmu"}
-# Format of each file extension, for a command without --format.
-FORMAT = {SUFFIX[form]: form for form in ("pt2", "onnx", "c", "casadi", "fmu")}
-DESCRIPTION = """\
+KNOWN = "\n".join(f"  {name:8}{form.words}" for name, form in FORMATS.items())
+DESCRIPTION = f"""\
 Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
 
-  pt2   graphs of PyTorch operations: one differentiable step, K steps, and a start from two positions. Any batch size,\
- any step; torch.export.load(FILE).module() needs no herglotz
-  onnx  K steps (q, p, s, h) for onnxruntime and numpy, without PyTorch; a start from two positions in its metadata
-  aoti  K steps and a start compiled to machine code (needs g++ or clang++, one or two minutes): fast batches
-  c     one C99 header that steps with <math.h> alone: the fastest single steps
-  casadi, acados  one C file for casadi.external, or for acados' discrete dynamics: step and Jacobian
-  fmu, fmu2  an FMU for co-simulation, FMI 3.0 or 2.0, with C sources and a binary for this machine
+{KNOWN}
 
 examples:
   herglotz export runs/pendulum --out pendulum.pt2
@@ -48,8 +39,8 @@ examples:
 HELP = "write a model as one file"
 FLAGS = (
     flag("source", "folder that `herglotz fit` wrote", metavar="RUN", type=Path),
-    flag("--out", "file to write, ending in .pt2, .onnx, .fmu or (C) .h, .c", required=True, type=Path, metavar="FILE"),
-    flag("--format", "kind of file (default: as the name says)", choices=tuple(SUFFIX)),
+    flag("--out", f"file to write, ending in {', '.join(endings())}", required=True, type=Path, metavar="FILE"),
+    flag("--format", "kind of file (default: as the name says)", choices=tuple(FORMATS)),
     flag("--h-range", "range of steps h (default: that of the data); C flags other steps, Python refuses them",
          type=positive, nargs=2, metavar=("LOW", "HIGH")),
     flag("--name", "what every name in a C header begins with, so that headers of two models fit into one program "
@@ -72,8 +63,8 @@ FLAGS = (
 
 def run(arguments: argparse.Namespace) -> int:
     """Export, read the file again and report."""
-    form: str | None = arguments.format or FORMAT.get(arguments.out.suffix.lower())
-    check_output_file(arguments.out, tuple(FORMAT) if form is None else (SUFFIX[form],), arguments.force)
+    form: str | None = arguments.format or of_ending(arguments.out.suffix)
+    check_output_file(arguments.out, endings() if form is None else (FORMATS[form].ending,), arguments.force)
     assert form is not None
     kicks = arguments.source / KICKS
     if kicks.is_file() and form == "c":
@@ -113,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
         extras=arguments.extras or (),
         unroll=arguments.unroll,
     )
-    in_c = form not in ("pt2", "aoti", "onnx")
+    in_c = FORMATS[form].is_c
     # C is read, not compiled, so that this machine needs no compiler.
     metadata = read_header(arguments.out)[1] if in_c else load_exported(arguments.out).metadata
     size = arguments.out.stat().st_size

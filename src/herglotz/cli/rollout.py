@@ -24,6 +24,7 @@ from herglotz.cli.common import (
 )
 from herglotz.cli.flags import FORCE, TRUST
 from herglotz.errors import InputError, check_start
+from herglotz.formats import endings
 
 if TYPE_CHECKING:
     import torch
@@ -44,9 +45,6 @@ examples:
   herglotz rollout runs/driven --steps 200 --inputs torque.csv --out motion.csv
   herglotz rollout runs/pendulum --steps 200 --h 0.05 --q0 1.2 --v0 -0.5 --out motion.csv
 """
-
-
-SUFFIXES = (".pt2", ".onnx", ".h", ".c", ".fmu")
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class Source:
 
 HELP = "step a model and write the motion"
 FLAGS = (
-    flag("source", "folder of a run, or an exported model: .pt2, .onnx, C (.h, .c) or .fmu",
+    flag("source", f"folder of a run, or an exported model: {', '.join(endings())}",
          metavar="RUN|FILE", type=Path),
     flag("--steps", "number of steps, at least 2", required=True, type=count, metavar="K"),
     flag("--out", "file to write: .csv or .npz", required=True, type=Path, metavar="FILE"),
@@ -233,7 +231,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     from herglotz.export.box import Box, s_matters
     from herglotz.stepping import State
 
-    if path.is_dir() or path.suffix.lower() not in SUFFIXES:
+    if path.is_dir() or path.suffix.lower() not in endings():
         from herglotz.training import load_run
 
         fitted = load_run(path)

@@ -11,6 +11,7 @@ from typing import Any
 from herglotz.cli.common import check_output_folder, count, flag, import_torch, positive, print_json, seed
 from herglotz.cli.flags import TRUST
 from herglotz.errors import InputError
+from herglotz.formats import FORMATS, of_ending
 
 DESCRIPTION = """\
 Measure every identity that a discrete contact Lagrangian must satisfy on a scene, a run or an exported file, and
@@ -101,12 +102,13 @@ def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: 
 def _opened(path: Path, arguments: argparse.Namespace) -> Any:
     """Open a file. A C header is trusted without --trust-code if its run is found and generates the same text."""
     from herglotz.export import load_c, load_exported
-    from herglotz.export.load import WITH_HEADER, read_header
+    from herglotz.export.load import read_header
     from herglotz.training import load_run
 
     if path.suffix.lower() in (".csv", ".npz", ".txt"):
         raise InputError(f"{path}: is data, not a model; fit it first: herglotz fit {path} --out RUN")
-    if path.suffix.lower() not in WITH_HEADER:
+    form = FORMATS.get(of_ending(path.suffix) or "")
+    if form is None or not form.is_c:
         found = load_exported(path, trust_code=arguments.trust_code)
         arguments.against = arguments.against or _exported_from(found.metadata, path)
         return found

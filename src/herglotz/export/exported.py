@@ -37,7 +37,7 @@ class ExportedStepper(OneStepMethod):
     path
         Where the file was read from, for messages.
     kind
-        "pt2", "aoti", "onnx" or "c".
+        "pt2", "aoti", "onnx", "c", or the name of another format.
     loop
         The loop of K steps of a format without the program `rollout`; it needs no inputs where none act.
     again
@@ -227,7 +227,7 @@ class ExportedStepper(OneStepMethod):
 
     @property
     def _file(self) -> str:
-        return FILES[self.kind]
+        return FILES.get(self.kind, f"a {self.kind}")
 
     def _checked(self, state: State) -> State:
         self._check(*state)

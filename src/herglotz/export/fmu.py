@@ -9,6 +9,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,9 @@ def export_fmu(
     else:
         content[_binary(name, version)] = portable_library({f"{name}.h": header, SOURCE: source})
     return write_trusted(path, sealed_zip(_zipped(content)))
+
+
+export_fmu2 = partial(export_fmu, version="2.0")
 
 
 def header_in(content: bytes, path: PathLike) -> str:

@@ -25,9 +25,9 @@ from herglotz.export.fmu import header_in
 from herglotz.export.metadata import AOTI, KEY, METADATA, from_json, weights_digest
 from herglotz.export.programs import quiet
 from herglotz.export.trusted import check_trusted
+from herglotz.formats import FORMATS, of_ending
 from herglotz.models import ContactLagrangian
 
-WITH_HEADER = (".h", ".c", ".fmu")
 # Names in the archive that torch writes.
 MODELS, EXTRA = "models/", f"extra/{METADATA}"
 
@@ -52,10 +52,8 @@ def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedSteppe
     InputError
         As in the reader of that format.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".onnx":
-        return load_onnx(path)
-    return (load_c if suffix in WITH_HEADER else load_pt2)(path, trust_code=trust_code)
+    form = FORMATS[of_ending(Path(path).suffix) or "pt2"]
+    return form.read(path, trust_code=trust_code) if form.runs_code else form.read(path)
 
 
 def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:

@@ -2,47 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from herglotz.errors import InputError, refuse
-from herglotz.export.c_header import export_c
-from herglotz.export.c_wrappers import export_acados, export_casadi
-from herglotz.export.fmu import export_fmu
-from herglotz.export.lower.aoti import export_aoti
-from herglotz.export.lower.onnx import export_onnx
-from herglotz.export.lower.pt2 import export_pt2
 from herglotz.export.noise import noise_of
 from herglotz.export.parameters import Chosen, described_parameters
+from herglotz.formats import FORMATS, endings, of_ending
 from herglotz.training import Run
 from herglotz.training.summary import model_card
 
 # Relative rounding error of steps that are differences of recorded times: a clock's 0.001 s and 0.00099999999999989 s
 # are one step.
 ROUNDING = 1e-6
-
-IN_C: dict[str, Callable[..., Path]] = {
-    "c": export_c,
-    "casadi": export_casadi,
-    "acados": export_acados,
-    "fmu": export_fmu,
-    "fmu2": partial(export_fmu, version="2.0"),
-}
-WRITERS = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx} | IN_C
-# Arguments of some kinds only: these kinds, and the words of the refusal.
-OF_KINDS: dict[str, tuple[Collection[str], str]] = {
-    "name": (IN_C, "a prefix (name) is of C headers only"),
-    "dtype": (IN_C, "dtype is of C headers only"),
-    "parameters": (("c",), "parameters are of C headers only"),
-    "extras": (("c",), "extras are of C headers only"),
-    "unroll": (("onnx",), "unroll is of ONNX only"),
-}
-# The kind of a file by the end of its name.
-KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c", ".c": "casadi", ".fmu": "fmu"}
 
 
 def export_run(
@@ -66,7 +41,8 @@ def export_run(
     path
         File ending in .pt2, .onnx, .h, .c or .fmu.
     kind
-        "pt2", "aoti", "onnx", "c", "casadi", "acados", "fmu" (FMI 3.0) or "fmu2" (2.0); None: by the end of the name.
+        A name in `herglotz.formats.FORMATS`: "pt2", "onnx", "aoti", "c", "casadi", "acados", "fmu" (FMI 3.0) or "fmu2"
+        (2.0); None: by the end of the name.
     h_range
         Shortest and longest step of the file; None: the steps of the fit and of the recording, which a fit may cross
         in several steps. The file takes steps that equal these to six digits, too: recorded times are rounded, and 0.2
@@ -88,13 +64,14 @@ def export_run(
         If the name has another end, the format cannot hold the model, or an argument is not one of this format.
     """
     path = Path(path)
-    kind = kind or KINDS.get(path.suffix.lower())
-    if kind not in WRITERS:
-        raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
+    kind = kind or of_ending(path.suffix)
+    if kind not in FORMATS:
+        raise InputError(f"{path}: the name must end in {', '.join(endings())}; other kinds are {', '.join(FORMATS)}")
+    form = FORMATS[kind]
     given = {"name": name, "dtype": dtype, "parameters": parameters, "extras": list(extras), "unroll": unroll}
     asked = {key: value for key, value in given.items() if value not in (None, (), [], {})}
-    refuse({f"{path}: {words}, not of {kind}; leave it out": key in asked and kind not in kinds
-            for key, (kinds, words) in OF_KINDS.items()})  # fmt: skip
+    refuse({f"{path}: the setting {key} is of {_taking(key)} only, not of {kind}; leave it out": key not in form.takes
+            for key in asked})  # fmt: skip
     (q, p, s), t = run.last_fitted()
     low, high = h_range or _steps(run)
     span = [low * (1 - ROUNDING), high * (1 + ROUNDING)]
@@ -109,7 +86,7 @@ def export_run(
         **_of_inputs(run),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
-    if run.setting and kind in IN_C and dtype in (None, run.setting["dtype"]):
+    if run.setting and form.is_c and dtype in (None, run.setting["dtype"]):
         # The tolerance of `herglotz tune` is for the dtype that tune chose.
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
     described |= asked
@@ -117,8 +94,12 @@ def export_run(
         constant = (0.0,) * len(described_parameters(run.model, parameters))
         noise = noise_of(run, constant)._asdict()
         metadata["noise"] = {key: x if isinstance(x, float) else list(x) for key, x in noise.items()}
-    WRITERS[kind](run.model, path, **described)
+    form.write(run.model, path, **described)
     return path
+
+
+def _taking(setting: str) -> str:
+    return ", ".join(name for name, form in FORMATS.items() if setting in form.takes)
 
 
 def _of_inputs(run: Run) -> dict[str, Any]:

@@ -55,14 +55,16 @@ class Network(nn.Module):
         if not zero:
             last = torch.randn(outputs or 1, sizes[-1], generator=generator, dtype=torch.float64) / sizes[-1] ** 0.5
         self.weights.append(nn.Parameter(last))
-        self.blind: Tensor | None
-        self.register_buffer("blind", None, persistent=False)
+        # A projection (m, m) of the features, along whose null space the network is constant; None: no projection.
+        # `models/translations.py` sets the projection for an imposed symmetry.
+        self.projection: Tensor | None
+        self.register_buffer("projection", None, persistent=False)
 
     @property
     def layers(self) -> list[Tensor]:
-        """The weights; the first layer reads the features through the projection `blind`, if there is one."""
+        """The weights; the first layer reads the features through `projection`, if there is one."""
         first, *rest = self.weights
-        return [first if self.blind is None else first @ self.blind, *rest]
+        return [first if self.projection is None else first @ self.projection, *rest]
 
     def forward(self, x: Jet) -> Jet:
         """Apply the network to a jet of features (..., m); the result is a scalar jet, or (..., k)."""

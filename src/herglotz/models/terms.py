@@ -99,7 +99,7 @@ class Potential(nn.Module):
         if config.potential_width:
             sizes = [feature_count(config.angles), *[config.potential_width] * config.potential_depth]
             self.network = Network(sizes, 1.0, generator, activation=config.activation)
-            self.network.blind = blind(config, 0)
+            self.network.projection = blind(config, 0)
 
     def baseline(self, q: Tensor, order: int) -> Jet:
         """The springs and tilts of V: Σ f(xᵢ) with x = A q, so V′ = Aᵀf′ and V″ = Aᵀ diag(f″) A."""
@@ -215,5 +215,5 @@ def _of_position_and_velocity(
     """A scalar network of the features of q̄ and v, invariant under the model's translations."""
     inputs = feature_count(config.angles) + config.dof
     network = Network([inputs, *[width] * depth], gain, generator, zero=zero, activation=config.activation)
-    network.blind = blind(config, config.dof)
+    network.projection = blind(config, config.dof)
     return network

@@ -1,8 +1,10 @@
-"""The conclusions: discrete evolution (thermodynamic) dynamics, whose steps keep the contact Hamiltonian H(q, p, s).
+"""Implicit steps along the evolution field E_H, which keep H(q, p, s) exactly, and along the contact field X_H.
+
+Evolution (thermodynamic) dynamics is what the paper's conclusions propose. With a discrete gradient a step is
 
     x1 = x0 + h B(x̄) ∇̄H,    B = [[0, I, 0], [−I, 0, −p], [0, pᵀ, 0]],    x = (q, p, s)
 
-with a discrete gradient, ∇̄H·(x1 − x0) = H(x1) − H(x0). B is antisymmetric, so H(x1) = H(x0). With −h H̄ ∂_s added,
+where ∇̄H·(x1 − x0) = H(x1) − H(x0). B is antisymmetric, so H(x1) = H(x0). With −h H̄ ∂_s added,
 H̄ = (H0 + H1)/2, the step follows the contact field X_H, and H1 − H0 = −h H̄ ∇̄_sH exactly. Neither step is a contact
 map; the step of `Stepper` is.
 """

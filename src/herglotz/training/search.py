@@ -131,8 +131,7 @@ class Search:
         fitter = self.fitter(found.fitter.variant.crossing(self.data.typical_step / found.fitter.data.typical_step))
         if found.fitter.data.lengths == self.data.lengths:
             return fitter.fit(found.taken, found.values, found.length, found, 2 * ITERATIONS)
-        whole = fitter.fit(found.taken, found.values, fitter.lengths[-1], None, 2 * ITERATIONS)
-        if whole is not None and whole.near:
+        if (whole := fitter.fit(found.taken, found.values, fitter.lengths[-1], None, 2 * ITERATIONS)) and whole.near:
             return self.finer(whole)
         first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
         other = fitter.fit(found.taken, found.values, first, None)

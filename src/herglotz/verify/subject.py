@@ -1,4 +1,7 @@
-"""The subject of a verification: the step map and the sample states of any target."""
+"""What `verify` measures: of a scene, a run, a file, an L_d or a stepper the step map and sample states.
+
+`subject` makes a `Subject` of any of these targets; the checks of the other modules see the `Subject` alone.
+"""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import judge
+from benchmarks import harness, judge
 from benchmarks.judging import catalogue, job, make, recorded, scoring, tables
 from benchmarks.judging.catalogue import Row
 from benchmarks.judging.running import Ended, Judge, environment, false_verdict, limited
@@ -84,7 +84,7 @@ def test_the_command_compares_and_exits(tmp_path, capsys):
     # fails if a script cannot tell by the exit code that a row is worse
     paths = [tmp_path / f"{name}.json" for name in ("old", "new")]
     for path, cpu in zip(paths, (10.0, 50.0), strict=True):
-        judge.store(path, result(row(cpu_s=cpu)))
+        harness.store(path, result(row(cpu_s=cpu)))
     compare = ["--compare", *map(str, paths)]
     assert judge.main(compare) == 1
     assert "* worse: a: time × 5" in capsys.readouterr().out
@@ -100,7 +100,8 @@ def test_the_command_compares_and_exits(tmp_path, capsys):
 def test_the_table_has_every_row(tmp_path):
     # fails if a row is left out, what was not reached looks like a number, or a reason for a skipped row is lost
     path = tmp_path / "t.json"
-    judge.store(path, result(row(), row("b", parts=(None,)), {"name": "c", "skipped": "no c.csv in data"}))
+    found = result(row(), row("b", parts=(None,)), {"name": "c", "skipped": "no c.csv in data"})
+    harness.store(path, found, tables.report(found))
     text = path.with_suffix(".md").read_text(encoding="utf-8")
     assert "| a | 1 | over noise | 0.01 | noise |  | 0 | 10.0 | 300 |" in text
     assert "| b | not reached |" in text

@@ -1,13 +1,10 @@
 """`benchmarks/worst_case.py`: what it counts, and how it tells it."""
 
-import shutil
-
-import pytest
-
 from benchmarks import worst_case
+from tests.compilers import needs_compiler
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+@needs_compiler
 def test_counts_of_a_short_run(monkeypatch):
     # fails if failed steps or evaluations are not counted, or a quantile is taken of the wrong side; no time is judged
     box = {f"{name}_{end}": [x] for name in "qps" for end, x in (("low", -1.0), ("high", 1.0))}

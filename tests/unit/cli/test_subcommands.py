@@ -352,3 +352,13 @@ def test_data_is_no_run(command, tiny_csv, capsys):  # fails if a csv file is ca
     assert main([command, str(tiny_csv), *more.get(command, [])]) == 2
     remedy = f"{tiny_csv}: is a file, and no run; fit data first: herglotz fit {tiny_csv} --out RUN"
     assert remedy in capsys.readouterr().err
+
+
+def test_the_page_says_why_fit_chose_a_model(tiny_run, capsys):
+    # fails if docs/choosing.md reads the reasons of a plan, or the models that were compared, where they are not
+    page = (Path(__file__).resolve().parents[3] / "docs" / "choosing.md").read_text(encoding="utf-8")
+    code = page.split("## Why did `fit` choose this?")[1].split("```python\n")[1].split("```")[0]
+    exec(code.replace('"RUN"', repr(str(tiny_run))), {})
+    said = capsys.readouterr().out
+    assert "features = ['cos(q1)']: mass, damping, cos(q1) miss the data by" in said
+    assert re.search(r"^2 0\.00\d+ \['cos\(q1\)'\] taken$", said, re.M)

@@ -6,17 +6,11 @@ import torch
 
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
+from tests.lagrangians import random_model, randomise, states
 
 SIZES = (("q", 2, 1.0), ("p", 2, 1.0), ("s", 1, 0.5))
 BOX = {name + end: [sign * x] * n for name, n, x in SIZES for end, sign in (("_low", -1), ("_high", 1))}
 SMALL = {key: [0.5 * x for x in values[:1]] for key, values in BOX.items()}
-
-
-def randomise(model, size, seed):
-    """Move every parameter by normal numbers of this size; where no gradient is kept."""
-    make = torch.Generator().manual_seed(seed)
-    for parameter in model.parameters():
-        parameter += size * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
 
 
 def model_of(n, level, correction=0, dtype=torch.float64):
@@ -26,10 +20,7 @@ def model_of(n, level, correction=0, dtype=torch.float64):
     config = ModelConfig(
         angles, level, ones, ones, ones, (0.0,) * n, potential_width=4, damping_width=4, correction_width=correction
     )
-    model = ContactLagrangian(config)
-    with torch.no_grad():
-        randomise(model, 0.2, seed=n)
-    return model.to(dtype)
+    return random_model(config, dtype, spread=0.2, seed=n)
 
 
 def damped(level, dtype, inputs=0):
@@ -39,10 +30,7 @@ def damped(level, dtype, inputs=0):
         (True,), level, one, one, one, (0.0,), rate=0.3, potential_width=4, damping_width=4, inputs=inputs,
         input_zero=inputs > 0,
     )  # fmt: skip
-    model = ContactLagrangian(config)
-    with torch.no_grad():
-        randomise(model, 0.05, seed=1)
-    return model.to(dtype)
+    return random_model(config, dtype, spread=0.05, seed=1)
 
 
 def beside(model):
@@ -52,8 +40,7 @@ def beside(model):
 
 
 def states_of(n, batch, dtype=torch.float64, seed=0):
-    x = torch.randn(batch, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
-    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+    return states(n, batch, seed, dtype)
 
 
 TERMS: dict[str, tuple[int, dict[str, Any]]] = {

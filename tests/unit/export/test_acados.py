@@ -1,7 +1,6 @@
 """The C file for acados' discrete dynamics, compiled and checked without acados: `examples/acados/check.c`."""
 
 import ast
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -11,8 +10,8 @@ from export_models import damped, model_of, with_terms
 
 from herglotz.errors import InputError
 from herglotz.export import export_acados, load_exported
+from tests.compilers import CC
 
-CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "acados"
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZED = ("-O0", "-fno-sanitize-recover=all", "-fsanitize=address,undefined")

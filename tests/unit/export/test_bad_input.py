@@ -1,6 +1,5 @@
-"""What no format steps from: every wrong argument is an error in one line, whatever file it is given to."""
+"""Arguments that no format steps from: an error in one line, whatever file they are given to (states: unit/trust)."""
 
-import shutil
 from typing import Any
 
 import pytest
@@ -11,12 +10,10 @@ import herglotz
 from herglotz.errors import InputError
 from herglotz.export import export_aoti, export_c, export_onnx, export_pt2, load_exported
 from herglotz.stepping import State
+from tests.compilers import needs_compiler
 
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH"
-)
 FORMATS = [
-    pytest.param("pt2", marks=pytest.mark.slow),  # 10 s to write; test_pt2.py has wrong states
+    pytest.param("pt2", marks=pytest.mark.slow),  # 10 s to write
     "onnx",
     pytest.param("h", marks=needs_compiler),
     pytest.param("compile", marks=needs_compiler),
@@ -45,48 +42,6 @@ def stepper(request, tmp_path_factory) -> Any:
 
 
 q, p, s = states_of(2, 3)
-STATES = {
-    "too few coordinates": State(q[:, :1], p[:, :1], s),
-    "q and p of two batches": State(q, p[:2], s),
-    "s with an axis too many": State(q, p, s[:, None]),
-    "a number for q": State(s[0], s[0], s[0]),
-    "no samples": State(q[:0], p[:0], s[:0]),
-    "float32": State(q.float(), p.float(), s.float()),
-    "p in float32": State(q, p.float(), s),
-    "integers": State(q.long(), p.long(), s.long()),
-}
-LOST = {
-    "NaN in q": State(q.clone().index_fill_(0, torch.tensor(1), NAN), p, s),
-    "NaN in p": State(q, p.clone().index_fill_(0, torch.tensor(1), NAN), s),
-    "an infinite s": State(q, p, s.clone().index_fill_(0, torch.tensor(1), INF)),
-}
-STEPS = {"zero": 0.0, "negative": -0.1, "NaN": NAN, "infinite": INF, "of two samples": torch.tensor([0.1, 0.1])}
-
-
-@pytest.mark.parametrize("name", STATES)
-def test_a_wrong_state_is_refused(stepper, name):
-    # fails if a format reads other memory, another dtype, or steps from what is no number
-    with pytest.raises(InputError):
-        stepper.step(STATES[name], 0.1)
-    with pytest.raises(InputError):
-        stepper.rollout(*STATES[name], h=0.1, steps=2)
-
-
-@pytest.mark.parametrize("name", LOST)
-def test_a_state_that_is_not_finite_is_lost_alone(stepper, name):
-    # fails if a format refuses the whole batch, passes NaN with status 0, or has another status than the eager stepper
-    assert stepper.step(LOST[name], 0.1).status.tolist() == [0, 3, 0]
-    assert stepper.rollout(*LOST[name], h=0.1, steps=2).status.tolist() == [[0, 0], [3, 3], [0, 0]]
-
-
-@pytest.mark.parametrize("name", STEPS)
-def test_a_wrong_step_is_refused(stepper, name):
-    # fails if a step backwards, or none, or one for other samples is taken
-    with pytest.raises(InputError):
-        stepper.step(State(q, p, s), STEPS[name])
-    if name != "of two samples":
-        with pytest.raises(InputError):
-            stepper.rollout(q, p, s, h=STEPS[name], steps=2)
 
 
 def test_other_arguments_are_refused(stepper):

@@ -1,7 +1,6 @@
 """Vector–Jacobian products in C against autograd through the eager stepper, over one step and over a rollout."""
 
 import re
-import shutil
 
 import pytest
 import torch
@@ -13,8 +12,9 @@ from herglotz.export.metadata import describe
 from herglotz.export.parameters import described_parameters
 from herglotz.models.numbers import WithNumbers, values_of, with_values
 from herglotz.stepping import State, Stepper
+from tests.compilers import needs_compiler
 
-pytestmark = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+pytestmark = needs_compiler
 STEPS = 4
 LOOPS = """
 #include "stepper.h"

@@ -1,6 +1,5 @@
 """`hz.compile` and `load_c`: a drop-in for the eager stepper, or the eager stepper itself with one warning."""
 
-import shutil
 import warnings
 from types import SimpleNamespace
 from typing import Any
@@ -11,10 +10,7 @@ import torch
 import herglotz as hz
 from herglotz.export import ExportedStepper, compile_c, export_c, load_c
 from herglotz.stepping import State, Stepper
-
-needs_compiler = pytest.mark.skipif(
-    not any(shutil.which(c) for c in ("cc", "gcc", "clang")), reason="no C compiler in the PATH"
-)
+from tests.compilers import needs_compiler
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,6 +1,5 @@
 """Features in C: every function they are made of, up to 32 coordinates."""
 
-import shutil
 from typing import Any
 
 import pytest
@@ -9,8 +8,7 @@ import torch
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
-
-needs_cc = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
+from tests.compilers import needs_compiler
 
 
 def model_of(n, angles, features, **settings) -> Any:
@@ -35,7 +33,7 @@ CASES = {
 }
 
 
-@needs_cc
+@needs_compiler
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 def test_features_step_in_c_as_they_do_in_eager(name, dtype):

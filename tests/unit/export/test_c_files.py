@@ -1,7 +1,6 @@
 """The generated header as a file: its runtime, its prefix, its size."""
 
 import re
-import shutil
 import subprocess
 from importlib import resources
 from typing import Any
@@ -12,9 +11,9 @@ from herglotz.errors import InputError
 from herglotz.export import export_c, trusted
 from herglotz.export.c_header import RUNTIME
 from herglotz.models import ContactLagrangian, ModelConfig
+from tests.compilers import CC, needs_compiler
 
-CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
-pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
+pytestmark = needs_compiler
 
 
 def test_every_file_of_the_runtime_is_in_the_package():

@@ -14,11 +14,10 @@ from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compile_c, export_c, load_c, weights_digest
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
-from tests.lagrangians import even_model
+from tests.compilers import CC, needs_compiler
+from tests.lagrangians import even_model, random_model, states as normal_states
 
-CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
 CXX = next((c for c in ("c++", "g++", "clang++") if shutil.which(c)), None)
-needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
 BOX = {"q_low": [-1.0], "q_high": [1.0], "p_low": [-1.0], "p_high": [1.0], "s_low": [-5.0], "s_high": [5.0]}
 KINDS = {"linear": ("linear", 0, True), "affine": ("affine", 0, True), "correction": ("linear", 6, True)}
 KINDS |= {"both": ("affine", 3, True), "alone": ("linear", 6, False)}
@@ -27,14 +26,12 @@ KINDS |= {"both": ("affine", 3, True), "alone": ("linear", 6, False)}
 def damped(n, kind, dtype=torch.float64):
     """A damped model whose every parameter is random; angles and lengths alternate."""
     level, correction, baseline = KINDS[kind]
-    make, size = torch.Generator().manual_seed(n), tuple(1.0 + 0.1 * i for i in range(n))
+    size = tuple(1.0 + 0.1 * i for i in range(n))
     config = ModelConfig(
         tuple(i % 2 == 0 for i in range(n)), level, size, size, size, (0.0,) * n, 0.3, 4, 2, 4, correction, 2, baseline
     )
-    model = ContactLagrangian(config)
+    model = random_model(config, spread=0.05, seed=n)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
         if not baseline:  # a network that bends enough to have a mixed Hessian
             assert model.correction is not None
             model.correction.network.weights[-1].mul_(3.0)
@@ -42,8 +39,8 @@ def damped(n, kind, dtype=torch.float64):
 
 
 def states_of(n, batch, dtype=torch.float64):
-    x = torch.randn(batch, 2 * n + 1, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(dtype)
-    return State(0.5 * x[:, :n], 0.5 * x[:, n : 2 * n], x[:, -1])
+    q, p, s = normal_states(n, batch, 5, dtype)
+    return State(0.5 * q, 0.5 * p, s)
 
 
 def relative(a, b):
@@ -111,12 +108,7 @@ def test_wide_networks():
     for width in (3, 37):
         size = (1.0,)
         config = ModelConfig((True,), "affine", size, size, size, (0.0,), 0.3, width, 3, width, width, 3)
-        model = ContactLagrangian(config)
-        with torch.no_grad():
-            for parameter in model.parameters():
-                parameter += 0.05 * torch.randn(
-                    parameter.shape, generator=torch.Generator().manual_seed(width), dtype=torch.float64
-                )
+        model = random_model(config, spread=0.05, seed=width)
         compiled = compile_c(model)
         for batch in (1, 2):  # one sample takes the product over units, two take the one over samples
             states = states_of(1, batch)

@@ -1,7 +1,6 @@
 """C for every level of the ladder: it computes what the eager stepper does, in float64 and in float32."""
 
 import functools
-import shutil
 from typing import Any
 
 import pytest
@@ -14,10 +13,9 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import ActionFlow
 from herglotz.models.mass import PositionKinetic
 from herglotz.stepping import State, Stepper
+from tests.compilers import needs_compiler
 
-pytestmark = pytest.mark.skipif(
-    not any(shutil.which(c) for c in ("cc", "gcc", "clang")), reason="no C compiler in the PATH"
-)
+pytestmark = needs_compiler
 H = 0.1
 CASES: dict[str, dict[str, Any]] = {
     "conservative": {"level": "conservative"},
@@ -47,8 +45,23 @@ CASES: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 
+MATRIX = {
+    f"{level}, {activation}, mass {mass}": {
+        **CASES[level], "rate": 0.3, "potential_width": 3, "potential_depth": 1, "correction_width": 3,
+        "activation": activation, "mass_width": mass,
+    }
+    for level in ("conservative", "linear", "affine, tanh", "full", "viscous", "dry")
+    for activation in ("tanh", "softplus", "silu")
+    for mass in (0, 3)
+}  # fmt: skip
+CASES |= MATRIX
+LONG = ["coupled", "drag", "sticking", "velocities", "order 4", "order 4, coupled motors", *MATRIX]
+SLOW = [pytest.param(case, marks=pytest.mark.slow) for case in ("sticking", "drag", *MATRIX)]
 
-SLOW = [pytest.param(case, marks=pytest.mark.slow) for case in ("sticking", "drag")]
+
+def steps_of(case):
+    """A thousand; without damping nothing forgets rounding, and the difference grows with the square of the steps."""
+    return 300 if case.startswith("conservative") else 1000
 
 
 def damped(case):
@@ -72,13 +85,13 @@ def damped(case):
     return model
 
 
-def problem(case, steps, dtype=torch.float64):
+def problem(case, steps, dtype=torch.float64, batch=3):
     """Model, states and the options of a rollout."""
     model = damped(case).to(dtype)
-    x = torch.randn(3, 5, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(dtype) / 2
+    x = torch.randn(batch, 5, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(dtype) / 2
     options: dict[str, Any] = {"h": H, "steps": steps}
     if model.inputs:
-        u = torch.randn(3, steps, model.inputs, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        u = torch.randn(batch, steps, model.inputs, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
         options["inputs"] = (0.3 * u).to(dtype)
     return model, State(x[:, :2], x[:, 2:4], x[:, 4]), options
 
@@ -105,7 +118,7 @@ def relative(a, b):
     return float((a.double() - b.double()).abs().max() / b.double().abs().max())
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [x for x in CASES if x not in MATRIX])
 def test_every_level_agrees_with_the_eager_stepper(case):
     # fails if a force enters one momentum only, an activation's slope is wrong, or lanes differ from single samples
     model, states, options = problem(case, 20)
@@ -123,17 +136,30 @@ def test_every_level_agrees_with_the_eager_stepper(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["coupled", "drag", "sticking", "velocities", "order 4", "order 4, coupled motors"])
-def test_a_thousand_steps_of_features_and_joints_agree(case):
-    # fails if rounding of features, of coupled friction or of order 4 adds up (test_c_matrix.py has the other terms)
-    model, states, options = problem(case, 1000)
+@pytest.mark.parametrize("case", LONG)
+def test_a_thousand_steps_agree(case):
+    # fails if any combination of terms loses a derivative or a digit, alone (B = 1) or in registers (a prime B), or if
+    # rounding of features, of coupled friction or of order 4 adds up
+    model, states, options = problem(case, steps_of(case))
     with torch.no_grad():
         eager = Stepper(model, tol=4e-16).rollout(*states, **options)
-    ours = compiled_of(case).rollout(*states, **options)
+    compiled = compiled_of(case)
+    start, alone = one(0, states, options)
+    ours, single = compiled.rollout(*states, **options), compiled.rollout(*start, **alone)
     assert eager.ok.all()
     assert ours.ok.all()
     for name in ("q", "p", "s"):
         assert relative(getattr(ours, name), getattr(eager, name)) <= 1e-12, name
+        assert relative(getattr(single, name), getattr(eager, name)[0]) <= 1e-12, name
+
+
+@pytest.mark.slow
+def test_a_thousand_steps_of_a_large_batch():
+    # fails if a register of a large batch is another sample's
+    model, states, options = problem("affine, tanh, tanh, mass 0", 1000, batch=4096)
+    with torch.no_grad():
+        eager = Stepper(model, tol=4e-16).rollout(*states, **options)
+    assert relative(compiled_of("affine, tanh, tanh, mass 0").rollout(*states, **options).q, eager.q) <= 1e-12
 
 
 @pytest.mark.parametrize("case", ["full, correction", "motors", "sticking"])
@@ -169,19 +195,20 @@ def test_a_failed_step_has_no_derivative():
 @pytest.mark.parametrize("case", ["linear", "affine, tanh", "full", "mass", "order 4", *SLOW])
 def test_float32_keeps_its_digits_over_many_steps(case):
     # fails if c is multiplied into p or sigma: 1 + E rounds, and 1000 steps add it up to 3e-5
-    model, states, options = problem(case, 1000, torch.float32)
+    steps = steps_of(case)
+    model, states, options = problem(case, steps, torch.float32)
     compiled = compiled_of(case, torch.float32)
     start, alone = one(0, states, options)
     ours, single = compiled.rollout(*states, **options), compiled.rollout(*start, **alone)
     wide = State(*(x.double() for x in states))
     wider = {key: x.double() for key, x in options.items() if key == "inputs"}
-    exact = compile_c(model.double()).rollout(*wide, h=float(torch.tensor(H)), steps=1000, **wider)
+    exact = compile_c(model.double()).rollout(*wide, h=float(torch.tensor(H)), steps=steps, **wider)
     assert ours.ok.all()
     for name in ("q", "p", "s", "sigma"):
         assert relative(getattr(ours, name), getattr(exact, name)) <= 1e-5, name
         assert relative(getattr(single, name), getattr(exact, name)[0]) <= 1e-5, name
     for sigma, truth in ((ours.sigma, exact.sigma), (single.sigma, exact.sigma[0])):  # it falls: entry by entry
-        rounded = 1000 * 6e-8 * float((truth[..., 1] / truth[..., 0] - 1).abs().max())  # c - 1, once a step
+        rounded = steps * 6e-8 * float((truth[..., 1] / truth[..., 0] - 1).abs().max())  # c - 1, once a step
         assert (sigma / truth - 1).abs().max() <= 1e-6 + rounded
 
 
@@ -270,10 +297,7 @@ def test_large_steps_are_found_by_halved_moves():
         level="affine", angles=(True, True), scale=(1.0, 1.0), speed=(1.0, 1.0), stiffness=(1.0, 1.0), tilt=(0.0, 0.0),
         rate=0.2, potential_width=16,
     )).double()  # fmt: skip
-    make = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for x in model.parameters():
-            x.add_(0.1 * torch.randn(x.shape, generator=make, dtype=torch.float64))
+    make = randomise(model, 0.1, seed=1)
     q, p = (size * torch.randn(400, 2, generator=make, dtype=torch.float64) for size in (2, 4))
     start = q, p, torch.zeros(400, dtype=torch.float64)
     eager, ours = (one.rollout(*start, h=4.0, steps=1).ok.sum() for one in (Stepper(model), compile_c(model)))

@@ -15,6 +15,7 @@ from herglotz.export.c_header import c_source, described
 from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.mass import PositionKinetic
+from tests.lagrangians import random_model
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "c.md"
 COMPILERS = [c for c in ("gcc", "clang") if shutil.which(c)]
@@ -26,12 +27,7 @@ BOX = {"q_low": [-9.0], "q_high": [9.0], "p_low": [-9.0], "p_high": [9.0], "s_lo
 def model(n=1, **options):
     sizes = (1.0,) * n
     config = ModelConfig((True,) * n, scale=sizes, speed=sizes, stiffness=sizes, tilt=(0.0,) * n, rate=0.3, **options)
-    made = ContactLagrangian(config)
-    make = torch.Generator().manual_seed(2)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
-    return made
+    return random_model(config, spread=0.05, seed=2)
 
 
 @functools.cache

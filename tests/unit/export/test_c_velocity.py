@@ -2,7 +2,6 @@
 
 import ctypes
 import math
-import shutil
 from typing import Any
 
 import pytest
@@ -18,8 +17,9 @@ from herglotz.export.metadata import describe
 from herglotz.export.parameters import described_parameters
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, StepError, Stepper
+from tests.compilers import needs_compiler
 
-pytestmark = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
+pytestmark = needs_compiler
 NAN = math.nan
 
 CALLS = """

@@ -1,7 +1,6 @@
 """The C file for CasADi: its step beside Python's, its derivatives, and what it does where there is no step."""
 
 import ctypes
-import shutil
 import subprocess
 
 import numpy as np
@@ -12,10 +11,10 @@ from export_models import beside, damped, model_of, near, states_of, with_terms
 from herglotz.errors import InputError
 from herglotz.export import export_casadi, load_exported
 from herglotz.stepping import State
+from tests.compilers import CC, needs_compiler
 
 ca = pytest.importorskip("casadi", reason="casadi is not installed (extra: control)")
-CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
-pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
+pytestmark = needs_compiler
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 MODELS = {
     "network": lambda: damped("full", torch.float64),

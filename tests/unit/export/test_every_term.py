@@ -5,7 +5,6 @@ over steps, batches, starts, files) does not depend on its terms; test_matrix.py
 test_c_levels.py have it.
 """
 
-import shutil
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import fields
@@ -32,6 +31,7 @@ from herglotz.models.features import expand
 from herglotz.models.network import ACTIVATIONS
 from herglotz.stepping import State, Stepper
 from herglotz.training.named_terms import candidates
+from tests.compilers import needs_compiler
 
 H, STEPS = 0.1, 3
 Setting = dict[str, Any]
@@ -169,7 +169,7 @@ def _traced_once(monkeypatch):
     monkeypatch.setattr(Equations, "of", once)
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
+@needs_compiler
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.usefixtures("_traced_once")
 def test_a_term_steps_in_every_format(case):

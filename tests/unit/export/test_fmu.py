@@ -2,7 +2,6 @@
 
 import ctypes
 import json
-import shutil
 import struct
 import subprocess
 import zipfile
@@ -17,10 +16,10 @@ from export_models import damped, model_of, with_terms
 from herglotz.codegen import c_compiler
 from herglotz.errors import InputError
 from herglotz.export import export_fmu, load_exported
+from tests.compilers import CC, needs_compiler
 
 fmpy = pytest.importorskip("fmpy", reason="fmpy is not installed (extra: control)")
-CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
-pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
+pytestmark = needs_compiler
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 VERSIONS = ("3.0", "2.0")
 INPUTS, STATE = (1, 2), (3, 4, 5)  # value references of the driven model

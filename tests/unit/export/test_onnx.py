@@ -12,6 +12,7 @@ from herglotz.export import DifferencedStepper, compare, export_onnx, load_onnx,
 from herglotz.mechanics import flow_derivative, partials, step_derivative
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
+from tests.lagrangians import randomise
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -187,10 +188,7 @@ def test_explicit_steps_of_every_length(angles, tmp_path):
     # feature's slope is turned where it is none, or a step without c has another status than the eager one
     one = (1.0, 1.0)
     model = ContactLagrangian(ModelConfig(angles, "linear", one, one, one, (0.1, 0.2), 0.3, potential_width=3))
-    make = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.1 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+    make = randomise(model, 0.1, seed=1)
     exported, eager = load_onnx(export_onnx(model, tmp_path / "a.onnx", h=0.1)), Stepper(model)
     q, p, s = (0.5 * x for x in states_of(2, 3))
     for steps in (1, 7, 8, 15, 16, 17, 33):

@@ -1,7 +1,5 @@
 """An L_d of one's own as C, `.pt2` and ONNX: the motion of the module, and words where it cannot be traced."""
 
-import shutil
-
 import pytest
 import torch
 from torch import nn
@@ -9,6 +7,7 @@ from torch import nn
 import herglotz as hz
 from herglotz.export import compare, compile_c, export_onnx, export_pt2, load_onnx, load_pt2
 from herglotz.models import OwnLagrangian
+from tests.compilers import CC
 
 H = 0.1
 
@@ -47,7 +46,7 @@ class DrivenArm(Arm):
 def loaded(kind, model, tmp_path):
     """The stepper of a file of one kind."""
     if kind == "c":
-        if not any(map(shutil.which, ("cc", "gcc", "clang"))):
+        if CC is None:
             pytest.skip("no C compiler in the PATH")
         return compile_c(model, h=H)
     if kind == "pt2":
@@ -82,7 +81,7 @@ def test_a_branch_that_a_file_would_freeze_is_refused(kind, tmp_path):  # fails 
 
 def test_c_derivatives_by_inputs_of_a_module_are_those_of_eager():
     # fails if a column by an input stands where that of another, or of h, belongs
-    if not any(map(shutil.which, ("cc", "gcc", "clang"))):
+    if CC is None:
         pytest.skip("no C compiler in the PATH")
     model, make = OwnLagrangian(DrivenArm(), 2, inputs=3), torch.Generator().manual_seed(0)
     q, p = torch.randn(2, 5, 2, generator=make).double()

@@ -1,7 +1,6 @@
 """The controller of `examples/real_time_iteration` around a file for CasADi: what it converges to, and its bounds."""
 
 import ctypes
-import shutil
 import subprocess
 from itertools import pairwise
 from pathlib import Path
@@ -13,9 +12,9 @@ from export_models import damped
 
 from herglotz.export import export_casadi
 from herglotz.stepping import State, Stepper
+from tests.compilers import CC, needs_compiler
 
-CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
-pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
+pytestmark = needs_compiler
 RTI = Path(__file__).parents[3] / "examples" / "real_time_iteration" / "rti.c"
 FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Werror", "-fPIC", "-shared")
 N, NX, NU, H = 6, 3, 2, 0.2

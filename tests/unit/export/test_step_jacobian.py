@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from herglotz.export.equation import Equations
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ModelConfig
 from herglotz.stepping import State, Stepper
+from tests.lagrangians import random_model
 
 CASES = {
     "linear": {"level": "linear", "correction_width": 3},
@@ -21,10 +22,7 @@ def test_the_traced_jacobian_holds_for_any_batch(case):
     ones = (1.0, 1.0)
     options = {"potential_width": 3, **CASES[case]}
     config = ModelConfig((True, False), scale=ones, speed=ones, stiffness=ones, tilt=(0.0, 0.0), **options)
-    model = ContactLagrangian(config)
-    with torch.no_grad():
-        for i, parameter in enumerate(model.parameters()):
-            parameter += 0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(i)).double()
+    model = random_model(config, spread=0.05)
     graph = Equations.of(model).jacobian
     names = {str(node.target) for node in graph.code.nodes if node.op == "call_function"}
     assert not [name for name in names if name.endswith("_.Tensor") or "copy_" in name or "fill_" in name]

@@ -13,6 +13,7 @@ from herglotz.mechanics import (
     step_derivative,
 )
 from herglotz.stepping import State, Stepper
+from tests.lagrangians import states_in_turn
 
 H = 0.2
 
@@ -36,15 +37,9 @@ class ForcedPendula:
         return (c * h / 2)[..., None] * force, (h / 2)[..., None] * force
 
 
-def states(count=5):
-    make = torch.Generator().manual_seed(0)
-    q, p = (torch.randn(count, 2, generator=make, dtype=torch.float64) for _ in range(2))
-    return State(q, p, torch.randn(count, generator=make, dtype=torch.float64))
-
-
 def test_a_step_solves_the_forced_equations():
     # fails if F⁻ or F⁺ is left out of a momentum, or enters with the wrong sign
-    L_d, state = ForcedPendula(), states()
+    L_d, state = ForcedPendula(), states_in_turn(2, 5)
     assert isinstance(L_d, Forced)
     with torch.no_grad():
         step = Stepper(L_d).step(state, H)
@@ -60,7 +55,7 @@ def test_a_step_solves_the_forced_equations():
 
 def test_the_derivative_of_a_forced_step_is_the_closed_form():
     # fails if a derivative of F⁻ or F⁺ is missing from J or from DΦ̃
-    L_d, state = ForcedPendula(), states()
+    L_d, state = ForcedPendula(), states_in_turn(2, 5)
     stepper = Stepper(L_d)
     (q1, _, _), D = flow_derivative(lambda q, p, s: stepper.step(State(q, p, s), H).state, *state)
     with torch.no_grad():
@@ -70,7 +65,7 @@ def test_the_derivative_of_a_forced_step_is_the_closed_form():
 
 def test_the_contact_defect_is_exactly_the_forces():
     # fails if forces change s, or the defect is not −F⁻dq0 − F⁺dq1
-    L_d, state = ForcedPendula(), states()
+    L_d, state = ForcedPendula(), states_in_turn(2, 5)
     with torch.no_grad():
         step = Stepper(L_d).step(state, H)
         P = partials(L_d, state.q, step.state.q, state.s, H, 2)
@@ -86,7 +81,7 @@ def test_the_contact_defect_is_exactly_the_forces():
 
 def test_the_forced_residual_vanishes_along_steps():
     # fails if the two-step equation and the one-step map place forces differently
-    L_d, state = ForcedPendula(), states()
+    L_d, state = ForcedPendula(), states_in_turn(2, 5)
     with torch.no_grad():
         out = Stepper(L_d).rollout(*state, h=H, steps=2)
         q0, q1, q2 = out.q.unbind(-2)

@@ -12,6 +12,7 @@ from herglotz.models.jet import Jet
 from herglotz.models.phase import Phase
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
+from tests.lagrangians import randomise
 
 
 def build(config) -> Any:
@@ -68,10 +69,8 @@ def test_affine_drag_is_second_order():
 
 def random_networks(config, size=0.5) -> Any:
     model = build(config)
-    make = torch.Generator().manual_seed(3)
+    randomise(model, size, seed=3)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += size * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
         if config.coulomb:
             model.friction.coulomb.abs_()
             model.friction.log_smooth.fill_(0.0)  # wide: the asymptotic order needs h to resolve it

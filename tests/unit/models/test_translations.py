@@ -1,6 +1,5 @@
 """Translations that a model has by construction, at every weight of its networks."""
 
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -14,6 +13,8 @@ from herglotz.models.translations import directions, unchanged
 from herglotz.stepping import State, Stepper
 from herglotz.theory import symmetries
 from herglotz.training.named_terms import candidates
+from tests.compilers import needs_compiler
+from tests.lagrangians import random_model
 
 F64 = torch.float64
 
@@ -25,11 +26,7 @@ def config(**settings):
 
 
 def model(**settings):
-    made, make = ContactLagrangian(config(**settings)), torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for x in made.parameters():
-            x.add_(0.2 * torch.randn(x.shape, generator=make, dtype=F64))
-    return made.requires_grad_(False)
+    return random_model(config(**settings), spread=0.2, seed=0).requires_grad_(False)
 
 
 def states(n):
@@ -135,7 +132,7 @@ def test_what_would_see_a_translation_is_refused(settings, message):
         config(**settings)
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
+@needs_compiler
 def test_translations_hold_in_c():
     # fails if a traced network reads features without the projection
     made, x = model(level="linear", correction_width=5, translations=("q1 + q2",)), states(2)

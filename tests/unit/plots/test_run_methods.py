@@ -11,7 +11,6 @@ from fake_run import fake_run
 import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.export.run_file import WRITERS
 from herglotz.theory.symmetries import symmetries
 from herglotz.training.motion import Motion
 
@@ -87,8 +86,9 @@ def test_pictures_files_and_checks(tmp_path, monkeypatch):  # fails if a method 
         run.plot("x")
     with pytest.raises(InputError, match=r"must end in .pt2, .onnx, .h"):
         run.export(tmp_path / "a.txt")
-    monkeypatch.setitem(
-        WRITERS, "c", lambda *given, **described: calls.append((*given, described["metadata"]["start"]))
+    monkeypatch.setattr(
+        "herglotz.export.c_header.export_c",
+        lambda *given, **described: calls.append((*given, described["metadata"]["start"])),
     )
     monkeypatch.setattr("herglotz.verify.verify", lambda target, **settings: (target, settings))
     assert run.export(tmp_path / "a.h", h_range=(0.1, 0.3)) == tmp_path / "a.h"

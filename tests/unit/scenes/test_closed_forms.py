@@ -94,6 +94,7 @@ CASES = [
     (oscillator, 0.7, 0.83, 1.66, 0.37),
     (oscillator, 0.7, 0.83, 1.66 * (1 + 1e-13), 0.37),
     (oscillator, 1.3, 1e-9, 0.4, 0.21),
+    (oscillator, 1.3, 0.0, 0.4, 0.21),
     (oscillator, 1.3, 1.1, 1e-12, 0.21),
     # seeds whose steps stay before the fold of H⁺
     *((parachute, *draws(i, (0.3, 3), (1, 20), (0.003, 0.2), (0.01, 0.8))) for i in range(1, 5)),

@@ -9,6 +9,7 @@ from herglotz.scenes import NumericallyExact, Reason, exact_discrete_lagrangian,
 from herglotz.scenes.collocation import lobatto
 from herglotz.scenes.motion import constant_rate
 from herglotz.stepping import State, Status, Stepper
+from tests.lagrangians import scene_states
 
 NUMERICAL = [scene(name) for name in scene_names() if scene(name).numerical]
 BLOCKS = ("L", "D1", "D2", "D3", "D11", "D12", "D22", "D13", "D23", "D33")
@@ -16,17 +17,6 @@ BLOCKS = ("L", "D1", "D2", "D3", "D11", "D12", "D22", "D13", "D23", "D33")
 
 def f64(*x):
     return torch.tensor(x, dtype=torch.float64)
-
-
-def starts(system, count=3, seed=0):
-    """Random (q, p, s) in the scene's ranges."""
-    rng = torch.Generator().manual_seed(seed)
-    draws = []
-    for limits in (system.q_range, system.v_range):
-        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
-        draws.append(low + (high - low) * torch.rand(count, system.dof, generator=rng, dtype=torch.float64))
-    s = 2 * torch.rand(count, generator=rng, dtype=torch.float64) - 1
-    return draws[0], system.momentum(*draws, s), s
 
 
 def numerical(system):
@@ -44,7 +34,7 @@ def test_closed_forms(name):
     # fails if any of the ten formulas in the sensitivities is wrong, if v is not turned into p = L_v (which depends on
     # s for the drag), or if a constant c hides its gradient (c = e^{2λΔ} there)
     system = scene(name, **scene(name).examples[0])
-    q, p, s = starts(system, 2)
+    q, p, s = scene_states(system, 2)
     h = f64(0.3, 0.8)
     q1 = system.flow(q, p, s, h)[0] + 0.05
     P = partials(exact_discrete_lagrangian(system.lagrangian), q, q1, s, h, 2)
@@ -55,7 +45,7 @@ def test_closed_forms(name):
 def test_it_generates_the_flow(system):
     # fails if FL⁻ or FL⁺ is not that of the motion, or if the step it generates is no contact map (D12, D13, D23, D33
     # all enter its derivative); and with a c that is off by 1e-6 the check must see it
-    q, p, s = starts(system, 2, seed=1)
+    q, p, s = scene_states(system, 2, seed=1)
     q1, p1, s1 = system.flow(q, p, s, system.h)
     P = partials(numerical(system), q, q1, s, system.h, 2)
     torch.testing.assert_close(-P.D1 / P.c[:, None], p, rtol=0, atol=2e-11)

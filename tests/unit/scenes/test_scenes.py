@@ -15,6 +15,7 @@ from herglotz.mechanics import (
 )
 from herglotz.scenes import ORDERS, reference_flow, scene, scene_names
 from herglotz.theory import RightHamiltonian, contact_vector_field
+from tests.lagrangians import scene_states
 
 # at each scene's own examples, off the default parameters, where m = 1 and Ω = 1 would hide powers
 SCENES = [scene(name, **parameters) for name in scene_names() for parameters in scene(name).examples]
@@ -24,18 +25,6 @@ CONTACT = [s for s in SCENES if s.external is None]  # the others: test_forced_s
 
 def label(s):
     return "-".join([s.name, *(f"{x:g}" for x in s.parameters.values())])
-
-
-def states(system, count, seed=0, dtype=torch.float64):
-    """Random (q, p, s) in the scene's ranges."""
-    rng = torch.Generator().manual_seed(seed)
-    draws = []
-    for limits in (system.q_range, system.v_range):
-        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
-        draws.append(low + (high - low) * torch.rand(count, system.dof, generator=rng, dtype=torch.float64))
-    q, v = draws
-    s = 2 * torch.rand(count, generator=rng, dtype=torch.float64) - 1
-    return tuple(x.to(dtype) for x in (q, system.momentum(q, v, s), s))
 
 
 def factor(system, q, p, s, h):
@@ -54,7 +43,7 @@ def relative(value, expected):
 @pytest.mark.parametrize("system", SCENES, ids=label)
 def test_legendre_transform(system):
     # fails if momentum is not L_v, velocity is not its inverse or not H_p, or H ≠ p·v − L
-    q, p, s = states(system, 20)
+    q, p, s = scene_states(system, 20)
     v = system.velocity(q, p, s)
     v = v.detach().requires_grad_()
     L = system.lagrangian(q, v, s)
@@ -69,7 +58,7 @@ def test_legendre_transform(system):
 @pytest.mark.parametrize("system", CONTACT, ids=label)
 def test_flow_is_the_contact_flow_of_its_hamiltonian(system, factor_of_h):
     # fails if the closed-form flow (or the pendulum's written-out field) is not that of X_H, in any of q, p, s
-    q, p, s = states(system, 20, seed=1)
+    q, p, s = scene_states(system, 20, seed=1)
     h = factor_of_h * system.h
     expected = reference_flow(partial(contact_vector_field, system.hamiltonian), q, p, s, h)
     for value, number in zip(system.flow(q, p, s, h), expected, strict=True):
@@ -79,7 +68,7 @@ def test_flow_is_the_contact_flow_of_its_hamiltonian(system, factor_of_h):
 @pytest.mark.parametrize("system", CONTACT, ids=label)
 def test_flow_is_a_contact_map(system):
     # fails if the flow of s does not match that of (q, p)
-    q, p, s = states(system, 6, seed=2)
+    q, p, s = scene_states(system, 6, seed=2)
     h = min(0.3, 3 * system.h)
     (_, p1, _), D = flow_derivative(lambda q, p, s: system.flow(q, p, s, h), q, p, s)
     c = factor(system, q, p, s, h)
@@ -92,7 +81,7 @@ def test_flow_is_a_contact_map(system):
 @pytest.mark.parametrize("system", EXACT, ids=label)
 def test_exact_lagrangian_generates_the_flow(system):
     # fails if FL⁻ or FL⁺ of L_d differs from the flow's momenta or action
-    q, p, s = states(system, 20, seed=3)
+    q, p, s = scene_states(system, 20, seed=3)
     h = 0.3
     q1, p1, s1 = system.flow(q, p, s, h)
     assert relative(legendre_minus(system.L_d, q, q1, s, h)[1], p) < 1e-11
@@ -104,7 +93,7 @@ def test_exact_lagrangian_generates_the_flow(system):
 @pytest.mark.parametrize("system", EXACT, ids=label)
 def test_closed_form_partials(system):
     # fails if a closed-form derivative is wrong, at pairs (q0, q1) off the flow and with a step per sample
-    q0, q1, s0 = states(system, 20, seed=4)
+    q0, q1, s0 = scene_states(system, 20, seed=4)
     q1 = q0 + 0.1 * torch.sin(17 * q1)
     h = torch.linspace(0.1, 0.7, 20, dtype=torch.float64)
     P, A = partials(system.L_d, q0, q1, s0, h, order=2), autograd_partials(system.L_d, q0, q1, s0, h, order=2)
@@ -122,7 +111,7 @@ def test_closed_form_partials(system):
 @pytest.mark.parametrize("system", EXACT, ids=label)
 def test_right_hamiltonian(system):
     # fails if H⁺ has a wrong branch, sign or coefficient: H⁺ = p1·q1 − L_d, ∂H⁺/∂p1 = q1, ∂H⁺/∂q0 = −D1, ∂H⁺/∂s0 = −D3
-    q, p, s = states(system, 20, seed=5)
+    q, p, s = scene_states(system, 20, seed=5)
     h = 0.2
     q1, p1, _ = system.flow(q, p, s, h)
     P = partials(system.L_d, q, q1, s, h)
@@ -142,7 +131,7 @@ def test_right_hamiltonian(system):
 def test_left_hamiltonian(system):
     # fails with the printed left equations (E5): q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻
     h = 0.2
-    q, p, s = states(system, 20, seed=6)
+    q, p, s = scene_states(system, 20, seed=6)
     q1, _, s1 = system.flow(q, p, s, h)
     p, q1, s1 = (x.requires_grad_() for x in (p, q1, s1))
     H = system.H_minus(p, q1, s1, h)
@@ -156,7 +145,7 @@ def test_left_hamiltonian(system):
 @pytest.mark.parametrize("system", SCENES, ids=label)
 def test_batch_and_step_per_sample(system):
     # fails if samples interact, if h (...) is not broadcast against (..., n), or if leading dims are not kept
-    q, p, s = states(system, 6, seed=7)
+    q, p, s = scene_states(system, 6, seed=7)
     h = torch.linspace(0.05, 0.6, 6, dtype=torch.float64)
     together = system.flow(*(x.reshape(2, 3, *x.shape[1:]) for x in (q, p, s)), h.reshape(2, 3))
     assert together[0].shape == (2, 3, system.dof)
@@ -184,7 +173,7 @@ def test_batch_and_step_per_sample(system):
 @pytest.mark.parametrize("system", SCENES, ids=label)
 def test_float32(system):
     # fails if a constant promotes to float64, or if a formula overflows or cancels in single precision
-    q, p, s = states(system, 8, seed=8)
+    q, p, s = scene_states(system, 8, seed=8)
     single = tuple(x.float() for x in (q, p, s))
     for value, expected in zip(system.flow(*single, 0.2), system.flow(q, p, s, 0.2), strict=True):
         assert value.dtype == torch.float32
@@ -216,7 +205,7 @@ def test_description_is_complete(name):
     assert system.examples
     assert all(set(parameters) <= set(system.parameters) for parameters in system.examples)
     # a negative control of `exact`: an exact L_d composes, S² = L_d(2h), and no rule does
-    q, p, s = states(system, 5, seed=9)
+    q, p, s = scene_states(system, 5, seed=9)
     q1 = system.flow(q, p, s, 2 * system.h)[0]
     gap = (legendre_minus(system.L_d, q, q1, s, 2 * system.h)[1] - p).detach()
     assert (float(gap.abs().max() / p.abs().max()) < 1e-11) is system.exact

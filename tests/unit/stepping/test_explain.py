@@ -13,7 +13,7 @@ from herglotz.stepping import State, Status, StepError, Stepper, explain_step
 from herglotz.stepping.explain import longest_step
 from herglotz.theory import LeftHamiltonian, RightHamiltonian
 from herglotz.verify import verify
-from tests.lagrangians import cubic
+from tests.lagrangians import cubic, states
 
 # m = Ω = 1, γ = 0.2
 OSCILLATOR = scene("damped_oscillator")
@@ -53,11 +53,6 @@ NAMES = {
 }
 
 
-def states(count=3):
-    x = torch.randn(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return State(x[:, :1], x[:, 1:2], x[:, 2])
-
-
 def lost(at):
     return {name for name in ("finite", "c", "M", "pole", "H_plus", "H_minus") if bool(at.lost(name).any())}
 
@@ -66,7 +61,7 @@ def lost(at):
 def test_the_condition_that_fails_is_named_where_it_fails(case):
     # fails if a condition is missed at its exact critical h, mistaken for another one, or reported for a neighbour
     L_d, critical, names = CRITICAL[case]
-    q, _, s = states()
+    q, _, s = states(count=3)
     h = torch.tensor([0.1, critical, critical * (1 + 1e-3)], dtype=torch.float64)
     at = regularity(L_d, q, q + 0.1, s, h)
     assert lost(at) == names
@@ -80,7 +75,7 @@ def test_the_condition_that_fails_is_named_where_it_fails(case):
 def test_a_step_where_c_vanishes_is_singular_and_explained(case):
     # fails if c = 0 gives a number, a status without a reason, or takes its neighbour down
     L_d, critical, _ = CRITICAL[case]
-    start, h = states(2), torch.tensor([0.1, critical], dtype=torch.float64)
+    start, h = states(count=2), torch.tensor([0.1, critical], dtype=torch.float64)
     step = Stepper(L_d).step(start, h)
     assert step.status.tolist() == [Status.CONVERGED, Status.SINGULAR]
     assert step.state.q.isnan().flatten().tolist() == [False, True]
@@ -92,7 +87,7 @@ def test_a_step_where_c_vanishes_is_singular_and_explained(case):
 def test_a_step_at_a_conjugate_point_is_singular_and_explained(beside):
     # fails if a momentum lost to rounding is returned as a number: q1 converges there, p1 and s1 do not
     critical = math.nextafter(CONJUGATE, math.copysign(9.0, beside)) if beside else CONJUGATE
-    start = states(200)
+    start = states(count=200)
     h = torch.full((200,), critical, dtype=torch.float64)
     h[0] = 0.1
     step, exact = Stepper(OSCILLATOR.L_d).step(start, h), OSCILLATOR.flow(*start, h)
@@ -111,7 +106,7 @@ def test_a_step_at_a_conjugate_point_is_singular_and_explained(beside):
 def test_beside_a_conjugate_point_and_at_rest_steps_go_on():
     # fails if a good momentum is thrown away, or a body at rest away from 0, whose momentum is rounding, is stopped
     h = CONJUGATE * (1 + 1e-8)
-    step, exact = Stepper(OSCILLATOR.L_d).step(states(200), h), OSCILLATOR.flow(*states(200), h)
+    step, exact = Stepper(OSCILLATOR.L_d).step(states(count=200), h), OSCILLATOR.flow(*states(count=200), h)
     assert step.status.tolist() == [Status.CONVERGED] * 200
     assert float((step.state.p - exact[1]).abs().max()) < 1e-6
 
@@ -129,27 +124,27 @@ def test_the_error_names_the_condition():
     h = torch.tensor([0.1, 5.0], dtype=torch.float64)
     words = r"sample \(1,\): SINGULAR, residual .*; try a smaller h; sample \(1,\), h = 5.0: SINGULAR: c = 0"
     with pytest.raises(StepError, match=words):
-        Stepper(LEFT, throw=True).step(states(2), h)
+        Stepper(LEFT, throw=True).step(states(count=2), h)
     with pytest.raises(StepError, match=r"step 0: .*; sample \(0,\), h = 3.157\d*: SINGULAR: L_d has a pole at this h"):
-        Stepper(OSCILLATOR.L_d, throw=True).rollout(*states(2), h=CONJUGATE, steps=3)
+        Stepper(OSCILLATOR.L_d, throw=True).rollout(*states(count=2), h=CONJUGATE, steps=3)
 
 
 def test_both_hamiltonians_are_nan_where_they_are_lost():
     # fails if the inverse of a block of size 1e-16 is trusted
     for case in ("implicit midpoint, h = 2/Ω", "implicit trapezoid, h = √2/Ω"):
         L_d, critical, _ = CRITICAL[case]
-        q, p, s = states(2)
+        q, p, s = states(count=2)
         h = torch.tensor([0.1, critical], dtype=torch.float64)
         assert RightHamiltonian(L_d)(q, p, s, h).isnan().tolist() == [False, True]
         assert LeftHamiltonian(L_d)(p, q, s, h).isnan().tolist() == [False, True]
         # A step needs neither H⁺ nor H⁻.
-        assert Stepper(L_d).step(states(2), h).status.tolist() == [0, 0]
-        assert explain_step(L_d, states(2), h) == []
+        assert Stepper(L_d).step(states(count=2), h).status.tolist() == [0, 0]
+        assert explain_step(L_d, states(count=2), h) == []
 
 
 def test_regularity_is_det_M_and_not_D2D2():
     # fails if the paper's condition is used (E4), which calls the first L_d regular and the second singular
-    q, p, s = states()
+    q, p, s = states(count=3)
     assert lost(regularity(sum_of_squares, q, q + 0.1, s, 0.1)) == {"M"}
     assert lost(regularity(product, q, q + 0.1, s, 0.1)) == {"H_plus", "H_minus"}
     assert Stepper(product).step(State(q, p, s), 0.1).status.tolist() == [Status.CONVERGED] * 3
@@ -163,7 +158,7 @@ def test_either_hamiltonian_may_be_lost_alone():
     def bent(a, b):
         return lambda q0, q1, s0, h: (a * q0**2 + b * q1**2 - q0 * q1).sum(-1) / h - 0.1 * h * s0
 
-    q = states()[0]
+    q = states(count=3)[0]
     s = torch.zeros_like(q[:, 0])
     assert lost(regularity(bent(0.5, 0.0), q, q + 0.1, s, 0.1)) == {"H_plus"}
     assert lost(regularity(bent(0.0, 0.5), q, q + 0.1, s, 0.1)) == {"H_minus"}
@@ -217,12 +212,12 @@ def test_values_that_overflow_are_named():
     def blown(q0, q1, s0, h):
         return torch.exp(1e6 + (q1 * q0).sum(-1)) + 0 * s0 * h
 
-    assert "DIVERGED: L_d or a derivative is not finite" in explain_step(blown, states(1), 0.1)[0]
+    assert "DIVERGED: L_d or a derivative is not finite" in explain_step(blown, states(count=1), 0.1)[0]
 
 
 def test_scale_and_precision():
     # fails if a margin depends on units, or the bound is that of float64 for float32
-    q, _, s = states()
+    q, _, s = states(count=3)
     plain = regularity(OSCILLATOR.L_d, q, q + 0.1, s, 0.1)
 
     def scaled(q0, q1, s0, h):
@@ -239,4 +234,4 @@ def test_scale_and_precision():
 def test_wrong_h_is_named():
     # fails if h = 0 reaches the solver
     with pytest.raises(InputError, match="h must be > 0, got 0"):
-        explain_step(OSCILLATOR.L_d, states(), 0.0)
+        explain_step(OSCILLATOR.L_d, states(count=3), 0.0)

@@ -9,6 +9,7 @@ import torch
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.stepping.linearise import eliminate
+from tests.lagrangians import randomise
 
 ONES = (1.0, 1.1)
 CASES: dict[str, dict[str, Any]] = {
@@ -33,11 +34,9 @@ def problem(case):
     """A model of an angle and a length whose every parameter is random, three states, h and inputs."""
     options = {"potential_width": 3, "damping_width": 3, **CASES[case]}
     config = ModelConfig((True, False), scale=ONES, speed=ONES, stiffness=ONES, tilt=(0.0, 0.0), **options)
-    make = torch.Generator().manual_seed(3)
     model: Any = ContactLagrangian(config)
+    make = randomise(model, 0.05, seed=3)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
         if model.friction is not None:
             model.friction.viscous.abs_()
         if model.action is not None:

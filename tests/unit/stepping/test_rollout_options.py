@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ModelConfig
 from herglotz.stepping import State, Status, StepError, Stepper
 from herglotz.stepping.guess import EQUAL, Extrapolation, extrapolation_weights
+from tests.lagrangians import random_model
 
 
 class Motor:
@@ -25,12 +26,7 @@ class Motor:
 
 
 def model(**settings):
-    made = ContactLagrangian(ModelConfig(**settings))
-    make = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
-    return made
+    return random_model(ModelConfig(**settings), spread=0.2, seed=1)
 
 
 def start(batch=3):

@@ -8,7 +8,7 @@ import torch
 from herglotz.mechanics import autograd_partials, partials
 from herglotz.mechanics.regularity import left_hessian
 from herglotz.scenes import scene
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import Stepper
 from herglotz.theory import (
     LeftHamiltonian,
     LeftLagrangian,
@@ -18,7 +18,7 @@ from herglotz.theory import (
     right_equations,
     right_step,
 )
-from tests.lagrangians import nonlinear
+from tests.lagrangians import nonlinear, states
 
 OSCILLATOR = scene("damped_oscillator", m=1.7, omega0=1.3, gamma=0.6)
 CASES = {
@@ -32,8 +32,7 @@ CASES = {
 def solved(name, count=12, seed=0):
     """States and one step from each by Newton on FL⁻."""
     L_d, n, h = CASES[name]
-    x = torch.randn(count, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    start = State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+    start = states(n, count, seed)
     step = Stepper(L_d).step(start, h)
     return L_d, h, start, step.state, step.c
 

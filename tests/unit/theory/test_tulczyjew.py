@@ -18,7 +18,7 @@ from herglotz.theory import (
     right_leg_states,
     tulczyjew_triple,
 )
-from tests.lagrangians import nonlinear
+from tests.lagrangians import nonlinear, states
 
 
 def stage(q0, q1, s0, h):
@@ -32,8 +32,8 @@ def f64(*x):
 
 
 def points(n=2, count=7, seed=0):
-    x = torch.randn(count, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return x[:, :n], x[:, :n] + 0.3 * x[:, n : 2 * n], x[:, -1]
+    q, p, s = states(n, count, seed)
+    return q, q + 0.3 * p, s
 
 
 LEGS = {

@@ -5,7 +5,6 @@ h of any kind.
 """
 
 import random
-import shutil
 from typing import Any
 
 import pytest
@@ -16,6 +15,7 @@ from herglotz.export import compile_c, load_exported, load_pt2
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene, scene_names
 from herglotz.stepping import State, StepError, Stepper
+from tests.compilers import CC
 
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 SINGLE = ("eager affine float32", "c forced float32")
@@ -48,7 +48,7 @@ def kind(request, files) -> tuple[Any, int, torch.dtype]:
         return Stepper(scene(name).L_d), scene(name).dof, dtype
     if how == "file":
         return load_pt2(files(name)) if name == "pt2" else load_exported(files(name)), 1, dtype
-    if how == "c" and not any(map(shutil.which, ("cc", "gcc", "clang"))):
+    if how == "c" and CC is None:
         pytest.skip("no C compiler in the PATH")
     return {"eager": Stepper, "c": compile_c}[how](ContactLagrangian(ModelConfig(level=name)).to(dtype)), 1, dtype
 

@@ -20,11 +20,9 @@ from herglotz.export.metadata import check_metadata, describe, from_json
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, load_run, save_run
 from herglotz.training.run_folder import FILES, MANIFEST
+from tests.compilers import needs_compiler
 
 FLIPS = 60  # of each file; `make fuzz` takes thousands
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH"
-)
 
 
 def damaged(content: bytes, make: random.Random) -> bytes:

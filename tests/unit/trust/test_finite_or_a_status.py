@@ -1,7 +1,6 @@
 """A number that is not finite has a status, eager and exported; every wrong start is refused at one door."""
 
 import itertools
-import shutil
 
 import pytest
 import torch
@@ -11,14 +10,13 @@ from herglotz.export import ExportedStepper, compile_c, export_onnx, load_export
 from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, StepError, Stepper
+from tests.compilers import CC, needs_compiler
 
-HAS_COMPILER = any(map(shutil.which, ("cc", "gcc", "clang")))
-needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="no C compiler in the PATH")
 LARGEST = {torch.float32: 3.3e38, torch.float64: 1.7e308}
 
 
 def steppers(model):
-    return [Stepper(model), *([compile_c(model)] if HAS_COMPILER else [])]
+    return [Stepper(model), *([compile_c(model)] if CC else [])]
 
 
 def silent(out):
@@ -148,7 +146,7 @@ def test_a_start_that_is_too_fast_is_said(model, files):
     # fails if `init`, which has no status, gives NaN in silence
     far = torch.tensor([[0.0], [1e300]], dtype=torch.float64)
     named = {"eager": Stepper(model), "onnx": load_exported(files("onnx"))}
-    named |= {"c": compile_c(model)} if HAS_COMPILER else {}
+    named |= {"c": compile_c(model)} if CC else {}
     for stepper in named.values():
         with pytest.raises(StepError, match=r"init failed at sample \(1,\)"):
             stepper.init(torch.zeros_like(far), far, h=1e-20)

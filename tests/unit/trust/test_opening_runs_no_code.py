@@ -11,10 +11,7 @@ from herglotz.codegen import cache
 from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
 from herglotz.export import compile, compile_c, load_c, load_exported, trusted
-
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH"
-)
+from tests.compilers import needs_compiler
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.codegen.c_compiler import compiler
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_defect, flow_derivative
 from herglotz.models import ContactLagrangian, ModelConfig
@@ -18,13 +17,8 @@ from herglotz.tune import CompiledKicks, KickStepper, export_kicks_c, fit_kicks
 from herglotz.tune.distil import FlowProblem
 from herglotz.tune.kick_composition import _leapfrog, _misses
 from herglotz.tune.kick_header import kicks_c
+from tests.compilers import needs_compiler
 
-try:
-    compiler()
-    HAS_C = True
-except InputError:
-    HAS_C = False
-needs_c = pytest.mark.skipif(not HAS_C, reason="no C compiler")
 H = 1.0
 
 
@@ -122,7 +116,7 @@ def test_the_normal_equations_of_a_flow_are_the_derivatives_of_its_cost():
     torch.testing.assert_close(A, J.T @ J)
 
 
-@needs_c
+@needs_compiler
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-13), ("float32", 1e-4)])
 @pytest.mark.parametrize("angle", [True, False], ids=["angle", "length"])
 def test_c_is_the_same_step(angle, dtype, tolerance):
@@ -148,14 +142,14 @@ def test_c_is_the_same_step(angle, dtype, tolerance):
     torch.testing.assert_close(a.sigma.to(number), b.sigma)
 
 
-@needs_c
+@needs_compiler
 def test_a_kick_in_c_takes_one_sine_and_one_cosine():
     # fails if multiple angles call sines of their own, which are most of the work of a step
     text = kicks_c(random_kicks(True))
     assert [text.count(f" {name}(") for name in ("sin", "cos")] == [3, 3]
 
 
-@needs_c
+@needs_compiler
 def test_what_is_not_finite_says_so():
     # fails if a motion that overflows is reported as converged, has a σ, or poisons the next motion of its batch
     d = torch.full((2,), 0.5, dtype=torch.float64)
@@ -197,7 +191,7 @@ def test_the_first_guess_is_leapfrog_of_the_potential(angle):
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
 
 
-@needs_c
+@needs_compiler
 def test_kicks_step_at_their_own_h_only():
     # fails if a right step among several lets the other steps pass, or the bound is not relative to h
     start = states(2)

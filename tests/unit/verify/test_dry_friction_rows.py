@@ -1,7 +1,5 @@
 """Verification of joints that dry friction can hold: the map is judged on its branches, what is held by its own row."""
 
-import shutil
-
 import pytest
 import torch
 
@@ -12,8 +10,8 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.verify import verify
 from herglotz.verify.legendre import _one_sign
+from tests.compilers import needs_compiler
 
-needs_cc = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
 H = 0.05
 
 
@@ -93,7 +91,7 @@ def test_what_friction_holds_verifies(kind, n, dtype):
         assert verify(file_of(model, kind)).missing == ("contact", "momentum", "holding")
 
 
-@needs_cc
+@needs_compiler
 def test_a_header_verifies():
     # fails if C's map is differentiated across the edge of what friction holds, and not by the header's own Jacobian
     model = held()
