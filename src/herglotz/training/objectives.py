@@ -8,7 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
+from herglotz.data.roughness import precision
 from herglotz.models import ContactLagrangian
+from herglotz.training.distillation import taught
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.look import PROBE, Look
 from herglotz.training.one_step_fit import NOISE_OF_R, best_restart, fit_one_step, one_step_problem
@@ -38,14 +40,18 @@ class Fitted:
 def fit_by_one_step(task: Task, seen: Look, plan: Plan) -> Fitted:
     """Minimise one-step errors, then fit the states: a free run must not start from two noisy samples."""
     raw = plan.objective == "raw"
+    start = taught(task, plan.network, outliers=plan.outliers)
+    known_s = None if start is None else start.s
 
     def problem(model: ContactLagrangian) -> OneStep:
         return one_step_problem(
-            task, model, task.exact, metric="raw" if raw else "position", expected=seen.baseline_motion
+            task, model, task.exact, metric="raw" if raw else "position", expected=seen.baseline_motion, s=known_s
         )
 
     iterations = task.config.iterations
-    if plan.restarts > 1 or plan.network == "covered":
+    if start is not None:
+        model = start.model
+    elif plan.restarts > 1 or plan.network == "covered":
         model, iterations = best_restart(task, plan.network, plan.restarts, problem)
     else:
         model = task.build(plan.network) if seen.probe is None else seen.probe.model
@@ -67,10 +73,15 @@ def fit_by_one_step(task: Task, seen: Look, plan: Plan) -> Fitted:
 
 def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG001
     """Fit parameters and states to whole trajectories, from a short one-step fit or from values that were found."""
-    model, sigma = (task.build(plan.network), plan.sigma or 0.0) if plan.fitted_before else _one_step_start(task, plan)
+    start = None if plan.fitted_before else taught(task, plan.network, outliers=plan.outliers)
+    known = plan.fitted_before or start is not None
+    if start is not None:
+        model, sigma = start.model, plan.sigma or precision(task.data)
+    else:
+        model, sigma = (task.build(plan.network), plan.sigma or 0.0) if known else _one_step_start(task, plan)
     if task.config.sticking:
         model = with_sticking(model, excess=not plan.fitted_before)
-    found = fit_trajectories(replace(task, longest=plan.longest), model, sigma, known=plan.fitted_before)
+    found = fit_trajectories(replace(task, longest=plan.longest), model, sigma, known=known)
     # A model that is lost keeps the parameters of the one-step fit.
     if found is None:
         return _lost(task, model, "trajectory", sigma, "the model cannot follow the data over 20 steps")
