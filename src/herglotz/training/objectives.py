@@ -77,6 +77,9 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     known = plan.fitted_before or start is not None
     if start is not None:
         model, sigma = start.model, plan.sigma or precision(task.data)
+        # The weakest prior comes first: what networks were taught is no departure to begin without.
+        weakest_first = tuple(sorted(task.config.departures, reverse=True))
+        task = replace(task, config=replace(task.config, departures=weakest_first))
     else:
         model, sigma = (task.build(plan.network), plan.sigma or 0.0) if known else _one_step_start(task, plan)
     if task.config.sticking:
