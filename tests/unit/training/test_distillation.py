@@ -13,7 +13,7 @@ from herglotz.training.problems.recorded_action import action
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 
-H, STEPS, SUBSTEPS = 0.1, 100, 5
+H, SUBSTEPS = 0.1, 5
 GAMMA, BETA = 0.1, 0.15
 SMALL = {"potential_width": 4, "damping_width": 3, "action_width": 2}
 
@@ -33,40 +33,40 @@ def rates(law, q, s):
     return GAMMA + 0.3 * torch.exp(-q * q) if law == "affine" else GAMMA + 2 * BETA * s
 
 
-def recorded(law, noise=0.0, trajectories=4, seed=0):
-    """(Trajectories, s at every sample) by Runge–Kutta steps of 0.02, from s = 0."""
-    make = torch.Generator().manual_seed(seed)
+def recorded(law, noise=0.0, trajectories=4, steps=60):
+    """(Trajectories, s and −∂L/∂s at every sample) by Runge–Kutta steps of 0.02, from s = 0."""
+    make = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.rand(*shape, generator=make, dtype=torch.float64)  # noqa: E731
     x = torch.cat([3 * draw(trajectories, 1) - 1.5, 2 * draw(trajectories, 1) - 1, torch.zeros(trajectories, 1)], 1)
     rows, h = [x], H / SUBSTEPS
-    for k in range(STEPS * SUBSTEPS):
+    for k in range(steps * SUBSTEPS):
         a = field(law, x)
         b = field(law, x + h / 2 * a)
         c = field(law, x + h / 2 * b)
         x = x + h / 6 * (a + 2 * b + 2 * c + field(law, x + h * c))
         rows += [x] if (k + 1) % SUBSTEPS == 0 else []
     q, _, s = torch.stack(rows, 1).flatten(0, 1).unbind(-1)
+    true = rates(law, q, s)
     q = q + noise * q.std() * torch.randn(len(q), generator=make, dtype=torch.float64)
-    t = (torch.arange(STEPS + 1, dtype=torch.float64) * H).repeat(trajectories)
-    return Trajectories.of(t, q[:, None], (STEPS + 1,) * trajectories), s
+    t = (torch.arange(steps + 1, dtype=torch.float64) * H).repeat(trajectories)
+    return Trajectories.of(t, q[:, None], (steps + 1,) * trajectories), s, true
 
 
-def missed_rates(model, data, q, s, law, true_s):
+def missed_rates(model, data, q, s, true):
     """RMS of −∂L/∂s of a model along its motion less the true one, at the middle of the steps."""
     i = data.steps().index
     with torch.no_grad():
         found = -model.partials(q[i], q[i + 1], s[i], torch.full_like(s[i], H)).c.log() / H
-    true = rates(law, recorded(law)[0].q[:, 0], true_s)
     return float((found - (true[i] + true[i + 1]) / 2).square().mean().sqrt())
 
 
 def test_networks_are_taught_the_damping_by_s():
     # fails if networks start at 0 (missed by 0.07, the spread of the rates), or are not taught s
-    data, s = recorded("full")
+    data, _, true = recorded("full")
     config = FitConfig(level="full", **SMALL)
     start = taught(Task(data, estimate_baseline(data), config, Stages()), "potential", outliers=False)
     assert start is not None
-    assert missed_rates(start.model, data, data.q, start.s, "full", s) < 0.01
+    assert missed_rates(start.model, data, data.q, start.s, true) < 0.01
 
 
 @pytest.mark.slow
@@ -75,15 +75,15 @@ def test_networks_recover_the_damping_from_noisy_positions(law):
     # fails without a start at named terms: free runs then miss unseen samples by 0.03 to 0.1, whose noise is 0.003. The
     # rates along a motion do not depend on the gauge s + b(q), the rates at given s do; their spread is 0.06.
     noise = 0.005
-    data, s = recorded(law, noise)
+    data, _, true = recorded(law, noise, steps=150)
     run = hz.fit(data, level=law, **SMALL)
     assert run.metrics["extrapolation_rms"] < 3 * noise * float(data.q.std())
-    assert missed_rates(run.model, data, run.states.q, run.states.s, law, s) < 0.03
+    assert missed_rates(run.model, data, run.states.q, run.states.s, true) < 0.03
 
 
 def test_named_terms_or_recorded_s_leave_networks_as_they_are():
     # fails if a search overrules what the user names, or what is known of s
-    data, _ = recorded("full", trajectories=1)
+    data, _, _ = recorded("full", trajectories=1)
     base = estimate_baseline(data)
     for told in ({"features": ("q1^4",)}, {"supervision": "qs"}, {"dissipation": ("s^2",)}):
         task = Task(data, base, FitConfig(level="full", **SMALL, **told), Stages())
@@ -92,7 +92,7 @@ def test_named_terms_or_recorded_s_leave_networks_as_they_are():
 
 def problem_with_s(seed=0):
     """The one-step problem of a full model with weights that are not 0, and unknowns near its start."""
-    data, s = recorded("full", trajectories=2)
+    data, s, _ = recorded("full", trajectories=2)
     config = FitConfig(level="full", **SMALL)
     model = Task(data, estimate_baseline(data), config, Stages()).build("potential")
     make = torch.Generator().manual_seed(seed)
