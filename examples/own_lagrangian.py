@@ -88,3 +88,19 @@ for step in range(21):
     optimiser.step()
     if step % 10 == 0:
         print(f"{step:4d}  RMS of segments {loss.sqrt():.2e} rad")
+
+# %% [markdown]
+# ## Rollouts
+#
+# A stepper of L_d starts at a position and a velocity, and takes steps of any lengths, as `t.diff()` of a grid of
+# times. Gradients go through all of them.
+
+# %%
+stepper = hz.Stepper(net)
+t = torch.tensor([0.0, 0.1, 0.2, 0.4, 0.6])
+start = stepper.init_qv(torch.tensor([1.0]), torch.tensor([0.0]), h=0.1)
+motion = stepper.rollout(*start, h=t.diff(), steps=len(t) - 1)
+v = stepper.velocity(motion.states, h=0.1)
+net.zero_grad()
+motion.q[-1, 0].backward()
+print(f"q {motion.q[-1, 0]:.3f} rad, q′ {v[-1, 0]:.3f} rad/s at {t[-1]:.1f} s; ∂q/∂γ {net.gamma.grad:.3f} rad s")

@@ -158,6 +158,10 @@ class OwnLagrangian(nn.Module):
 
 def check_own(L_d: Any, inputs: int) -> None:
     """Raise InputError if L_d is no discrete Lagrangian, or has inputs and no `at(u)`."""
+    if isinstance(L_d, type):
+        raise InputError(
+            f"model must be a module or function, got the class {L_d.__name__}; make one: {L_d.__name__}()"
+        )
     if not isinstance(L_d, Callable):
         raise InputError(f"model must be a module or function L_d(q0, q1, s0, h), got a {type(L_d).__name__}")
     if inputs and not isinstance(L_d, Driven):

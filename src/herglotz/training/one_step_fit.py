@@ -45,11 +45,13 @@ def one_step_problem(
     metric: str = "position",
     freedom: float | None = None,
     expected: tuple[Triples, float] | None = None,
+    s: Tensor | None = None,
     short: bool = False,
 ) -> OneStep:
     """The one-step objective that the settings ask for: of positions, or of s (and p) beside them.
 
-    `short`: it measures the noise or starts another fit; the triples of a long recording are not all needed.
+    `s` (N,) is near s at every sample. `short`: the objective measures the noise or starts another fit; the triples of
+    a long recording are not all needed.
     """
     config, base = task.config, task.base
     prior = prior_of(model, base, config.departures[-1])
@@ -58,7 +60,7 @@ def one_step_problem(
         return SupervisedProblem(model, task.data, momenta=config.supervision == "qps", **shared)
     rows = SHORT_ROWS if short else ROWS if config.coupled and base.start else None
     most = None if rows is None or prior is None else rows * prior.start.numel()
-    return ResidualProblem(model, task.data, metric=metric, expected=expected, most=most, **shared)
+    return ResidualProblem(model, task.data, metric=metric, expected=expected, most=most, s=s, **shared)
 
 
 def fit_one_step(task: Task, problem: OneStep, name: str, iterations: int) -> tuple[OptimiserResult, float]:

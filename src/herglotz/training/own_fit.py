@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from typing import Any, cast
 
@@ -98,7 +100,8 @@ def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagra
     kept = train.keep(~dropped)
     base = estimate_baseline(kept, substeps=config.substeps)
     model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device="cpu")
-    model.s_enters_motion = s_enters_motion(model, kept)
+    with _differentiable(model.config.name):
+        model.s_enters_motion = s_enters_motion(model, kept)
     seen = Look(
         data, train, unseen, kept, dropped, False, data.arrival, {}, (), (),
         noise=roughness(kept), settings=config, base=base,
@@ -137,6 +140,20 @@ def s_enters_motion(model: Any, data: Trajectories) -> bool:
     return not all(torch.equal(x, y) for x, y in ((getattr(first, k), getattr(second, k)) for k in ("D1", "D2", "D3")))
 
 
+@contextmanager
+def _differentiable(name: str) -> Iterator[None]:
+    """Turn what torch.func says of an L_d that it cannot differentiate into an InputError with a remedy."""
+    try:
+        yield
+    except (RuntimeError, NotImplementedError) as error:
+        first = str(error).strip().splitlines()[0]
+        raise InputError(
+            f"{name}: torch.func cannot differentiate it sample by sample ({first}); write it as a pure function of "
+            "tensors, without .item(), numpy, `if` on values or writing in place (batch norms do), or train it in your "
+            "own loop (herglotz.losses)"
+        ) from None
+
+
 def _try_derivatives(model: Any, data: Trajectories) -> None:
     """Refuse an L_d that torch.func cannot differentiate sample by sample, or with a singular ∂²L_d/∂q0∂q1."""
     t = data.triples()
@@ -149,16 +166,9 @@ def _try_derivatives(model: Any, data: Trajectories) -> None:
         return P.D12
 
     inputs = () if u is None else (u[t.index[:2]],)
-    try:
+    with _differentiable(model.config.name):
         D12 = torch.func.vmap(one, (None, *(0,) * (3 + len(inputs))))(theta, *rows, *inputs)
         torch.func.vmap(torch.func.jacrev(one), (None, *(0,) * (3 + len(inputs))))(theta, *rows, *inputs)
-    except (RuntimeError, NotImplementedError) as error:
-        first = str(error).strip().splitlines()[0]
-        raise InputError(
-            f"{model.config.name}: torch.func cannot differentiate it sample by sample ({first}); write it as a pure "
-            "function of tensors, without .item(), numpy, `if` on values or writing in place, or train it in your own "
-            "loop (herglotz.losses)"
-        ) from None
     if not bool((torch.linalg.det(D12) != 0).all()):
         raise InputError(
             f"{model.config.name}: ∂²L_d/∂q0∂q1 is singular at the start of the fit, so that no step follows from it; "

@@ -38,6 +38,9 @@ NOT_THE_NOISE = 1.5
 FAR_OFF, NEAR = 1e-3, 1e-8
 # Most iterations of a stage. A start near the optimum needs fewer; a poor optimum is improved by the next stage.
 STAGE = 40
+# The same for compiled models whose motion depends on s: rates and s make up for one another, so that steps are many
+# and small.
+STAGE_WITH_S = 200
 # With more coordinates an iteration takes up to 0.2 s, and gains of 1e-4 would take minutes.
 MANY_COORDINATES = 4
 
@@ -151,7 +154,8 @@ class SegmentStages:
         """Minimise from these parameters and segment states, `near` the minimum or not; None if no path is found."""
         target = StatesOnly(problem, theta) if self.frozen else problem
         x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
-        total, whole = min(self.task.config.iterations, STAGE), problem.grid.segments == len(self.task.data)
+        most = STAGE_WITH_S if self.model.s_enters_motion and problem.compiled is not None else STAGE
+        total, whole = min(self.task.config.iterations, most), problem.grid.segments == len(self.task.data)
         early = self.hurried and (self.frozen or self.compared or not whole)
         rtol, patience = (1e-2, 1) if early else (1e-3 if self.many else 1e-4, 3)
         result = self.task.stages.run(

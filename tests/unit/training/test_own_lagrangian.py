@@ -241,13 +241,28 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
             L = super().forward(q0, q1, s0, h)
             return L if bool((L > 0).all()) else 2 * L
 
+    class Normed(Spring):
+        def __init__(self):
+            super().__init__()
+            self.norm = nn.BatchNorm1d(1)
+
+        def forward(self, q0, q1, s0, h):
+            return super().forward(q0, q1, s0, h) + self.norm(q0.reshape(-1, 1)).sum()
+
+    class Copied(Spring):
+        def forward(self, q0, q1, s0, h):
+            return super().forward(torch.as_tensor(q0.detach().numpy()), q1, s0, h)
+
     frozen = Spring()
     frozen.k.requires_grad_(False)
     wrong: tuple[tuple[Any, dict[str, Any], str], ...] = (
         (3, {}, "must be a module or function"),
+        (Spring, {}, r"got the class Spring; make one: Spring\(\)"),
         (lambda *x: x[0].sum(-1), {}, "no parameters to train"),
         (frozen, {}, r"L_d.k do not require gradients"),
         (Branching(), {}, "cannot differentiate it sample by sample"),
+        (Normed(), {}, "Normed: torch.func cannot differentiate it .*batch norms"),
+        (Copied(), {}, "Copied: torch.func cannot differentiate it .* numpy"),
         (Spring(), {"level": "affine"}, "level: model= says"),
         (Spring(), {"objective": "raw"}, "not raw"),
         (Spring(), {"out": "run"}, "without plan, out"),

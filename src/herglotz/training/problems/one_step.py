@@ -135,7 +135,8 @@ class ResidualProblem(OneStep):
     s is integrated along each trajectory from its latent start. `metric` is "position" for J⁻¹R or "raw" for R. Triples
     with a step longer than `max_step` (gaps) are left out. `expected` adds triples that were not recorded, with their
     standard deviation (`baseline_motion`); `residuals` leaves them out. If s does not enter the motion, `most` limits
-    the recorded triples, evenly spread. `settings` are those of `OneStep`.
+    the recorded triples, evenly spread. The latent starts of s begin at those of `s` (N,), else at 0, with the prior
+    N(there, its natural size²). `settings` are those of `OneStep`.
     """
 
     def __init__(
@@ -147,6 +148,7 @@ class ResidualProblem(OneStep):
         max_step: float | None = None,
         expected: tuple[Triples, float] | None = None,
         most: int | None = None,
+        s: Tensor | None = None,
         **settings: Any,
     ):
         self.metric, self.carries_s, triples = metric, model.s_enters_motion, data.triples(max_step)
@@ -158,14 +160,34 @@ class ResidualProblem(OneStep):
         if expected is not None:
             self.deviation[self.recorded :] = expected[1]
         self.latents = len(data) if self.carries_s else 0
+        first = data.t.new_zeros(len(data)) if s is None else s[torch.tensor(data.offsets, device=s.device)]
+        self.first = first[: self.latents]
+        # The natural size of s, the deviation of its starts as in `ShootingProblem`.
+        self.action = sum(v * x for v, x in zip(model.config.speed, model.config.scale, strict=True))
         # An `OwnLagrangian` has its second derivatives from autograd.
         costly = data.dof >= MANY or isinstance(model, OwnLagrangian)
         self.many = costly and not self.carries_s and metric == "position"
 
     def start(self) -> Tensor:
-        """The parameters, then 0 for every latent s."""
+        """The parameters, then the first s of every trajectory if it is latent."""
         theta = self.parameters.get()
-        return torch.cat([theta, theta.new_zeros(self.latents)])
+        return torch.cat([theta, self.first.to(theta)])
+
+    def cost(self, x: Tensor) -> Tensor:
+        """See `OneStep`, with the prior of the latent starts of s."""
+        return super().cost(x) + self._astray(x).square().sum() / 2
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `OneStep`, with the prior of the latent starts of s."""
+        cost, A, b = super().normal_equations(x)
+        astray = self._astray(x)
+        A[self.P :, self.P :].diagonal().add_(1 / self.action**2)
+        b[self.P :] += astray / self.action
+        return cost + astray.square().sum() / 2, A, b
+
+    def _astray(self, x: Tensor) -> Tensor:
+        """The latent starts of s from where they began, over the natural size of s, (latents,)."""
+        return (x[self.P :] - self.first) / self.action
 
     def residuals(self, x: Tensor) -> Tensor:
         """Residuals of the recorded triples, (T, n); see `OneStep`."""

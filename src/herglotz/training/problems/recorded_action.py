@@ -11,6 +11,9 @@ from torch.func import jacrev, vmap
 from herglotz.data import Trajectories
 from herglotz.training.parameter_vector import ParameterVector
 
+# Multiple of the rounding of the largest s, below which a change of s is rounding.
+ROUNDING = 16
+
 
 def action(
     parameters: ParameterVector,
@@ -20,19 +23,20 @@ def action(
 ) -> Tensor:
     """The action s at every sample, (N,), from its start values `latent` of every trajectory.
 
-    For L_d affine in s, L_d = L_d(s = 0) + (c − 1) s, all steps need only one evaluation.
+    Newton's method on all steps at once: with s near s*, s_{k+1} = c_k s_k + L_d(s*_k) − (c_k − 1) s*_k. For L_d affine
+    in s the first iteration gives s. Each iteration makes at least one further step exact.
     """
-    s, h = torch.zeros_like(data.t), data.t.diff()
-    affine = not parameters.model.capabilities.action_flow
-    P = parameters.partials(theta, data.q[:-1], data.q[1:], s[:-1], h, 1) if affine else None
-    for k, (now, live) in enumerate(_samples(data)):
-        if k == 0:
-            s[now] = latent[live]
-        elif P is not None:
-            s[now] = (P.c[now - 1] * s[now - 1] + P.L[now - 1]).detach()
-        else:
-            step = parameters.partials(theta, data.q[now - 1], data.q[now], s[now - 1], h[now - 1], 1)
-            s[now] = s[now - 1] + step.L.detach()
+    q, h, s = data.q, data.t.diff(), torch.zeros_like(data.t)
+    samples = list(_samples(data))
+    for _ in samples:
+        P = parameters.partials(theta, q[:-1], q[1:], s[:-1], h, 1)
+        c, gained = P.c.detach(), (P.L - (P.c - 1) * s[:-1]).detach()
+        near, s = s, torch.zeros_like(s)
+        s[samples[0][0]] = latent[samples[0][1]]
+        for now, _ in samples[1:]:
+            s[now] = c[now - 1] * s[now - 1] + gained[now - 1]
+        if not float((s - near).abs().max()) > ROUNDING * torch.finfo(s.dtype).eps * float(s.abs().max()):
+            break
     return s
 
 
