@@ -1,6 +1,7 @@
 """What the residual of a model that does not fit shows of the reason."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,11 @@ import torch
 
 from herglotz.data import Trajectories
 from herglotz.data.rates import filled_inputs
-from herglotz.training import fit
+from herglotz.training import FitConfig, fit, verdict
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.missed import FEW, reason_of, reason_of_data
+from herglotz.training.stages import Stages
+from herglotz.training.task import Task
 from herglotz.training.verdict import Errors, in_words
 
 N, H, NOISE = 800, 0.1, 1e-3
@@ -99,6 +103,16 @@ def test_steps_so_short_that_noise_hides_a_force_are_thinned(hidden, start, nois
     run = fit(data, level="forced", features="q1^2", objective="trajectory", progress=False)
     assert run.metrics["window_rms"] > 1.5 * noise
     assert ("record what else acts" in run.metrics["verdict"]) is hidden, run.metrics["verdict"]
+
+
+def test_a_model_that_cannot_be_stepped_is_judged_by_the_motion(monkeypatch):
+    # fails if nothing is said where the windows of a model fail: two frequencies are no force of the state
+    monkeypatch.setattr(verdict, "with_own_starts", lambda *_: None)
+    data = Trajectories.of(T, noisy()[:, None])
+    task = Task(data, estimate_baseline(data), FitConfig(), Stages())
+    assert "It misses differently" in verdict._reason_of_residuals(task, None, data)  # pyright: ignore
+    plain = Trajectories.of(T, noisy(torch.sin(T))[:, None])
+    assert verdict._reason_of_residuals(replace(task, data=plain), None, plain) == ""  # pyright: ignore
 
 
 def test_few_samples_show_nothing():  # fails if an empty table of neighbours raises
