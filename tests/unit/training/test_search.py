@@ -17,9 +17,10 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, fit, flow, search as search_module, structure
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.found_model import settings
+from herglotz.training.friction_search import without_injecting_friction
 from herglotz.training.held_out import HeldOut, blocks
 from herglotz.training.look import look
-from herglotz.training.moves import BLOCKS, MEMORY, Moves
+from herglotz.training.moves import BLOCKS, MAX_VALUES_AT_ONCE, Moves
 from herglotz.training.offers import Offer
 from herglotz.training.score import Score, correlation_time, fitted_score
 from herglotz.training.search import Search
@@ -440,7 +441,7 @@ def test_offers_of_many_numbers_are_compared_in_parts():
     fitter = SimpleNamespace(offered=9, offers=[], data=FEW, numbers=lambda own: range(300 * len(own)))
     Parts(cast(Any, SimpleNamespace(fitter=fitter))).scores([frozenset({str(i)}) for i in range(40)])
     assert sum(asked) == 40
-    assert max(asked) * BLOCKS * 300**2 <= MEMORY
+    assert max(asked) * BLOCKS * 300**2 <= MAX_VALUES_AT_ONCE
 
 
 def test_an_excess_comes_and_goes_with_what_it_is_of():
@@ -495,11 +496,11 @@ def test_a_model_that_goes_astray_takes_no_place(rms, joins, monkeypatch):
     monkeypatch.setattr(search_module, "Moves", lambda _: moves)
     search, other = (
         searched(Trajectories.of(torch.arange(9.0), torch.arange(9.0) ** 2)),
-        SimpleNamespace(rms=rms, pushing={}),
+        SimpleNamespace(rms=rms, injecting_friction={}),
     )
     monkeypatch.setattr(search, "better", lambda _, richer: richer)
     fitter = SimpleNamespace(spread=1.0, fit=lambda *_: other)
-    trial: Any = SimpleNamespace(taken=frozenset(), rms=0.1, pushing={}, length=5, fitter=fitter)
+    trial: Any = SimpleNamespace(taken=frozenset(), rms=0.1, injecting_friction={}, length=5, fitter=fitter)
     assert search.moved(trial) is (other if joins else None)
 
 
@@ -526,14 +527,15 @@ def test_friction_that_pushes_does_not_join():
     simple = there(fitter.fit(fitter.simple, {}, fitter.lengths[0], None))
     assert Moves(simple).joining(simple.taken)[0] - simple.taken == {"friction.coulomb"}
     pushed = there(fitter.fit(simple.taken | {"friction.coulomb"}, simple.values, simple.length, simple, 60))
-    assert pushed.pushing == {"friction.coulomb": 0}
+    assert pushed.injecting_friction == {"friction.coulomb": 0}
     assert pushed.replaces(simple)
     other = search.moved(simple)
     assert other is None or "friction.coulomb" not in other.taken
     both = fitter.fit(pushed.taken | {"friction.breakaway"}, pushed.values, pushed.length, pushed, 60)
-    assert "friction.breakaway" not in search.braking(there(both)).taken  # no excess of friction that is gone
-    braked = search.braking(pushed)
-    assert not braked.pushing
+    # No excess of a friction that is gone.
+    assert "friction.breakaway" not in without_injecting_friction(search, there(both)).taken
+    braked = without_injecting_friction(search, pushed)
+    assert not braked.injecting_friction
     assert search.moved(braked, whole=True, swapped=True) is None
 
 
@@ -581,8 +583,8 @@ def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
     other = SimpleNamespace(fits_better=lambda _: True, replaces=lambda _: False)
     monkeypatch.setattr(search, "of", lambda _: SimpleNamespace(again=lambda _: other))
     trial = cast(Any, SimpleNamespace(at_the_noise=False))
-    assert search.held(trial, ["first"], alike=True) == "first"
-    assert search.held(trial, ["first"]) == ""
+    assert search.better_hold(trial, ["first"], by_residuals=True) == "first"
+    assert search.better_hold(trial, ["first"]) == ""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
@@ -614,7 +616,7 @@ def test_a_search_of_many_samples_is_made_of_some(monkeypatch):
     # fails if every trial of a long recording is fitted to all of it, or the model to a part alone
     import herglotz.training.search as module
 
-    monkeypatch.setattr(module, "PART", 200)
+    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
     data, seen = simulate(scene("duffing"), trajectories=1, steps=900, h=0.05, noise=NOISE, seed=0), []
     fit = module.Fitter.fit
     monkeypatch.setattr(
@@ -642,7 +644,7 @@ def test_zeros_that_say_nothing_are_not_taken_off():
     best = there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))
     best = there(fitter.grow(best))
     assert search.with_zeros(best) == (search, best, None)
-    read, other, zeros = search.with_zeros(best, sure=True)
+    read, other, zeros = search.with_zeros(best, accepted=True)
     assert there(zeros)[0].abs().max() > 0
     assert there(other).fitter.data is read.data
 
