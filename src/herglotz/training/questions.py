@@ -31,7 +31,7 @@ class Questions:
     """
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
-        # The hold of the data is tried too: another may be found before it.
+        # The hold of the data is among the candidates, because it is tried again after another hold was found.
         self.wanted, self.holds = wanted, (*holds, *([wanted.data.hold] if holds else []))
         self.hold, self.input_terms = "", ()
         self.read: Search = wanted.part

@@ -258,7 +258,7 @@ class Search:
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
         line = Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
-        # A whole search is worth its time only if the angles fail or the first model is no worse.
+        # A search on the line is worth its time only if the angles fail or its first model is no worse.
         if trial is not None and trial.whole and (line.first is None or trial.replaces(line.first)):
             return False
         other = line.run()
@@ -325,5 +325,5 @@ class Search:
         return other
 
     def input_terms(self, trial: Trial) -> tuple[str, ...]:
-        """The terms of the inputs in the model that has all these terms among its offers, if that is better."""
+        """The terms of the inputs that a model takes if all are offered (`asked_terms`); () if that is no better."""
         return asked_terms(self, trial) if self.config.find_input_terms and not trial.at_the_noise else ()

@@ -124,7 +124,7 @@ class Trial:
 
     @cached_property
     def score(self) -> Score:
-        """Score over held-out blocks; the model is noted among the compared ones."""
+        """Score over held-out blocks; computing the score records the model in `Fitter.compared`."""
         count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
         (found,) = scores(self._held_out, [range(self.problem.P)], choices, count, self.fitter.floor)
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
@@ -177,8 +177,8 @@ class Trial:
 class Fitter:
     """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
 
-    `like` is a fitter of the same data, from which segments and noise levels are taken. A number is a scalar parameter
-    by its name; `keys` name its term.
+    `like` is another fitter of the same data, which shares its segments and noise levels. Numbers are scalar
+    parameters, by name; `keys` has the term of each number.
     """
 
     def __init__(
