@@ -84,47 +84,47 @@ class CompiledFlow:
         F = 0 if sums is None else len(sums.corner)
         chosen = self.placed.chosen[:F]
 
-        def swept(piece: Piece) -> tuple[Piece, Tensor | None] | None:
+        def run_piece(piece: Piece) -> tuple[Piece, Tensor | None] | None:
             """The piece with its rows of J; None if a step has no solution."""
             own = slice(piece.first, piece.last)
             first = self.first[own] if piece.starts else torch.full_like(self.first[own], -1)
-            derived, sent, made = (None, None), (None, None, None), None
+            derived, summed, J = (None, None), (None, None, None), None
             if sums is not None:
-                made = ends.new_zeros(piece.samples * self.n, F + d)
-                derived, sent = (sums.slopes[own], r), (sums.border[own], sums.blocks[own], sums.by_state[own])
+                J = ends.new_zeros(piece.samples * self.n, F + d)
+                derived, summed = (sums.slopes[own], r), (sums.border[own], sums.blocks[own], sums.by_state[own])
             failed = self.kernel.sweep(
                 piece.last - piece.first, piece.steps, self.h, self.u, whole, self.sharpest, F, chosen, self.sample,
                 first, of.y, of.weight, of.freedom, piece.offset, piece.place, ends[own], delta[own], states, *derived,
-                made, *sent,
+                J, *summed,
             )  # fmt: skip
-            return None if failed >= 0 else (piece, made)
+            return None if failed >= 0 else (piece, J)
 
-        def together(pieces: Sequence[Piece]) -> list[tuple[Piece, Tensor | None] | None]:
-            """The pieces of a job in order, because parts of a segment follow one another, until one fails."""
+        def run_job(pieces: Sequence[Piece]) -> list[tuple[Piece, Tensor | None] | None]:
+            """The pieces of a job in order, because parts of a segment follow one another, until a piece fails."""
             found = []
             for piece in pieces:
-                found.append(swept(piece))
+                found.append(run_piece(piece))
                 if found[-1] is None:
                     break
             return found
 
-        for done in self._run(together, self._jobs(0 if sums is None else F + d)):
-            for result in done:
+        for results in self._run(run_job, self._jobs(0 if sums is None else F + d)):
+            for result in results:
                 if result is None:
                     return None
-                piece, made = result
-                if sums is None or made is None:
+                piece, J = result
+                if sums is None or J is None:
                     continue
                 part = slice(piece.offset, piece.offset + piece.samples)
                 if rows is not None:
-                    rows[part] = made.unflatten(0, (-1, self.n))
-                mine = made[:, :F]
-                sums.corner.addmm_(mine.T, mine)
-                sums.by_theta.addmv_(mine.T, r[part].flatten())
+                    rows[part] = J.unflatten(0, (-1, self.n))
+                by_theta = J[:, :F]
+                sums.corner.addmm_(by_theta.T, by_theta)
+                sums.by_theta.addmv_(by_theta.T, r[part].flatten())
         return states
 
     @staticmethod
-    def _run(together: Callable, jobs: list[list[Piece]]) -> Iterator[list]:
+    def _run(run_job: Callable, jobs: list[list[Piece]]) -> Iterator[list]:
         """The results of all jobs, in order; as many jobs run at once as there are processors.
 
         Memory grows with the number of processors. Sums do not depend on this number, because their order is fixed.
@@ -133,10 +133,10 @@ class CompiledFlow:
             len(jobs), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         )
         if workers < 2:
-            yield from map(together, jobs)
+            yield from map(run_job, jobs)
             return
         for k in range(0, len(jobs), workers):
-            yield from _pool(workers).map(together, jobs[k : k + workers])
+            yield from _pool(workers).map(run_job, jobs[k : k + workers])
 
     def _jobs(self, width: int) -> list[list[Piece]]:
         """The segments divided into jobs that can run at once, each with enough samples to be worth a thread."""

@@ -58,10 +58,10 @@ class Moves:
         size = max(1, MAX_VALUES_AT_ONCE // max(curvatures, self.fitter.data.q.numel()))
         for k in range(0, len(new), size):
             chunk = new[k : k + size]
-            self.known.update(zip(chunk, self.foretold(chunk), strict=True))
+            self.known.update(zip(chunk, self.computed(chunk), strict=True))
         return [self.known[offers] for offers in sets]
 
-    def foretold(self, sets: Sequence[Offers]) -> list[Score]:
+    def computed(self, sets: Sequence[Offers]) -> list[Score]:
         """Scores of models with these sets of offers, computed anew by the linearised motion."""
         (model, places), count = self._linear, self.trial.problem.data.q.numel()
         numbers = [[places[name] for name in self.fitter.numbers(offers)] for offers in sets]

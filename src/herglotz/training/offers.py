@@ -57,23 +57,30 @@ def offers_of(
     waves = {text for band in bands for text in band.texts}
     m, n = model.inputs, model.dof
     of_terms = {f"{INPUTS}[{i * m + j}]" for i in range(n) for j in range(m - terms, m)}
-    # The spring and the tilt of each coordinate.
-    own = own_terms(model.config.angles)
+    springs = own_terms(model.config.angles)
+    # Viscous friction of a single coordinate is the damping rate, which every model has.
+    no_offers = {*SHAPES.values(), *(["friction.viscous"] if n == 1 else [])}
     for number, key in zip(numbers, keys, strict=True):
+        if key in waves:
+            continue
         stem = re.sub(r"\[\d+\]", "", number)
         # Beyond the recorded range waves vanish, and springs and tilts bound the motion.
-        if stem in ALWAYS or (bands and key not in waves and (stem in SIMPLE[:2] or key in own)):
+        if stem in ALWAYS or (bands and (stem in SIMPLE[:2] or key in springs)):
             always.append(number)
-        # Viscous friction of a single coordinate is the damping rate, which every model has.
-        elif not (key in waves or stem in SHAPES.values() or (stem == "friction.viscous" and n == 1)):
-            shape = number.replace(stem, SHAPES.get(stem, stem))
-            on = key.replace(stem, EXCESS_OF[stem]) if stem in EXCESS_OF else ""
-            found.append(Offer(key, (number,), (shape,) if shape != number and shape in numbers else (), on))
-            if (stem in SIMPLE and number not in of_terms) or key in own:
+        elif stem not in no_offers:
+            found.append(_offer(number, key, stem, numbers))
+            if (stem in SIMPLE and number not in of_terms) or key in springs:
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
     found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]
     return tuple(always), found, frozenset(simple)
+
+
+def _offer(number: str, key: str, stem: str, numbers: Collection[str]) -> Offer:
+    """The offer of one amplitude, with its shape parameter if the model has one; `stem` is `number` without indices."""
+    shape = number.replace(stem, SHAPES.get(stem, stem))
+    on = key.replace(stem, EXCESS_OF[stem]) if stem in EXCESS_OF else ""
+    return Offer(key, (number,), (shape,) if shape != number and shape in numbers else (), on)
 
 
 def standing(offers: Iterable[Offer], taken: Collection[str]) -> frozenset[str]:

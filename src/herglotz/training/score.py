@@ -78,10 +78,10 @@ class Score:
     def price(self, model: Score, offered: int) -> float:
         """Price of a model's parameters and choices at the τ of this score; `offered` is C, the number of offers."""
         chosen = math.log(math.comb(offered, model.choices))
-        return (model.numbers + model.zeros) * self.of_a_number + self.correlation_time * chosen
+        return (model.numbers + model.zeros) * self.price_of_a_number + self.correlation_time * chosen
 
     @property
-    def of_a_number(self) -> float:
+    def price_of_a_number(self) -> float:
         """½ τ log (N/τ), the price of one parameter."""
         return self.correlation_time * math.log(self.count / self.correlation_time) / 2
 

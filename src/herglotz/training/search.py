@@ -155,7 +155,7 @@ class Search:
         simple = fitter.fit(fitter.simple, best.values, best.length, best, 2 * ITERATIONS)
         every = (end for end in (simple, *ends) if end is not None and end.length == best.length)
         others = {(end.fitter.variant, end.taken): end for end in every}
-        scored = [(end, end.fitter.foretold(end)) for end in others.values()]
+        scored = [(end, end.fitter.free_run_score(end)) for end in others.values()]
         scored = sorted(((end, x) for end, x in scored if x is not None), key=lambda pair: pair[1].numbers)
         winner, lowest, offered = best, None, max(end.fitter.offered for end in others.values())
         for end, found in scored:
@@ -264,7 +264,7 @@ class Search:
         other = line.run()
         if other is None or trial is None or not other.replaces(trial):
             return other is not None and trial is None
-        ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
+        ahead, its = other.fitter.free_run_score(other), trial.fitter.free_run_score(trial)
         return ahead is not None and (its is None or ahead.replaces(its, trial.fitter.offered))
 
     def zeros(self, trial: Trial) -> tuple[Tensor, Tensor] | None:

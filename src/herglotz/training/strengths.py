@@ -8,13 +8,13 @@ from herglotz.training.trials import Fitter, Trial
 
 
 def likeliest(trial: Trial, most: int) -> Trial:
-    """The model with the prior variances of its bands at their likeliest values (`Trial.sizes`), found by refitting.
+    """The model refitted with the likeliest prior variances of its bands (`Trial.likeliest_scales`).
 
     Each refit has at most `most` iterations. Refits end when the held-out log-loss falls by less than the price of one
-    parameter, and a refit with a larger log-loss is dropped. A model without functions is returned as it is.
+    parameter. A refit with a larger log-loss is dropped. A model without functions is returned as it is.
     """
     gain = math.inf
-    while trial.sizes and gain > trial.score.of_a_number:
+    while trial.likeliest_scales and gain > trial.score.price_of_a_number:
         other = trial.fitter.fit(trial.taken, trial.values, trial.length, trial, most)
         if other is None or not (gain := float((trial.score.losses - other.score.losses).sum())) > 0:
             break
@@ -27,7 +27,7 @@ def needed(trial: Trial, most: int) -> Trial:
 
     `Moves.leaving` removes bands too, but by the linearised motion alone.
     """
-    for name in sorted(trial.sizes, key=trial.sizes.__getitem__):
+    for name in sorted(trial.likeliest_scales, key=trial.likeliest_scales.__getitem__):
         other = trial.fitter.fit(trial.taken - {name}, trial.values, trial.length, trial, most)
         if other is not None and not trial.replaces(other):
             trial = likeliest(other, most)

@@ -162,7 +162,7 @@ class Trial:
         return self.problem.prior
 
     @cached_property
-    def sizes(self) -> dict[str, float]:
+    def likeliest_scales(self) -> dict[str, float]:
         """Likeliest prior variance of each function, over the variance in the fitter (evidence, MacKay 1992)."""
         numbers, found = self.problem.parameters.numbers, {}
         place = {name: i for i, name in enumerate(numbers)}
@@ -206,16 +206,10 @@ class Fitter:
         self.offers = [offer for offer in every_offer if offer.name not in one_way]
         self.loads = [offer for offer in every_offer if offer.name in one_way]
         self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
-        prior, self.weights = prior_of(self.model, base, None), {}
-        place = {key: name for name, key in self.keys.items()}
+        self.place = {key: name for name, key in self.keys.items()}
         # Names of the coefficients of the waves of each function.
-        self.functions = {band.name: [place[text] for text in band.texts] for band in bands}
-        for i, spread in zip(prior.index.tolist(), prior.spread.tolist(), strict=True):
-            self.weights[every.numbers[i]] = spread**-2
-        powers = [self.keys[name] for name in self.always if bands and not name.startswith(ALWAYS)]
-        spreads = prior_spreads(bands, base, data.balance, powers)
-        self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}
-        self.weights |= self.centred
+        self.functions = {band.name: [self.place[text] for text in band.texts] for band in bands}
+        self.weights, self.centred = self._weights(every.numbers)
         lengths = segment_lengths(data)
         self.lengths = [*(length for length in SHORT_SEGMENTS if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
@@ -225,6 +219,16 @@ class Fitter:
         known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
         self.known = self.smooth, self.precision, self.spread = known
         self.compared: list[Compared] = []
+
+    def _weights(self, numbers: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+        """Prior weights 1/variance by number: all, and those of waves and of powers that waves can imitate."""
+        prior, bands = prior_of(self.model, self.base, None), self.variant.functions
+        names = [numbers[i] for i in prior.index.tolist()]
+        weights = {name: spread**-2 for name, spread in zip(names, prior.spread.tolist(), strict=True)}
+        powers = [self.keys[name] for name in self.always if bands and not name.startswith(ALWAYS)]
+        spreads = prior_spreads(bands, self.base, self.data.balance, powers)
+        centred = {self.place[key]: spread**-2 for key, spread in spreads.items()}
+        return weights | centred, centred
 
     def prior(self, names: Collection[str], scales: Mapping[str, float] | None = None) -> Gaussian:
         """Prior of these numbers, in the order of the model; `scales` multiply the variances of functions."""
@@ -250,9 +254,8 @@ class Fitter:
 
     def numbers(self, taken: Iterable[str]) -> list[str]:
         """Names of the numbers of a model with these offers."""
-        taken = set(taken)
-        every = (*self.offers, *self.loads)
-        return [*self.always, *(name for offer in every if offer.name in taken for name in offer.numbers)]
+        taken, offers = set(taken), (*self.offers, *self.loads)
+        return [*self.always, *(name for offer in offers if offer.name in taken for name in offer.numbers)]
 
     def values_of(self, trial: Trial) -> dict[str, float]:
         """The values of a trial of another fitter, by the names of the same numbers here."""
@@ -271,22 +274,20 @@ class Fitter:
         taken, every = frozenset(taken), self.problem(length)
         names = self.numbers(taken)
         sigma = every.sigma if before is None else max(before.rms, self.floor)
-        scales = {} if before is None else before.sizes
+        scales = {} if before is None else before.likeliest_scales
         problem = every.of(names, sigma, self.prior(names, scales))
         names = problem.parameters.numbers
         theta = self.data.q.new_tensor([values.get(name, self.start[name]) for name in names])
         if before is None:
             states = first_states(problem, theta, self.smooth)
-            if problem.compiled is None:
+        elif states is None:
+            states = before.problem.states_at(before.path, problem.grid.start_sample, problem.d)
+        if problem.compiled is None:
+            if before is None:
                 problem.guess_from_states(states_of_pairs(self.model, self.smooth))
-        else:
-            if states is None:
-                states = before.problem.states_at(before.path, problem.grid.start_sample, problem.d)
-            if problem.compiled is None:
+            else:
                 problem.guess_from(before.problem, before.path)
-        x = problem.pack(theta, states)
-        near = before is not None and before.length == length
-        damping = NEAR if near else FAR_OFF
+        x, damping = problem.pack(theta, states), NEAR if before is not None and before.length == length else FAR_OFF
         result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
         path = problem.solve(result.x) if math.isfinite(result.cost) else None
         if path is None:
@@ -294,7 +295,7 @@ class Fitter:
         found = dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
         return Trial(self, taken, self.start | found, problem, path, scales)
 
-    def foretold(self, trial: Trial) -> Score | None:
+    def free_run_score(self, trial: Trial) -> Score | None:
         """The score of a free run over the last quarter of every trajectory, after a fit to the rest; None: no path."""
         names = trial.problem.parameters.numbers
         problem = self.problem(trial.length).of(names, max(trial.rms, self.floor), trial.prior)

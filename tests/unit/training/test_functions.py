@@ -100,7 +100,7 @@ def test_what_a_function_costs_is_what_the_data_tell_of_it(searched):
     waves = len(every & set(found.problem.parameters.numbers))
     told = found.score.numbers - (found.problem.P - waves)
     assert 4 < told < waves
-    assert all(size > 0 for size in found.sizes.values())
+    assert all(size > 0 for size in found.likeliest_scales.values())
 
 
 def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(searched, monkeypatch):
@@ -116,7 +116,7 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
         return problem
 
     monkeypatch.setattr(ShootingProblem, "of", watched)
-    found.fitter.foretold(found)
+    found.fitter.free_run_score(found)
     Moves(found).scores([found.taken])
     at = {name: i for i, name in enumerate(found.problem.parameters.numbers)}
     assert len(asked) == 2

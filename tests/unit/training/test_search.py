@@ -273,7 +273,7 @@ def test_a_free_run_of_few_independent_samples_decides_less(time, wins):
     # fails if what a free run misses early, and later too, counts anew with every sample
     def end(name, loss, numbers) -> Any:
         score = Score(torch.full((10,), loss), 400, numbers, 1, 1.0, time)
-        fitter = SimpleNamespace(offered=8, simple={"a"}, foretold=lambda _: score, variant=Variant(2))
+        fitter = SimpleNamespace(offered=8, simple={"a"}, free_run_score=lambda _: score, variant=Variant(2))
         return SimpleNamespace(
             fitter=fitter, taken=frozenset(name), whole=True, length=9, at_the_noise=False, values={}
         )  # fmt: skip
@@ -290,7 +290,7 @@ def test_misfits_below_the_floor_are_alike(duffing):
     assert fitted_score(problem, path, 10.0).losses.tolist() == pytest.approx(
         fitted_score(problem, replace(path, x=path.x + 0.5), 10.0).losses.tolist(), rel=1e-12
     )
-    assert there(search.fitter(Variant(2)).foretold(found)).choices == 0  # a free run has paid for these before
+    assert there(search.fitter(Variant(2)).free_run_score(found)).choices == 0  # a free run has paid for these before
 
 
 def test_numbers_that_come_together_are_one_choice():
@@ -415,7 +415,7 @@ def test_of_many_offers_some_leave_at_once_but_not_those_that_stand_for_one_anot
     names, asked = [f"{x}{i}" for i in range(16) for x in "ab"], []
 
     class Pairs(Moves):
-        def foretold(self, sets):
+        def computed(self, sets):
             asked.extend(sets)
             lost = [sum(not {f"a{i}", f"b{i}"} & own for i in range(16)) for own in sets]
             every = zip(sets, lost, strict=True)
@@ -434,7 +434,7 @@ def test_offers_of_many_numbers_are_compared_in_parts():
     asked = []
 
     class Parts(Moves):
-        def foretold(self, sets):
+        def computed(self, sets):
             asked.append(len(sets))
             return [Score(torch.zeros(10), 400, len(own), len(own), 1.0) for own in sets]
 
@@ -450,7 +450,7 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
     dry, excess = Offer("dry", ("dry",)), Offer("excess", ("excess",), on="dry")
 
     class Friction(Moves):
-        def foretold(self, sets):
+        def computed(self, sets):
             lost = [10.0 * ("excess" not in own) + 0.1 * ("dry" in own) for own in sets]
             every = zip(sets, lost, strict=True)
             return [Score(torch.full((10,), none), 400, len(own), len(own), 1.0) for own, none in every]
