@@ -309,8 +309,8 @@ def strike(fault: Fault, whole: Whole, folder: Path, make: random.Random, counte
 
 def faults(folder: Path, times: int, *, seed: int = 0, only: str = "") -> dict[str, Count]:
     """Strike so many fits with every fault whose name holds `only`."""
-    counts, every = {}, stages.EVERY
-    stages.EVERY = 1  # a checkpoint after every iteration
+    counts, every = {}, stages.ITERATIONS_PER_CHECKPOINT
+    stages.ITERATIONS_PER_CHECKPOINT = 1  # a checkpoint after every iteration
     try:
         whole = {}
         for fault in [fault for fault in FAULTS if only in fault.name]:
@@ -326,7 +326,7 @@ def faults(folder: Path, times: int, *, seed: int = 0, only: str = "") -> dict[s
             counts[fault.name] = c = counted
             print(f"{fault.name:20}{c.struck:>8}{c.said:>8}{c.whole:>8}{c.same:>8}{c.hung:>8}", flush=True)
     finally:
-        stages.EVERY = every
+        stages.ITERATIONS_PER_CHECKPOINT = every
     return counts
 
 

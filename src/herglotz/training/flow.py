@@ -1,4 +1,4 @@
-"""Motions of segments with their derivatives by the compiled kernel, added up to normal equations piece by piece."""
+"""Free runs over segments by the compiled kernel, with derivatives that are summed into normal equations in pieces."""
 
 from __future__ import annotations
 
@@ -17,24 +17,30 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.sums import Sums
 
-CHUNK = 64 * 2**20  # bytes of rows of J at once
-WORK, JOBS = 1000, 8  # samples that are worth a thread, and parts of all that may run at once
+# Largest size of the rows of J of a piece, in bytes.
+CHUNK_BYTES = 64 * 2**20
+# Least number of samples that is worth a thread, and largest number of jobs that samples are divided into.
+SAMPLES_PER_JOB, MAX_JOBS = 1000, 8
 
 
 class Piece(NamedTuple):
-    """Segments, or a part of one, that are run at once."""
+    """Segments `first` ≤ k < `last`, or a part of one segment, that the kernel runs in one call.
 
-    first: int  # segment
+    `steps` are where the model steps of each segment begin and end, `place` the node of its first state. `starts`:
+    the piece begins at the start of its segments. Its samples are `samples` in number, from `offset` on.
+    """
+
+    first: int
     last: int
-    steps: Tensor  # (last − first + 1,) where their model steps begin and end
-    place: Tensor  # (last − first,) node of the first state
-    starts: bool  # whether it has the starts of its segments
-    samples: int  # that are observed
-    offset: int  # the first of them
+    steps: Tensor  # (last − first + 1,)
+    place: Tensor  # (last − first,)
+    starts: bool
+    samples: int
+    offset: int
 
 
 class Observed(NamedTuple):
-    """What residuals of samples are made of: r = weight (q − y), with Student's t of `freedom` where that is not 0."""
+    """Data of the residuals r = weight (q − y) of samples, with Student's t of `freedom`, or least squares if 0."""
 
     y: Tensor  # (N, n)
     weight: Tensor  # (N, n)
@@ -57,18 +63,19 @@ class CompiledFlow:
         self.begin = torch.cat([torch.zeros(1, dtype=torch.long), grid.end.cumsum(0)])
         self.place, self.nodes = torch.arange(S) * (K + 1), (S, K + 1)
         seen = torch.cat([torch.zeros(1, dtype=torch.long), (self.sample >= 0).long().cumsum(0)])
-        self.seen = seen  # how many of the first steps end at a sample
+        # seen[k]: how many of the first k steps end at a sample. counts[i]: samples of segment i.
+        self.seen = seen
         self.counts = (seen[self.begin[1:]] - seen[self.begin[:-1]] + (self.first >= 0).long()).tolist()
-
-        self.jobs: dict[int, list[list[Piece]]] = {}  # by the width of a row; the same for all subsets of parameters
+        # Jobs by the width of a row of J; copies of this flow for other subsets of parameters share them.
+        self.jobs: dict[int, list[list[Piece]]] = {}
 
     def run(
         self, theta: Tensor, starts: Tensor, of: Observed, sums: Sums | None = None, rows: Tensor | None = None
     ) -> Tensor | None:
-        """States at all nodes (S, K+1, 2n+1) from `starts` (S, 2n+1); None where a step has no solution.
+        """States at all nodes (S, K+1, 2n+1) from `starts` (S, 2n+1); None if a step has no solution.
 
-        With `sums` the normal equations of the data are added to it; with `rows` (N, n, P + d) the derivatives of the
-        positions at the samples are written, times their weights.
+        The normal equations of the data are added to `sums`. The derivatives of the positions at the samples, times
+        their weights, are written to `rows` (N, n, P + d).
         """
         whole = self.placed.rest.index_copy(0, self.placed.chosen, theta)
         ends, r = starts.contiguous().clone(), torch.zeros_like(of.y)
@@ -77,65 +84,65 @@ class CompiledFlow:
         F = 0 if sums is None else len(sums.corner)
         chosen = self.placed.chosen[:F]
 
-        def swept(piece: Piece) -> tuple[Piece, Tensor | None] | None:
-            """The rows of J of a piece; None where a step has no solution."""
+        def run_piece(piece: Piece) -> tuple[Piece, Tensor | None] | None:
+            """The piece with its rows of J; None if a step has no solution."""
             own = slice(piece.first, piece.last)
             first = self.first[own] if piece.starts else torch.full_like(self.first[own], -1)
-            derived, sent, made = (None, None), (None, None, None), None
+            derived, summed, J = (None, None), (None, None, None), None
             if sums is not None:
-                made = ends.new_zeros(piece.samples * self.n, F + d)
-                derived, sent = (sums.slopes[own], r), (sums.border[own], sums.blocks[own], sums.by_state[own])
+                J = ends.new_zeros(piece.samples * self.n, F + d)
+                derived, summed = (sums.slopes[own], r), (sums.border[own], sums.blocks[own], sums.by_state[own])
             failed = self.kernel.sweep(
                 piece.last - piece.first, piece.steps, self.h, self.u, whole, self.sharpest, F, chosen, self.sample,
                 first, of.y, of.weight, of.freedom, piece.offset, piece.place, ends[own], delta[own], states, *derived,
-                made, *sent,
+                J, *summed,
             )  # fmt: skip
-            return None if failed >= 0 else (piece, made)
+            return None if failed >= 0 else (piece, J)
 
-        def together(pieces: Sequence[Piece]) -> list[tuple[Piece, Tensor | None] | None]:
-            """The pieces one after the other, until one fails: parts of a segment follow one another."""
+        def run_job(pieces: Sequence[Piece]) -> list[tuple[Piece, Tensor | None] | None]:
+            """The pieces of a job in order, because parts of a segment follow one another, until a piece fails."""
             found = []
             for piece in pieces:
-                found.append(swept(piece))
+                found.append(run_piece(piece))
                 if found[-1] is None:
                     break
             return found
 
-        for done in self._run(together, self._jobs(0 if sums is None else F + d)):
-            for result in done:
+        for results in self._run(run_job, self._jobs(0 if sums is None else F + d)):
+            for result in results:
                 if result is None:
                     return None
-                piece, made = result
-                if sums is None or made is None:
+                piece, J = result
+                if sums is None or J is None:
                     continue
                 part = slice(piece.offset, piece.offset + piece.samples)
                 if rows is not None:
-                    rows[part] = made.unflatten(0, (-1, self.n))
-                mine = made[:, :F]
-                sums.corner.addmm_(mine.T, mine)
-                sums.by_theta.addmv_(mine.T, r[part].flatten())
+                    rows[part] = J.unflatten(0, (-1, self.n))
+                by_theta = J[:, :F]
+                sums.corner.addmm_(by_theta.T, by_theta)
+                sums.by_theta.addmv_(by_theta.T, r[part].flatten())
         return states
 
     @staticmethod
-    def _run(together: Callable, jobs: list[list[Piece]]) -> Iterator[list]:
-        """What comes of every job, in their order; several at once where there are processors and work for them.
+    def _run(run_job: Callable, jobs: list[list[Piece]]) -> Iterator[list]:
+        """The results of all jobs, in order; as many jobs run at once as there are processors.
 
-        What is kept in memory grows with the processors, and sums do not depend on their number.
+        Memory grows with the number of processors. Sums do not depend on this number, because their order is fixed.
         """
         workers = min(
             len(jobs), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         )
         if workers < 2:
-            yield from map(together, jobs)
+            yield from map(run_job, jobs)
             return
         for k in range(0, len(jobs), workers):
-            yield from _pool(workers).map(together, jobs[k : k + workers])
+            yield from _pool(workers).map(run_job, jobs[k : k + workers])
 
     def _jobs(self, width: int) -> list[list[Piece]]:
-        """Runs of segments that do not wait for one another, each with enough samples to be worth a thread."""
+        """The segments divided into jobs that can run at once, each with enough samples to be worth a thread."""
         if width not in self.jobs:
             S, total, found = len(self.place), sum(self.counts), []
-            least, a, offset = max(WORK, total // JOBS), 0, 0
+            least, a, offset = max(SAMPLES_PER_JOB, total // MAX_JOBS), 0, 0
             while a < S:
                 b, samples = a + 1, self.counts[a]
                 while b < S and (samples < least or total - offset - samples < least):
@@ -148,11 +155,14 @@ class CompiledFlow:
         return self.jobs[width]
 
     def _pieces(self, a: int, last: int, offset: int, width: int) -> Iterator[Piece]:
-        """Segments whose rows fit into `CHUNK` bytes, and parts of one that is longer; all at once without rows."""
+        """Segments a ≤ k < `last` in pieces whose rows fit into `CHUNK_BYTES`; in one piece if there are no rows.
+
+        A segment that is longer is divided into parts.
+        """
         if not width:
             yield Piece(a, last, self.begin[a : last + 1], self.place[a:last], True, 0, 0)
             return
-        most = max(1, CHUNK // (8 * self.n * width))
+        most = max(1, CHUNK_BYTES // (8 * self.n * width))
         while a < last:
             b, samples = a + 1, self.counts[a]
             while b < last and samples + self.counts[b] <= most:
@@ -166,7 +176,7 @@ class CompiledFlow:
             a = b
 
     def _parts(self, segment: int, most: int, offset: int) -> Iterator[Piece]:
-        """A segment in parts of at most so many model steps."""
+        """A segment in parts of at most `most` model steps."""
         begin, end = self.begin[segment : segment + 2].tolist()
         for at in range(begin, end, most):
             to, starts = min(at + most, end), at == begin
@@ -178,18 +188,19 @@ class CompiledFlow:
 
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    """So many threads, which stay: to start them anew takes as long as a sweep of a short recording."""
+    """A pool of threads that stay, because starting threads takes as long as a sweep over a short recording."""
     return ThreadPoolExecutor(workers)
 
 
-if hasattr(os, "register_at_fork"):  # a child has no threads
+# The threads of the parent do not exist in a forked process.
+if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def motion(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:
-    """Free runs from `start` (S, 2n+1) by steps h (S, K) with inputs u (S, K, m), (S, K+1, 2n+1).
+    """Free runs (S, K+1, 2n+1) from `start` (S, 2n+1) with steps h (S, K) and inputs u (S, K, m).
 
-    None where the model has no kernel, or a step no solution.
+    None if the model has no kernel, a start is not finite, or a step has no solution.
     """
     placed, (S, K) = kernel_of(model), h.shape
     if placed is None or not bool(torch.isfinite(start).all()):

@@ -1,23 +1,25 @@
-"""Functions beside named terms, where these miss the data."""
+"""Learned functions beside named terms, for data that named terms alone do not follow to the noise."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from herglotz.progress import MORE_TERMS, inside, part
+from herglotz.training.friction_search import without_injecting_friction
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.search import Search
 from herglotz.training.strengths import likeliest, of_terms
-from herglotz.training.trials import ITERATIONS, Fitter, Trial, Variant
+from herglotz.training.trials import ITERATIONS, Fitter, Trial
+from herglotz.training.variants import Variant
 
 
 @inside()
 def with_functions(search: Search, best: Trial) -> Trial:
-    """The model with functions, where it is better; `best` where it is not.
+    """A model with functions if that is better than `best`, otherwise `best`.
 
-    Functions join a model that follows whole trajectories as all offers do: near the data its linear motion says which
-    are worth a fit. Far from them a model of functions is made anew, from the shortest segments on.
+    If `best` is near the data (`Trial.near`), functions join like all offers, by the linearised motion. Otherwise a
+    model of functions is fitted anew, from the shortest segments on.
     """
     if best.at_the_noise or search.config.translations:
         return best
@@ -26,25 +28,26 @@ def with_functions(search: Search, best: Trial) -> Trial:
     found = _anew(search) if found is None else found
     if found is None or (best.near and not found.taken & set(found.fitter.functions)):
         return best
-    return search.braking(search.finalist(search.better(best, found) or best, (best, found)))
+    better = search.finalist(search.better(best, found) or best, (best, found))
+    return without_injecting_friction(search, better)
 
 
 def _fitter(search: Search, variant: Variant) -> Fitter | None:
-    """The fitter of a variant with all functions; None where no kernel holds them."""
-    fitter = search.fitter(replace(variant, functions=tuple(bands(search.over, search.base))))
+    """The fitter of a variant with all functions; None if they have more numbers than a kernel may have."""
+    fitter = search.fitter(replace(variant, functions=tuple(bands(search.range_data, search.base))))
     return fitter if len(fitter.start) <= MAX_PARAMETERS else None
 
 
 def _joined(search: Search, best: Trial) -> Trial | None:
-    """A model with the functions that join it one by one or, where that does not end at the noise, all at once.
+    """The model `best` with functions that join one by one or, if the result is not at the noise, all at once.
 
-    The model with all functions is worth further fits if it misses held-out blocks by less than the one without.
-    None where the model cannot be fitted together with what all functions have. Terms that are waves of a function
-    bring that function with them.
+    The model with all functions is fitted further only if its held-out log-loss is below that of `best`. None if
+    `best` cannot be fitted with the dictionary that has all functions.
     """
     if (fitter := _fitter(search, replace(best.fitter.variant, kept=best.taken))) is None:
         return None
     taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
+    # A named term that is a wave of a function is in the model only with the band of that wave.
     taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
     same = fitter.fit(taken, fitter.values_of(best), best.length, best)
     found = same and search.settled(search.finer(same), swapped=True)
@@ -57,7 +60,11 @@ def _joined(search: Search, best: Trial) -> Trial | None:
 
 
 def _anew(search: Search) -> Trial | None:
-    """A model of functions that join one by one or, where some do, all at once, without masses and with them."""
+    """A model fitted from the shortest segments on, with functions that join one by one or all at once.
+
+    All functions at once are tried unless terms alone follow whole trajectories or the first model is at the noise:
+    first without functions of the mass, then with them. A model that ends without functions is fitted by named terms.
+    """
     if (fitter := _fitter(search, Variant(search.order))) is None:
         return None
     every, found = frozenset({*fitter.simple, *fitter.functions}), search.climbed(fitter, fitter.simple, {})

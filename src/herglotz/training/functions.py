@@ -1,12 +1,14 @@
-"""Functions of coordinates and speeds that no named term says, as sums of waves with a Gaussian prior.
+"""Learned functions of coordinates and speeds: sums of waves with a Gaussian prior, beside the named terms.
 
-A Gaussian process on an interval is a sum of the waves that vanish at its ends, each with a coefficient of its own
-(Solin & Särkkä 2020, Hilbert-space methods for reduced-rank Gaussian process regression): smooth functions need the
-longest waves alone. The interval is `REACH` times as long as what was recorded, so that its ends lie outside. On an
-angle they are whole waves, which are periodic; of a speed, and in the plane, waves whose period is the interval. What
-data do not tell of a function its prior holds at 0, so that all waves join a model together. Octaves of a function are
-bands, each with a strength of its own. Every wave is a named term, which is stepped, printed and exported like any
-other.
+A Gaussian process on an interval is a sum of the sine waves that vanish at both ends, with independent coefficients
+(Solin & Särkkä 2020, Hilbert-space methods for reduced-rank Gaussian process regression); a smooth function needs only
+the longest waves. The interval is `REACH` times the recorded range, so that both ends lie outside the data. Functions
+of an angle are sums of the harmonics of the angle. Functions of a speed, and of two coordinates, are sums of cos and
+sin whose period is the interval.
+
+The prior keeps a function at 0 where the data say nothing, so all waves can join a model together. The waves of an
+octave are a band with a prior variance of its own. A wave is a named term: stepping, printing and export need no code
+for waves.
 """
 
 from __future__ import annotations
@@ -27,41 +29,55 @@ from herglotz.models.features import parse
 from herglotz.training.baseline import Baseline
 from herglotz.training.named_terms import NamedTerms, own_terms
 
-REACH = 1.5  # times the recorded interval
-POTENTIAL, OF_MANY = 47, 15  # waves of the potential of one length, of each of several lengths; harmonics of an angle
-PLANE = 80  # of a potential of two lengths: pairs of cos and sin
-MASS = 7  # of the mass of one coordinate
-DAMPING = 3  # of damping by position: pairs of cos and sin
-FRICTION = 7  # of friction by speed: pairs of cos and sin
+# Interval of the waves over the recorded range.
+REACH = 1.5
+# Waves of the potential of the only coordinate, if a length.
+POTENTIAL_WAVES = 47
+# Waves of the potential of each of several lengths, and harmonics of an angle.
+POTENTIAL_WAVES_OF_MANY = 15
+# Pairs of cos and sin of the potential of two lengths together.
+PLANE_PAIRS = 80
+# Waves of the mass of the only coordinate.
+MASS_WAVES = 7
+# Pairs of cos and sin of the damping as a function of position.
+DAMPING_PAIRS = 3
+# Pairs of cos and sin of the friction as a function of speed.
+FRICTION_PAIRS = 7
 
-OWN = re.compile(r"(cos|sin)\(q\d+\)")  # of an angle: what the baseline has
+# The first harmonic of an angle, which is a named term.
+FIRST_HARMONIC = re.compile(r"(cos|sin)\(q\d+\)")
 
 
 class Band(NamedTuple):
-    """Waves of a function that join a model together, with one strength."""
+    """Waves of a function that join a model together, with one prior variance.
 
-    name: str  # V(q1) 1, damping(q1) 1, mass(q1) 2, friction(v1) 1
+    `name` reads V(q1) 1, damping(q1) 1, mass(q1) 2 or friction(v1) 1, for example. `rates` are the angular rates k of
+    the waves, per unit of the coordinate; `longest` is the rate of the longest wave of the whole function.
+    """
+
+    name: str
     texts: tuple[str, ...]
-    rates: tuple[float, ...]  # of each wave, per unit of its coordinate
-    longest: float  # rate of the longest wave of the function
+    rates: tuple[float, ...]
+    longest: float
 
     @property
     def brakes(self) -> bool:
-        """Whether it is a force beside L."""
+        """True if the function is a dissipative force, which is no part of L."""
         return self.name.startswith(("damping", "friction"))
 
 
 def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Band]:
-    """All functions that these coordinates may be given beside their named terms.
+    """The bands of all functions that a model of these coordinates may have beside the named terms.
 
-    `fine`: the damping and the mass of one coordinate have waves as short as its potential's, which are too many for a
-    search.
+    `fine`: the damping and the mass of the only coordinate have waves as short as those of the potential, which would
+    be too many for a search.
     """
     found: dict[str, list[tuple[str, float]]] = {}
     several = data.dof > 1
-    pairs, mass = (POTENTIAL // 2, POTENTIAL) if fine and not several else (DAMPING, MASS)
+    pairs, mass = (POTENTIAL_WAVES // 2, POTENTIAL_WAVES) if fine and not several else (DAMPING_PAIRS, MASS_WAVES)
+    count = POTENTIAL_WAVES_OF_MANY if several else POTENTIAL_WAVES
     for i, angle in enumerate(data.angles):
-        own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], OF_MANY if several else POTENTIAL)
+        own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], count)
         found[f"V(q{i + 1})"] = own
         around = own if angle else _pairs(data, i, pairs)
         found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * pairs]]
@@ -74,7 +90,7 @@ def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Ban
     for i, j in combinations(range(data.dof), 2):
         if data.angles[i] or data.angles[j]:
             continue
-        found[f"V(q{j + 1} - q{i + 1})"] = _waves(data, [(j, 1.0), (i, -1.0)], OF_MANY)
+        found[f"V(q{j + 1} - q{i + 1})"] = _waves(data, [(j, 1.0), (i, -1.0)], POTENTIAL_WAVES_OF_MANY)
         found[f"friction(v{j + 1} - v{i + 1})"] = _of_speed(f"(v{j + 1} - v{i + 1})", base.speed[i] + base.speed[j])
         if data.dof == 2 and data.units[i] == data.units[j]:
             found[f"V(q{i + 1}, q{j + 1})"] = _plane(data, i, j)
@@ -84,35 +100,35 @@ def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Ban
 def terms_with(
     every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...], kept: Collection[str] = ()
 ) -> NamedTerms:
-    """The terms with all waves of these functions, which take the place of powers in the potential but the lowest.
+    """The terms joined by all waves of the bands, without the powers in the potential that waves can replace.
 
-    Those that are `kept` stay.
+    Terms in `kept` stay.
     """
     gone = replaced(terms.features, (), angles).difference(kept)
     left = [text for text in terms.features if text not in gone]
     waves = {brakes: [text for own in every if own.brakes == brakes for text in own.texts] for brakes in (False, True)}
-    still = NamedTerms(tuple(waves[False]), tuple(waves[True]))
-    return replace(terms, features=tuple(left)).joined(still)
+    return replace(terms, features=tuple(left)).joined(NamedTerms(tuple(waves[False]), tuple(waves[True])))
 
 
 def replaced(features: Iterable[str], drag: Iterable[str], angles: tuple[bool, ...]) -> set[str]:
-    """Those of these terms that functions can stand for: powers in the potential, and drag of one coordinate alone."""
+    """The terms that functions can replace: powers in the potential, and drag that depends on one coordinate alone."""
     own = own_terms(angles)
-    still = {
+    powers = {
         text for text in features
         if "v" not in text and text not in own and parse(text, angles)[0].function not in ("cos", "sin")
     }  # fmt: skip
     parsed = {text: parse_drag(text, angles) for text in drag}
     alone = {x for x, f in parsed.items() if f.of is None and f.at == f.on and (f.b or f.c) and not (f.air or f.wave)}
-    return still | alone
+    return powers | alone
 
 
 def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers: list[str]) -> dict[str, float]:
-    """Prior deviations, by what a number is: forces and rates of the motion's own size, and half the mass.
+    """Prior standard deviations of the coefficients of waves and of the lowest `powers`, by key.
 
-    They fall with the rate k of the wave as those of a Matérn process of ν = 3/2 do, as k^−2 on a line and k^−2.5 in
-    the plane. A mass that is rougher or larger is negative somewhere in a fit of short segments. The lowest `powers`,
-    whose place waves could take, are known to the same size.
+    The longest wave of a force or a damping has the size that the motion itself has, and the longest wave of a mass
+    half the mass. The deviations fall with the rate k of a wave as those of a Matérn process with ν = 3/2: as k^−2 on
+    a line and k^−2.5 in the plane. With a rougher or larger mass, fits of short segments find a mass that is negative
+    somewhere. Powers, which a sum of waves can imitate, have the size of the same force.
     """
     found: dict[str, float] = {}
     force = max(v * v / x for v, x in zip(base.speed, base.scale, strict=True))
@@ -131,12 +147,12 @@ def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers
 
 
 def _octaves(name: str, waves: list[tuple[str, float]]) -> Iterator[Band]:
-    """The waves of a function in octaves of their rates, the first two together.
+    """The waves of a function in bands, one for each octave of the rate, the first two octaves together.
 
-    An angle's own cos and sin are named terms.
+    The first harmonic of an angle is left out, because it is a named term.
     """
     longest = min(k for _, k in waves)
-    rest = [(text, k) for text, k in waves if not OWN.fullmatch(text)]
+    rest = [(text, k) for text, k in waves if not FIRST_HARMONIC.fullmatch(text)]
     octave = lambda wave: max(2, math.floor(round(wave[1] / longest, 6)).bit_length())  # noqa: E731
     for number, (_, part) in enumerate(groupby(rest, octave), 1):
         texts, rates = zip(*part, strict=True)
@@ -144,14 +160,14 @@ def _octaves(name: str, waves: list[tuple[str, float]]) -> Iterator[Band]:
 
 
 def _interval(data: Trajectories, form: list[tuple[int, float]]) -> tuple[float, float]:
-    """Middle and half length of the interval of a linear form."""
+    """Middle and half length of the interval of a linear form Σ w q_i, `form` = [(i, w), …]."""
     x = torch.stack([w * data.q[:, i] for i, w in form]).sum(0)
     low, high = float(x.min()), float(x.max())
     return (low + high) / 2, REACH * (high - low) / 2
 
 
 def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> list[tuple[str, float]]:
-    """sin(k (x − a)) of a linear form x that vanish at both ends of its interval, which begins at a."""
+    """sin(k (x − a)) of a linear form x, zero at both ends of the interval of x, which begins at a; with rates k."""
     middle, half = _interval(data, form)
     longest, found = _short(math.pi / (2 * half)), []
     phase = _short(longest * (half - middle))
@@ -163,38 +179,39 @@ def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> lis
 
 
 def _pairs(data: Trajectories, i: int, count: int) -> list[tuple[str, float]]:
-    """Waves of one coordinate whose period is its interval."""
+    """Pairs of cos and sin of one coordinate, with the period of its interval."""
     return _periodic(f"q{i + 1}", _interval(data, [(i, 1.0)])[1], count)
 
 
 def _of_speed(speed: str, largest: float) -> list[tuple[str, float]]:
-    """Waves of a speed, a number or a difference, whose period is its interval."""
-    return _periodic(speed, REACH * largest, FRICTION)
+    """Pairs of cos and sin of a speed, or of a difference of speeds, with the period of its interval."""
+    return _periodic(speed, REACH * largest, FRICTION_PAIRS)
 
 
 def _periodic(x: str, half: float, count: int) -> list[tuple[str, float]]:
-    """Pairs of cos and sin of a number whose period is its interval."""
+    """Pairs of cos and sin of a variable x whose period is its interval, of half length `half`."""
     rates = [j * _short(math.pi / half) for j in range(1, count + 1)]
     return [(f"{f}({k:.10g} {x})", k) for k in rates for f in ("cos", "sin")]
 
 
 def _plane(data: Trajectories, i: int, j: int) -> list[tuple[str, float]]:
-    """Plane waves of two coordinates that are periodic on the rectangle of their intervals, the longest ones first."""
+    """Plane waves of two coordinates with the periods of both intervals, the longest waves first."""
     a, b = (_short(math.pi / _interval(data, [(at, 1.0)])[1]) for at in (i, j))
-    every = ((math.hypot(m * a, n * b), m * a, n * b) for m in range(PLANE) for n in range(-PLANE, PLANE))
+    multiples = ((m, n) for m in range(PLANE_PAIRS) for n in range(-PLANE_PAIRS, PLANE_PAIRS))
+    every = ((math.hypot(m * a, n * b), m * a, n * b) for m, n in multiples)
     found = []
-    for k, x, y in sorted(wave for wave in every if wave[1] > 0 or wave[2] > 0)[:PLANE]:
+    for k, x, y in sorted(wave for wave in every if wave[1] > 0 or wave[2] > 0)[:PLANE_PAIRS]:
         parts = [f"{abs(w):.10g} q{at + 1}" for w, at in ((x, i), (y, j)) if w]
         found += [(f"{f}({(' - ' if y < 0 else ' + ').join(parts)})", k) for f in ("cos", "sin")]
     return found
 
 
 def _short(x: float) -> float:
-    """A number of seven digits, whose multiples are exact in ten: sines of multiples follow from that of one."""
+    """Round x to seven digits: ten printed digits then hold multiples exactly, and sin k x follows from sin x."""
     return float(f"{x:.7g}")
 
 
 def _harmonics(i: int) -> list[tuple[str, float]]:
-    """Waves of whole multiples of an angle."""
-    every = range(1, OF_MANY + 1)
-    return [(f"{f}({'' if k == 1 else k}q{i + 1})", float(k)) for k in every for f in ("cos", "sin")]
+    """Pairs of cos and sin of whole multiples of an angle."""
+    multiples = range(1, POTENTIAL_WAVES_OF_MANY + 1)
+    return [(f"{f}({'' if k == 1 else k}q{i + 1})", float(k)) for k in multiples for f in ("cos", "sin")]

@@ -1,9 +1,11 @@
-"""The step of a model with its derivatives by state and parameter, traced once and compiled: what a fit evaluates.
+"""The compiled kernel of a fit: the step of a model with its derivatives by state and parameters, traced to C.
 
-The parameters θ are an argument, so that one library serves every fit of this structure and every subset of its terms
-(a term that is absent is a 0). It is kept on disk by what it is made of: the configuration, this package's sources, the
-compiler and the processor. Models without C (large networks, order 4 of several coordinates), and machines without a
-compiler, have no kernel: `kernel_of` gives None, and torch evaluates the same functions.
+The parameters θ are an argument of the kernel. One library therefore serves every fit of a structure and every subset
+of its terms: an absent term has the coefficient 0. The library is cached on disk under the hash of the configuration,
+the sources of this package, the compiler and the processor.
+
+Large networks, order 4 of several coordinates, and machines without a compiler have no kernel: `kernel_of` returns
+None, and torch evaluates the same functions.
 """
 
 from __future__ import annotations
@@ -41,29 +43,32 @@ from herglotz.training.dictionary import dictionary, keys_of
 from herglotz.training.parameter_vector import ParameterVector
 
 RUNTIME = Path(herglotz.__file__).parent / "codegen" / "runtime"
-MAX_PARAMETERS = 300  # of a kernel: three joints with all their terms have 206, and gcc takes 5 s for them
-# Long straight lines of sums and products gain nothing from -O3, which takes 13 times as long, and much from fused
-# multiply-adds, which gcc's -O1 leaves out.
-LEVEL = ("-O1", "-fexpensive-optimizations")
-# Rooms, and files beside this one, whose sources decide what a kernel computes.
-MADE_OF = ("models", "mechanics", "stepping", "codegen")
-OWN = ("kernel.py", "parameter_vector.py")
-HANDED = ("const char *restrict gate", "const double *restrict fixed")  # what `hz_prepare` sets
-BATCHES = (101, 211, 431, 1021)  # primes: the example batch of a trace is larger than any axis
+# Largest number of parameters of a kernel. Three joints with all their terms have 206, which gcc compiles in 5 s.
+MAX_PARAMETERS = 300
+# Long straight-line code gains nothing from -O3, which takes 13 times as long, but much from fused multiply-adds,
+# which gcc leaves out at -O1.
+COMPILER_FLAGS = ("-O1", "-fexpensive-optimizations")
+# Packages, and files of `training`, whose sources decide what a kernel computes.
+SOURCE_PACKAGES = ("models", "mechanics", "stepping", "codegen")
+SOURCE_FILES = ("kernel.py", "parameter_vector.py")
+# Arguments of the C functions that `hz_prepare` sets.
+PREPARED_ARGUMENTS = ("const char *restrict gate", "const double *restrict fixed")
+# Batch sizes for a trace: the first prime above the number of parameters differs from every other axis.
+BATCHES = (101, 211, 431, 1021)
 
 
 class Placed(NamedTuple):
-    """A kernel, and where it has the numbers of a model."""
+    """A kernel and the places of a model's free parameters in its θ; `rest` is θ with 0 at these places."""
 
     kernel: Kernel
-    chosen: Tensor  # (P,) places in θ of the kernel
-    rest: Tensor  # θ of the kernel with 0 at these
+    chosen: Tensor  # (P,)
+    rest: Tensor  # (Pk,) of the kernel
 
 
 def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = None) -> Placed | None:
-    """The kernel that evaluates a model, compiled where it is not known yet; None where there can be none.
+    """The kernel that evaluates a model, compiled unless cached; None if the model can have none.
 
-    `parameters` are those that a fit moves, by default all; the others are what they are in the model.
+    `parameters` are the free parameters of a fit, by default all. The others keep their values in the model.
     """
     if not isinstance(model, ContactLagrangian):
         return None
@@ -92,9 +97,9 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
 
 
 def structure(config: ModelConfig) -> ModelConfig:
-    """The configuration without what a kernel takes as an argument: starts, sizes, and which numbers are 0.
+    """The configuration with defaults for all that a kernel has as an argument: starts, sizes, and absent numbers.
 
-    Networks have the sizes of what they are given as constants.
+    The sizes of the inputs of a network are constants of the kernel, and stay.
     """
     plain = replace(config, seed=0, absent=())
     plain = plain if config.level in ("affine", "full") else replace(plain, damping_width=0)
@@ -102,20 +107,21 @@ def structure(config: ModelConfig) -> ModelConfig:
         return plain
     n = len(config.angles)
     ones, zeros = (1.0,) * n, (0.0,) * n
-    held = config.alike or config.translations  # the baseline's potential, which is no argument there
-    stiffness, tilt = (config.stiffness, config.tilt) if held else (ones, zeros)
+    # With a shared mass or translations, the potential of the baseline is a constant and no argument.
+    constant = config.alike or config.translations
+    stiffness, tilt = (config.stiffness, config.tilt) if constant else (ones, zeros)
     return replace(plain, scale=ones, speed=ones, stiffness=stiffness, tilt=tilt, rate=0.1)
 
 
 @cache
 def _whole(config: ModelConfig) -> ModelConfig:
-    """The dictionary that holds a model, or the structure of the model where no dictionary does."""
+    """The dictionary that contains a model; the structure of the model itself if no dictionary does."""
     return dictionary(config) or structure(config)
 
 
 @cache
 def _kernel(config: ModelConfig) -> Kernel | None:
-    """The kernel of this structure; None where it is too large, or has an operation without a form in C."""
+    """The kernel of this structure; None if it has too many parameters or an operation that C does not have."""
     model = ContactLagrangian(config)
     if len(numbers_of(model)) > MAX_PARAMETERS:
         return None
@@ -126,36 +132,37 @@ def _kernel(config: ModelConfig) -> Kernel | None:
 
 @cache
 def _sources() -> str:
-    """The hash of the package's sources that decide what a kernel computes."""
+    """The hash of the package's sources that decide what a kernel computes, and the version of torch."""
     root, digest = Path(herglotz.__file__).parent, hashlib.sha256()
-    for name in OWN:
+    for name in SOURCE_FILES:
         digest.update((root / "training" / name).read_bytes())
-    for room in MADE_OF:
-        for path in sorted((root / room).rglob("*")):
+    for package in SOURCE_PACKAGES:
+        for path in sorted((root / package).rglob("*")):
             if path.suffix in (".py", ".c", ".h"):
                 digest.update(path.read_bytes())
     return digest.hexdigest() + torch.__version__
 
 
 class Kernel:
-    """Free runs of a structure over segments, with their derivatives by the start and by chosen parameters."""
+    """Free runs of a structure over segments, with derivatives by the start state and by chosen parameters."""
 
     def __init__(self, model: ContactLagrangian):
         self.n, self.m, self.sticks = model.dof, model.inputs, model.capabilities.sticking
         self.d = states_of(model)
-        self.numbers = ParameterVector(model).numbers  # of θ, in order
+        # Names of the entries of θ, in order.
+        self.numbers = ParameterVector(model).numbers
         self.place = {key: i for i, key in enumerate(keys_of(self.numbers, model.config))}
         key = _sources() + json.dumps(model.config.to_dict(), sort_keys=True)
-        self.library = built(key, lambda: {SOURCE: source_of(model)}, LEVEL)
+        self.library = built(key, lambda: {SOURCE: source_of(model)}, COMPILER_FLAGS)
         self.library.hz_sweep.restype = ctypes.c_long
         self.library.hz_eliminate.restype = ctypes.c_long
 
     def sweep(self, *arguments: Any) -> int:
-        """`hz_sweep` of `codegen/runtime/sweep.c`: -1, or the segment in which a step has no solution."""
+        """`hz_sweep` of `codegen/runtime/sweep.c`: -1, or the index of the segment with a step without solution."""
         return self.library.hz_sweep(*map(_passed, arguments))
 
     def eliminate(self, diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
-        """The solution (S, d, R) of a block tridiagonal system; None where it is not positive definite."""
+        """The solution (S, d, R) of a block tridiagonal system; None if the matrix is not positive definite."""
         x, work = columns.contiguous().clone(), torch.empty_like(upper)
         S, d, R = x.shape
         bad = self.library.hz_eliminate(*map(_passed, (S, d, R, diagonal.contiguous(), upper.contiguous(), x, work)))
@@ -163,7 +170,7 @@ class Kernel:
 
 
 def _passed(x: Tensor | float | int | None) -> Any:
-    """A number or an address as C takes it."""
+    """A number, or the address of a tensor, as a C argument."""
     if isinstance(x, int):
         return ctypes.c_long(x)
     if isinstance(x, float):
@@ -173,12 +180,12 @@ def _passed(x: Tensor | float | int | None) -> Any:
 
 
 def states_of(model: ContactLagrangian) -> int:
-    """How many numbers of a state the motion depends on: those of q and p, and s where it enters."""
+    """d, the size of the state that the motion depends on: 2n for (q, p), or 2n + 1 if s enters the motion."""
     return 2 * model.dof + model.s_enters_motion
 
 
 class _Increments(nn.Module):
-    """A model's partials by q0 and Δ, as a module whose parameters and buffers can be given."""
+    """The partials of a model by q0 and Δ as a module, for `functional_call` with other parameters and buffers."""
 
     def __init__(self, model: ContactLagrangian):
         super().__init__()
@@ -189,7 +196,7 @@ class _Increments(nn.Module):
 
 
 class _At:
-    """The discrete Lagrangian at parameters θ (P,), the widths' floors of friction (n,), and inputs u (B, m)."""
+    """The discrete Lagrangian at parameters θ (P,), least widths of smooth friction (n,), and inputs u (B, m)."""
 
     def __init__(self, parameters: ParameterVector, theta: Tensor, sharpest: Tensor, u: Tensor | None):
         self.model, self.u = parameters.model, u
@@ -199,7 +206,7 @@ class _At:
 
     @property
     def capabilities(self) -> Capabilities:
-        """The model's."""
+        """The capabilities of the model."""
         return self.model.capabilities
 
     def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
@@ -208,7 +215,10 @@ class _At:
 
 
 class Functions:
-    """What the C runtime calls, as tensor code: x = (q, p, s) is (B, 2n + 1), θ and `sharpest` have no batch."""
+    """The functions that the C runtime calls, as tensor code to be traced.
+
+    x = (q, p, s) is (B, 2n + 1). θ (P,) and `sharpest` (n,), the least widths of smooth friction, have no batch.
+    """
 
     def __init__(self, model: ContactLagrangian):
         self.parameters, self.n, self.sticks = ParameterVector(model), model.dof, model.capabilities.sticking
@@ -221,13 +231,13 @@ class Functions:
         return PartialsEquation(at, state, h, 2, increments=True)  # pyright: ignore[reportArgumentType]
 
     def rest(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> tuple[Tensor, ...]:
-        """z, K and w/K of `herglotz.stepping.stick_slip`."""
+        """z, K and w/K with which the iteration for set-valued friction starts (`herglotz.stepping.stick_slip`)."""
         return tuple(y.clone() for y in at_rest(self.equation(x, h, u, theta, sharpest)))
 
     def evaluate(
         self, x: Tensor, z: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor, *held: Tensor
     ) -> tuple[Tensor, ...]:
-        """F and J at the increment z or, where dry friction can hold, at z of `herglotz.stepping.stick_slip`."""
+        """F and J at the increment Δ = z; with set-valued friction at the z of `herglotz.stepping.stick_slip`."""
         equation: Any = self.equation(x, h, u, theta, sharpest)
         point = (StickSlip(equation, *held) if held else equation)(z, True)
         return point.F.clone(), point.J.clone()
@@ -235,9 +245,9 @@ class Functions:
     def derive(
         self, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor
     ) -> tuple[Tensor, ...]:
-        """F, J, (p1, s1 − s0), and of a solved step ∂(q1, p1)/∂(q, p), c, and ∂(F, p1)/∂θ at Δ.
+        """F, J, (p1, s1 − s0), ∂(q1, p1)/∂(q, p), c and ∂(F, p1)/∂θ at the increment Δ of a solved step.
 
-        Where s enters the motion the derivatives are those of (q1, p1, s1) by (q, p, s), and of (F, p1, s1) by θ.
+        If s enters the motion, the derivatives are those of (q1, p1, s1) by (q, p, s), and of (F, p1, s1) by θ.
         """
         n, d, p0 = self.n, self.d, x[:, self.n : 2 * self.n]
 
@@ -246,8 +256,8 @@ class Functions:
             P = self.equation(x[None], h[None], driven, theta, sharpest)(delta[None], False).rest
             return torch.cat([momentum_residual(P, x[None, n : 2 * n]), momentum_plus(P), P.L[:, None]], -1)[0, :d]
 
-        # Each sample has a θ of its own, whose derivatives autograd gives: `torch.func.vjp` imports torch's compiler,
-        # which takes longer than the trace.
+        # Autograd by a copy of θ for each sample: `torch.func.vjp` would import torch's compiler, which takes longer
+        # than the trace.
         with torch.enable_grad():
             own = theta.expand(len(x), -1).clone().requires_grad_()
             results = vmap(of_sample, (0, 0, 0, 0, None if u is None else 0))(own, x, delta, h, u).unbind(-1)
@@ -261,7 +271,7 @@ class Functions:
 
 
 def source_of(model: ContactLagrangian) -> str:
-    """The whole C of a structure: sizes, traced functions, and the runtime."""
+    """The C source of a structure: sizes, traced functions, and the runtime."""
     functions, prepared = Functions(model), Prepared()
     n, m, P, sticks = functions.n, model.inputs, len(functions.parameters.numbers), functions.sticks
     end = {"h": 0, **({"u": m} if m else {}), "theta": P, "sharpest": n}
@@ -289,7 +299,7 @@ OPTIMISED = """
 
 
 class _Traced:
-    """A traced function with the numbers of its results, from which C functions of some of them are written."""
+    """A traced function, from which C functions that compute some of its results are written."""
 
     def __init__(
         self,
@@ -317,13 +327,14 @@ class _Traced:
         if not self.inputs:
             read.insert(list(self.given).index("h") + 1, "const double *restrict u")
         outputs: Outputs = {key: self.outputs[key] for key in results}
-        head = f"\nstatic void hz_{name}({', '.join([*read, *HANDED, *written])})"
-        columns = {"G": self.given["theta"]}  # of derivatives by θ
+        head = f"\nstatic void hz_{name}({', '.join([*read, *PREPARED_ARGUMENTS, *written])})"
+        # G are derivatives by θ, and has a column for each parameter.
+        columns = {"G": self.given["theta"]}
         return gated(self.program, head, outputs, self.prepared, columns)
 
 
 def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:
-    """Arguments of these sizes for a trace; θ and `sharpest` have no batch, and a size of 0 is one number."""
+    """Example arguments of these sizes for a trace; θ and `sharpest` have no batch, and a size of 0 is a scalar."""
     batch = next(prime for prime in BATCHES if prime > given["theta"])
     make = torch.Generator().manual_seed(0)
     random = lambda *shape: torch.rand(*shape, generator=make, dtype=torch.float64)  # noqa: E731

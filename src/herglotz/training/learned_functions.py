@@ -1,12 +1,12 @@
-"""What a model has learned, as functions of one coordinate or speed, with the bands of their posterior.
+"""The functions that a model has learned, along one coordinate or speed, with the bands of their posterior.
 
-Positions identify a model only up to a gauge (trap 3 of `docs/mathematics.md`), and functions are compared in this one:
+Positions identify a model only up to a gauge (trap 3 of `docs/mathematics.md`). Functions are given in this gauge:
 
-* the first entry of the mass is 1 in the mean over the data, so that forces are accelerations of the first coordinate;
-* the potential V is 0 in the mean over the recorded range;
-* friction is 0 at rest: a constant force, which waves of a speed have too, is a tilt of V.
+* the first entry of the mass has the mean 1 over the data, so that forces are accelerations of the first coordinate;
+* the potential V has the mean 0 over the recorded range;
+* friction is 0 at rest: a constant force, which waves of a speed can contain, is a tilt of V.
 
-A band is that of the function in this gauge, std² = ∇f · Σ ∇f, with the covariance Σ of `function_posterior`.
+The variance of a function f in this gauge is std² = ∇f · Σ ∇f, with the covariance Σ of `function_posterior`.
 """
 
 from __future__ import annotations
@@ -28,14 +28,17 @@ from herglotz.training.function_posterior import SAMPLES, by_numbers, function_p
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace
 
-CONSTANT = 1e-6  # of the largest value: a function that varies by less is constant, but for rounding of float32
-Line = tuple[Tensor, float, float]  # points x (K,), and the ends of the recorded range
-Part = tuple[str, tuple[int, ...], Line]  # kind, coordinates and line of a function
+# Relative variation below which a function is constant: rounding of float32.
+MAX_VARIATION_OF_CONSTANT = 1e-6
+# Points x (K,), and the ends of the recorded range.
+Line = tuple[Tensor, float, float]
+# Kind, coordinates and line of a function.
+Part = tuple[str, tuple[int, ...], Line]
 
 
 @dataclass(frozen=True)
 class LearnedFunction:
-    """A function of a model along one coordinate or speed, the other coordinates being at their median.
+    """A function of a model along one coordinate or speed, with the other coordinates at their medians.
 
     Its posterior at x is 𝒩(mean, std²): section 7 of `docs/trajectory.md`.
 
@@ -45,17 +48,17 @@ class LearnedFunction:
         "potential" V, "force" −∂V/∂q_i, "friction" f_i(v_i), "damping" −f_i/v_i by position at the RMS speed, or
         "mass" m_jk.
     of
-        (i,) the coordinate, from 0; of a mass (j, k, i), its entry and the coordinate that it is a function of.
+        (i,), the coordinate from 0. For a mass (j, k, i), the entry m_jk and the coordinate i that m_jk depends on.
     x
-        (K,) positions or speeds, in the data's units; −π to π of an angle that went further round.
+        (K,) positions or speeds, in the data's units; −π to π for an angle whose range exceeds one turn.
     value
-        (K,) of the model, in units where the first coordinate's mass is 1.
+        (K,) of the model, in units where the mass of the first coordinate is 1.
     low, high
-        The range of x that the training data have, in the data's units.
+        The range of x in the training data, in the data's units.
     mean, std
-        (K,) of the posterior, in the units of `value`; None without one. The mean differs from `value` where the data
-        ask for more than a model has, or where its steps are not short. `std` is infinite beyond
-        the recorded range, and where left-out blocks of time cannot be foretold.
+        (K,) of the posterior, in the units of `value`; None without a posterior. The mean differs from `value` if the
+        data need more than the model has, or if the model's steps are not short. `std` is infinite beyond the recorded
+        range, and everywhere if left-out blocks of time cannot be predicted.
     """
 
     kind: str
@@ -68,7 +71,7 @@ class LearnedFunction:
     std: Tensor | None = None  # (K,)
 
     def interval(self, level: float = 0.9) -> tuple[Tensor, Tensor]:
-        """Lower and upper end of the central interval of the posterior, (K,) each."""
+        """Lower and upper ends of the central interval of the posterior, (K,) each; `level` is its probability."""
         refuse({f"level must be between 0 and 1, got {level:g}; 0.9 is usual": not 0 < level < 1})
         if self.mean is None or self.std is None:
             raise InputError("a function without a posterior has no band; give one: learned_functions(laplace(run))")
@@ -78,19 +81,19 @@ class LearnedFunction:
 
 @one_thread()
 def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0.0) -> list[LearnedFunction]:
-    """The functions that a run has learned, along each coordinate, with bands where its posterior is given.
+    """The functions that a run has learned, along each coordinate; with bands if its posterior is given.
 
-    Each coordinate has its potential and force; friction where the model has any; damping and the entries of the mass
-    where they depend on position. The gauge is that of the head of this module (section 7 of `docs/trajectory.md`).
+    Each coordinate has a potential and a force, and a friction if the model has friction. Damping and the entries of
+    the mass are listed if they depend on the position. The gauge is described in section 7 of `docs/trajectory.md`.
 
     Parameters
     ----------
     of
         A fitted run, or its posterior, `laplace(run)`.
     points
-        K, number of points, evenly over the recorded range.
+        K, number of points, evenly spaced over the recorded range.
     beyond
-        Part of the range that is added on both sides, where the model extrapolates; dimensionless.
+        Share of the recorded range by which x continues on both sides, where the model extrapolates; dimensionless.
 
     Returns
     -------
@@ -100,7 +103,7 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
     Raises
     ------
     InputError
-        If the model is one's own module, there are fewer than two points, or `beyond` is negative.
+        If the model is the user's own module, there are fewer than two points, or `beyond` is negative.
 
     Examples
     --------
@@ -127,7 +130,7 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
 
 
 class _Lines:
-    """The lines that a run's functions are evaluated on."""
+    """The lines along which the functions of a run are evaluated."""
 
     @torch.no_grad()
     def __init__(self, run: Run, points: int, beyond: float):
@@ -144,23 +147,24 @@ class _Lines:
         ]
 
     def _of(self, model: ContactLagrangian, i: int, at: Line, speeds: Line) -> list[Part]:
-        """The functions of one coordinate."""
+        """Kinds and lines of the functions of coordinate i: positions `at`, and `speeds`."""
         found: list[Part] = [("potential", (i,), at), ("force", (i,), at)]
-        rubs = isinstance(model.damping, LinearDamping)
-        found += [("friction", (i,), speeds)] if rubs else []
-        found += [("damping", (i,), at)] if rubs and _varies(self._damping(model, i, at[0])) else []
+        friction = isinstance(model.damping, LinearDamping)
+        found += [("friction", (i,), speeds)] if friction else []
+        found += [("damping", (i,), at)] if friction and _varies(self._damping(model, i, at[0])) else []
         m = mass_at(model, self._line(i, at[0]), self.h)
         pairs = ((j, k) for j in range(len(m)) for k in range(j, len(m)))
         return [*found, *(("mass", (j, k, i), at) for j, k in pairs if _varies(m[j, k], m))]
 
     def values(self, model: ContactLagrangian) -> Tensor:
-        """All functions of a model in the gauge, one after the other, float64."""
+        """All functions of a model in the gauge of this module, concatenated, float64."""
         unit = mass_at(model, self.some, self.h)[0, 0].double().cpu().mean()
         return torch.cat([self._value(model, kind, of, *line) / unit for kind, of, line in self.parts])
 
     def _value(
         self, model: ContactLagrangian, kind: str, of: tuple[int, ...], x: Tensor, low: float, high: float
     ) -> Tensor:
+        """A function on its line before the division by the mean mass, (K,)."""
         i = of[-1]
         if kind == "friction":
             v = self.middle.new_zeros(len(x), len(self.middle))
@@ -179,7 +183,7 @@ class _Lines:
         return V - V[(x >= low) & (x <= high)].mean()
 
     def _damping(self, model: ContactLagrangian, i: int, x: Tensor) -> Tensor:
-        """−f_i/v_i, the mean of both directions, at the RMS speed."""
+        """−f_i/v_i at the RMS speed, the mean of both directions, (K,)."""
         q = self._line(i, x)
         v = torch.zeros_like(q)
         v[:, i] = self.speed[i]
@@ -188,13 +192,13 @@ class _Lines:
         )
 
     def _line(self, i: int, x: Tensor) -> Tensor:
-        """Positions (K, n): coordinate i along x, the others at their median."""
+        """Positions (K, n): coordinate i along x, the others at their medians."""
         q = self.middle.expand(len(x), -1).clone()
         q[:, i] = x.to(q)
         return q
 
     def _friction(self, model: ContactLagrangian, q: Tensor, v: Tensor) -> Tensor:
-        """−γ m v of the contact term at s = 0, and the forces beside L but those of inputs, (K, n)."""
+        """Dissipative force −γ m v of the contact term at s = 0 plus the forces beside L without inputs, (K, n)."""
         if not isinstance(model.damping, LinearDamping):
             return 0.0 * v
         h, rate = torch.full_like(q[:, 0], self.h), model.damping.rate
@@ -207,9 +211,10 @@ class _Lines:
 
 
 def _range(values: Tensor, points: int, beyond: float, turns: bool = False) -> Line:
-    """Points over the range of values and beyond, and the range; of an angle that `turns` further, one turn.
+    """Evenly spaced points over the range of the values and beyond, and the range.
 
-    Functions of an angle come again after a turn, and few points to each of many would draw others.
+    For an angle (`turns`) whose range exceeds one turn, one turn: functions of an angle are periodic, and the points
+    would be too few for each of many turns.
     """
     low, high = float(values.min()), float(values.max())
     if turns and high - low > 2 * math.pi:
@@ -219,11 +224,11 @@ def _range(values: Tensor, points: int, beyond: float, turns: bool = False) -> L
 
 
 def _inside(std: Tensor | None, x: Tensor, low: float, high: float) -> Tensor | None:
-    """Infinite beyond the recorded range, where waves vanish because nothing is known, not because functions do."""
+    """The deviations, infinite beyond the recorded range: waves vanish there by their form, not by the data."""
     return None if std is None else torch.where((x >= low) & (x <= high), std, torch.inf)
 
 
 def _varies(values: Tensor, among: Tensor | None = None) -> bool:
-    """Whether a function varies by more than rounding."""
+    """True if a function varies by more than rounding, relative to the largest of the values `among`."""
     size = (values if among is None else among).abs().amax()
-    return bool(values.amax() - values.amin() > CONSTANT * size)
+    return bool(values.amax() - values.amin() > MAX_VARIATION_OF_CONSTANT * size)

@@ -1,8 +1,11 @@
-"""What a search asks of data beside their terms: one question after the other, of the model that the last one left.
+"""Questions to the data beside the terms of a model, asked one after the other of the best model so far.
 
-Damping by s belongs to the terms. Zeros of sensors and how inputs hold come before everything else that may stand for
-them. By which terms inputs act, and whether functions say what named terms do not, follows. Of long recordings a part
-is asked, and all samples at the end.
+1. Zeros of the sensors and the hold of the inputs, because terms could make up for either.
+2. The terms of the model, damping by s among them (`Search.run`).
+3. The terms by which inputs act (`how_inputs_act`).
+4. Learned functions in the place of missing named terms (`functions`).
+
+Of a long recording a part answers these questions, and `all_data` fits the answer to all samples.
 """
 
 from __future__ import annotations
@@ -20,47 +23,57 @@ from herglotz.training.trials import Trial
 
 
 class Questions:
-    """The answers so far: the model, and what the data were found to be."""
+    """The answers so far.
+
+    `wanted` is the search of all data. `read` is the search of the part, of readings less the zeros of their sensors
+    once those are found. `best` is the model in `read`, and `differ` the zeros (B, n) with their standard deviations.
+    `hold` and `input_terms` are empty until another hold, or terms of the inputs, are found.
+    """
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
-        # The search of all data, and the holds of inputs that may be tried, that of the data among them.
+        # The hold of the data is among the candidates, because it is tried again after another hold was found.
         self.wanted, self.holds = wanted, (*holds, *([wanted.data.hold] if holds else []))
         self.hold, self.input_terms = "", ()
-        # The search of the part, its sensors' zeros taken off where these differ; the model; the zeros.
         self.read: Search = wanted.part
         self.best: Trial | None = wanted.part.first
         self.differ: tuple[Tensor, Tensor] | None = None
         asked = False
         if self.best is None or not self.best.at_the_noise:
-            self.best = wanted.part.full  # which lacks no term that zeros, or another hold, could stand for
+            # The whole dictionary lacks no term for which zeros or another hold could make up.
+            self.best = wanted.part.full
             asked = self.best is not None and self.best.whole
-            if asked and any([self.zeros(), self.how_inputs_hold(alike=True)]):
+            if asked and any([self.zeros(), self.how_inputs_hold(by_residuals=True)]):
                 self.read.full = self.best
         self.best = _searched(self.read)
-        if not asked and self.zeros():  # what stood for zeros has bent the terms
+        # Terms that made up for zeros or another hold are searched anew.
+        if not asked and self.zeros():
             self.best = self.read.better(self.best, _searched(self.read))
         if not asked and self.how_inputs_hold():
             self.best = self.read.better(self.best, _searched(self.read))
 
     def zeros(self) -> bool:
-        """Zeros of sensors that differ between recordings, where the model asks for some."""
+        """Find zeros of sensors that differ between recordings; True if the model is better with them."""
         self.read, self.best, self.differ = self.read.with_zeros(self.best)
         return self.differ is not None
 
-    def how_inputs_hold(self, *, alike: bool = False) -> bool:
-        """Another hold of the inputs where the model asks for one; `alike`: by the residuals of its fits themselves."""
-        if self.best is None or self.wanted.part.longer > 1:
+    def how_inputs_hold(self, *, by_residuals: bool = False) -> bool:
+        """Find another hold of the inputs (`Search.better_hold`); True if the model is better with it.
+
+        A part with longer steps has means of the inputs, which say little of a hold over one step.
+        """
+        if self.best is None or self.wanted.part.step_ratio > 1:
             return False
-        if not (hold := self.read.held(self.best, self.holds, alike=alike)):
+        if not (hold := self.read.better_hold(self.best, self.holds, by_residuals=by_residuals)):
             return False
         self.wanted, self.read = (x.of(replace(x.data, hold=hold)) for x in (self.wanted, self.read))
         self.hold, self.best = hold, self.read.again(self.best)
         return True
 
     def how_inputs_act(self) -> None:
-        """Terms anew with other terms of the inputs, where the model asks for some; then the hold once more.
+        """Find terms by which the inputs act, search the terms of the model anew with them, then the hold.
 
-        A hold may have stood for the term that was missing, and some of the terms for the hold.
+        A hold may have made up for a missing term of the inputs. If another hold is found now, terms of the inputs
+        that only made up for the hold leave.
         """
         if self.best is None or not (terms := self.read.input_terms(self.best)):
             return
@@ -78,19 +91,19 @@ class Questions:
                 self._drive(left, wanted, read, found)
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
-        """The inputs act by these terms as well, in all data and in the search of a model."""
+        """Keep these terms of the inputs, the search of the part that has them, and its model."""
         self.input_terms, self.wanted = columns_of(terms), wanted.driven_by(terms)
         self.read, self.best = read, found
 
     def functions(self) -> None:
-        """A model of functions, where it is better; then holds and zeros once more.
+        """Find a better model with learned functions, then ask for the hold and the zeros once more.
 
-        Functions may be what recordings seemed to differ by, and tell a hold that terms did not.
+        What seemed a difference between recordings, or errors of another hold, may have been a missing function.
         """
         if self.best is None or (found := with_functions(self.read, self.best)) is self.best:
             return
         self.best = found
-        later = "" if self.wanted.part.longer > 1 else self.read.held(found, self.holds)
+        later = "" if self.wanted.part.step_ratio > 1 else self.read.better_hold(found, self.holds)
         wanted = self.wanted.of(replace(self.wanted.data, hold=later)) if later else self.wanted
         if (again := wanted.part.again(found)) is None:
             return
@@ -99,20 +112,20 @@ class Questions:
         self.best = best and self.read.settled(best, swapped=True)
 
     def all_data(self) -> None:
-        """The model of a part fitted to all data, with what more these ask for, and its zeros of sensors."""
+        """Fit the model of a part to all data, and ask these for zeros, more terms and, if not yet asked, the hold."""
         if self.wanted.part is self.wanted:
             if self.best is not None and self.differ is not None:
                 self.read, best, self.differ = self.wanted.zeros_again(self.read, self.best, self.differ)
                 self.best = best and (best if best is self.best else self.read.settled(best, swapped=True))
             return
-        longer = self.wanted.part.longer > 1  # inputs are means over several samples, which say little of holds of one
+        longer = self.wanted.part.step_ratio > 1
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
-        if longer and self.best is not None and (hold := self.read.held(self.best, self.holds)):
+        if longer and self.best is not None and (hold := self.read.better_hold(self.best, self.holds)):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
 
 
 def _searched(search: Search) -> Trial | None:
-    """The model of a search, whose damping depends on s where that is better."""
+    """The model of a search, with damping that depends on s if that is better."""
     found = search.run()
     return found and with_dissipation(search, found)

@@ -1,15 +1,17 @@
-"""The one comparison of a fit: what a model misses held-out blocks of time by, and whether a richer one is worth it.
+"""The only comparison of two models: their log-losses over held-out blocks of time, and the price of more numbers.
 
-A richer model of k_r numbers, which come in c_r of C offers, replaces a simpler one of k_s where
+A rich model with k_r parameters, chosen as c_r of C offers, replaces a simple model with k_s and c_s if
 
-    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)] + e/√τ,
+    Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)] + e/√τ
 
-and more than e, the standard error of this sum over blocks; ℓ_b is the log-loss of block b by Student's t, had its
-samples been left out of the fit. τ is how many samples in a row tell as much as one (`correlation_time`), so that N
-numbers are worth N/τ independent ones; e/√τ is what e would be if they all were. Where a model lacks nothing its
-residuals are white, τ is 1, and without e this is the extended Bayesian information criterion (Chen & Chen 2008).
-Residuals that are no noise go on from sample to sample, τ is large, and every further number is dear. Lost blocks and
-outliers weigh little: the loss of Student's t grows as log |r|.
+and if the sum also exceeds e, its standard error over blocks. ℓ_b is the log-loss of block b under Student's t for a
+fit without the samples of the block. τ is the correlation time of the residuals in samples (`correlation_time`): N
+correlated values carry the information of N/τ independent values, for which the standard error would be e/√τ.
+
+* White residuals have τ = 1. Without e the inequality is then the extended Bayesian information criterion
+  (Chen & Chen 2008).
+* If a force is missing, residuals are correlated from sample to sample, τ is large, and each parameter costs more.
+* Lost blocks and outliers have little weight, because the loss of Student's t grows only as log |r|.
 """
 
 from __future__ import annotations
@@ -26,50 +28,71 @@ from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
-ROUNDS, SETTLED = 20, 1e-6  # of the scale of Student's t, and the relative change that ends them
-WORST = 1e3  # the loss of a residual that is no number
+# Iterations for the scale of Student's t, and the relative change at which they end.
+SCALE_ITERATIONS, SCALE_RTOL = 20, 1e-6
+# Log-loss of a residual that is infinite or NaN: more than any finite residual of a model that follows the data has.
+LOSS_IF_NOT_FINITE = 1e3
 
 
 @dataclass(frozen=True)
 class Score:
-    """Log-losses of held-out blocks, and what decides beside them."""
+    """Log-losses of held-out blocks, with the numbers that the price of a model depends on.
 
-    losses: Tensor  # (B,) sums over the samples of a block
-    count: int  # N, numbers in q
-    numbers: float  # k of the model: of those with a prior what the data tell
-    choices: int  # c, how many offers it has taken
-    rms: float  # of held-out residuals, in units of q over the balance
-    correlation_time: float = 1.0  # τ, in samples
-    zeros: int = 0  # further numbers, which are one choice for all: zeros of sensors
+    Parameters
+    ----------
+    losses
+        (B,) log-loss of each block, summed over its samples.
+    count
+        N, number of recorded values in q.
+    numbers
+        k, number of parameters. The coefficient of a wave counts as the share (0 to 1) that the data determine.
+    choices
+        c, number of offers in the model.
+    rms
+        Of the residuals, in units of q over the balance.
+    correlation_time
+        τ, in samples.
+    zeros
+        Number of further parameters that are no choice among offers: zeros of sensors.
+    """
+
+    losses: Tensor  # (B,)
+    count: int
+    numbers: float
+    choices: int
+    rms: float
+    correlation_time: float = 1.0
+    zeros: int = 0
 
     def replaces(self, simple: Score, offered: int) -> bool:
-        """Whether this richer model replaces a simpler one, where there are so many offers."""
+        """True if this richer model replaces a simpler model; `offered` is C, the number of offers."""
         return self.gain(simple, offered) > 0
 
     def gain(self, simple: Score, offered: int) -> float:
-        """The left side of the inequality less the larger right one, τ being that of the richer model."""
+        """Left side of the inequality minus the larger of the two bounds, with the τ of this richer model."""
         by_block = simple.losses - self.losses
         error = float(by_block.std()) * len(by_block) ** 0.5
         dearer = self.price(self, offered) - self.price(simple, offered)
         return float(by_block.sum()) - max(dearer + error / self.correlation_time**0.5, error)
 
     def price(self, model: Score, offered: int) -> float:
-        """What the numbers and the choices of a model cost at the τ of this one, where there are so many offers."""
+        """Price of a model's parameters and choices at the τ of this score; `offered` is C, the number of offers."""
         chosen = math.log(math.comb(offered, model.choices))
-        return (model.numbers + model.zeros) * self.of_a_number + self.correlation_time * chosen
+        return (model.numbers + model.zeros) * self.price_of_a_number + self.correlation_time * chosen
 
     @property
-    def of_a_number(self) -> float:
-        """½ τ log (N/τ), what a number costs."""
+    def price_of_a_number(self) -> float:
+        """½ τ log (N/τ), the price of one parameter."""
         return self.correlation_time * math.log(self.count / self.correlation_time) / 2
 
 
 def scores(
     model: HeldOut, sets: Sequence[Sequence[int]], choices: Sequence[int], count: int, floor: float
 ) -> list[Score]:
-    """The scores of sets of the numbers of a fit, to first order; `choices` (C,) offers have brought them.
+    """Scores, to first order, of C models that keep these sets of a fit's parameters (indices).
 
-    Misfits below `floor`, in units of q over the balance, are rounding.
+    `choices` are the numbers of offers that the sets come from, `count` is N. Residuals below `floor`, in units of q
+    over the balance, are rounding and count as `floor`.
     """
     block = torch.where(model.complete, model.block, -1)
     of_misfits = _of_misfits(model.residuals(sets), block, floor)
@@ -78,9 +101,9 @@ def scores(
 
 
 def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int = 0) -> Score:
-    """The score by the residuals of the fit itself, block by block, of models that are alike but for a few numbers.
+    """Score from the residuals of the fit itself, for two models that differ in few parameters.
 
-    What leaving out a block does to a model of many numbers, to first order, says more of these than of the few.
+    Residuals without a block would depend, to first order, more on the many shared parameters than on the few others.
     """
     block = torch.where(problem.data.complete, blocks(problem.data), -1)
     ((losses, rms, time),) = _of_misfits(problem.misfit(path)[None], block, floor)
@@ -88,9 +111,9 @@ def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int 
 
 
 def free_run_score(problem: ShootingProblem, path: Path, numbers: float, floor: float) -> Score:
-    """The score over the samples that a fit has not used, which a free run over whole trajectories foretells.
+    """Score over the samples that a fit has not used, as a free run over whole trajectories predicts them.
 
-    The few models that are compared so have paid for their choices.
+    Choices cost nothing here: the few models that are compared in this way have already paid for their choices.
     """
     unseen = ~problem.used & problem.data.complete
     block = torch.where(unseen, torch.cumsum(unseen, 0) - 1, 0) * BLOCKS // max(1, int(unseen.sum()))
@@ -99,30 +122,30 @@ def free_run_score(problem: ShootingProblem, path: Path, numbers: float, floor: 
 
 
 def _of_misfits(r: Tensor, block: Tensor, floor: float) -> list[tuple[Tensor, float, float]]:
-    """Log-losses (B,), RMS and τ of each of C sets of residuals (C, N, n) over the balance, alike below `floor`.
+    """Log-losses (B,), RMS and τ of each of C sets of residuals r (C, N, n) over the balance.
 
-    Of samples in blocks (N,); those in block −1 are in none.
+    `block` (N,) is the block of each sample; samples in block −1 do not count. |r| below `floor` counts as `floor`.
     """
     inside = block >= 0
     r, block = r[:, inside], block[inside]
     scale = _scale(r).clamp_min(floor)
     x = r.abs().clamp_min(floor) / scale
     loss = scale.log() + (FREEDOM + 1) / 2 * torch.log1p(x.square() / FREEDOM)
-    loss = loss.nan_to_num(nan=WORST, posinf=WORST).sum(2)
+    loss = loss.nan_to_num(nan=LOSS_IF_NOT_FINITE, posinf=LOSS_IF_NOT_FINITE).sum(2)
     losses = torch.zeros(len(r), int(block.max()) + 1, dtype=r.dtype, device=r.device).index_add_(1, block, loss)
     rms, time = r.square().mean((1, 2)).sqrt().tolist(), correlation_time(r / scale).tolist()
     return list(zip(losses, rms, time, strict=True))
 
 
 def correlation_time(x: Tensor) -> Tensor:
-    """Samples in a row that tell as much as one, of residuals (C, N, n) over their scale, (C,): 1 of white ones.
+    """Correlation time τ = 1 + 2 Σ ρ_k in samples, (C,), of residuals x (C, N, n) over their scale; 1 if white.
 
-    τ = 1 + 2 Σ ρ_k, ρ_k being the autocorrelation at lag k of what a residual pulls with, the slope of its loss by
-    Student's t. Lags are added up in pairs as long as the pairs are positive (Geyer 1992).
+    ρ_k is the autocorrelation at lag k of the influence of a residual, the slope of its loss under Student's t. Lags
+    are added in pairs until the first pair that is not positive (Geyer 1992).
     """
-    pull = (x / (FREEDOM + x.square())).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    influence = (x / (FREEDOM + x.square())).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     N = x.shape[1]
-    power = torch.fft.rfft(pull, 2 * N, dim=1).abs().square().sum(2)
+    power = torch.fft.rfft(influence, 2 * N, dim=1).abs().square().sum(2)
     covariance = torch.fft.irfft(power, 2 * N)[:, : N // 2 * 2]
     rho = covariance / covariance[:, :1].clamp_min(torch.finfo(x.dtype).tiny)
     pairs = rho.unflatten(1, (-1, 2)).sum(2)
@@ -131,17 +154,17 @@ def correlation_time(x: Tensor) -> Tensor:
 
 
 def _scale(r: Tensor) -> Tensor:
-    """Scale of Student's t at which residuals (C, N, n) of each coordinate are likeliest, (C, 1, n).
+    """Maximum-likelihood scale of Student's t, (C, 1, n), of the residuals r (C, N, n) of each coordinate.
 
-    By expectation and maximisation with an expanded parameter (Liu, Rubin & Wu 1998), which takes far fewer rounds.
+    Parameter-expanded EM (Liu, Rubin & Wu 1998), which needs far fewer iterations than EM.
     """
     squared, v = r.square(), FREEDOM
     tiny = torch.finfo(r.dtype).tiny
     s = squared.median(1, keepdim=True).values.clamp_min(tiny)
     # Σ w r² / Σ w with the weights w = 1 / (v + r²/s).
-    for _ in range(ROUNDS):
+    for _ in range(SCALE_ITERATIONS):
         before = s
         s = (r.shape[1] / (squared + v * s).reciprocal_().sum(1, keepdim=True) - v * s).clamp_min(tiny)
-        if bool(((s - before).abs() <= SETTLED * s).all()):
+        if bool(((s - before).abs() <= SCALE_RTOL * s).all()):
             break
     return s.sqrt()

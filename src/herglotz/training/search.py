@@ -1,12 +1,12 @@
-"""One search over offers, from both ends: up from the simplest model, and down from the whole dictionary.
+"""The search over offers, from both ends: up from the simplest model, and down from the whole dictionary.
 
-A model is a set of offers (`offers`), fitted by multiple shooting over segments that grow while it follows the data.
-Its linear motion says which offers are worth a fit (`moves`); the fit is compared by the one inequality of `score`.
+A model is a set of offers (`offers`). Each model is fitted by multiple shooting, over segments that grow while the
+model follows the data. The linearised motion of a fit predicts which offers are worth a fit (`moves`), and fits are
+compared by the inequality of `score`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -24,51 +24,58 @@ from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.acting_inputs import asked_terms, columns_of
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.friction_search import with_sticking, without_injecting_friction
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
-from herglotz.training.named_terms import DRY, NamedTerms, candidates, special, started
-from herglotz.training.offers import standing
+from herglotz.training.named_terms import NamedTerms, candidates, special, started
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import clear, differing_zeros
 from herglotz.training.strengths import likeliest, needed
-from herglotz.training.task import LEAST_GRIP, build_model
-from herglotz.training.trials import ALIKE, ASTRAY, FINER, ITERATIONS, Fitter, Trial, Variant, is_precise, moved
+from herglotz.training.task import build_model
+from herglotz.training.trials import ALIKE, FINER, ITERATIONS, MAX_MISFIT, Fitter, Trial, is_precise, moved
+from herglotz.training.variants import Variant
 
-PART = 2000  # samples that a search is made of, where there are more than twice as many
-FEW = 5  # iterations of a trial's fit, in the place of `ITERATIONS`, on more samples than a search is made of
-TRIED = 3  # changes of a kind whose fits are compared, of those that the linear motion puts first
-EXCESS = "friction.breakaway"  # of breakaway, Stribeck's
-FINEST, STEPS = 16, 40_000  # model steps in a recorded one, and in all trajectories
+# Samples of the part that is searched, if there are more than twice as many.
+SAMPLES_OF_A_PART = 2000
+# Iterations of a trial's fit to all samples if a part is searched, in the place of `ITERATIONS`.
+ITERATIONS_ON_ALL = 5
+# Changes of one kind that are fitted, the most promising first.
+FITS_OF_A_KIND = 3
+# Largest number of model steps in a recorded step, and in all trajectories.
+MAX_SUBSTEPS, MAX_STEPS = 16, 40_000
 
-# A search, its model, and the zeros (B, n) that have been taken off its readings, with their deviations.
+# A search of readings less the zeros of their sensors, its model, and the zeros (B, n) with standard deviations.
 Zeroed = tuple["Search", Trial | None, tuple[Tensor, Tensor] | None]
 
 
 class Search:
-    """See the head of this module. A step of its data is `longer` times one of the data that are to be fitted."""
+    """A search over recordings; `part` is the search of a part of long recordings, otherwise the search itself.
+
+    A step of these data is `step_ratio` steps of the data to be fitted. Functions have the range of `range_data`.
+    """
 
     def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False):
-        # Functions are made for what `over` holds: of a part of long recordings all of them.
-        self.data, self.base, self.config, self.over = data, base, config, data
+        self.data, self.base, self.config, self.range_data = data, base, config, data
         self.freedom = FREEDOM if outliers else None
         self.order = 4 if is_precise(data) and data.dof == 1 else 2
         self.fitters: dict[Variant, Fitter] = {}
-        self.finest = max(1, min(FINEST, STEPS // data.samples))
-        self.tried, self.most, self.part, self.longer = TRIED, ITERATIONS, self, 1.0
-        if (few := part_of(data, PART)) is not data:
-            self.part, self.tried, self.most, m = self.of(few), 1, FEW, few.typical_step / data.typical_step
-            self.part.longer, self.part.base = m, base.stepped(m)
+        self.max_substeps = max(1, min(MAX_SUBSTEPS, MAX_STEPS // data.samples))
+        self.fits, self.iterations, self.part, self.step_ratio = FITS_OF_A_KIND, ITERATIONS, self, 1.0
+        if (few := part_of(data, SAMPLES_OF_A_PART)) is not data:
+            self.part, self.fits, self.iterations = self.of(few), 1, ITERATIONS_ON_ALL
+            ratio = few.typical_step / data.typical_step
+            self.part.step_ratio, self.part.base = ratio, base.stepped(ratio)
 
     def of(self, data: Trajectories) -> Search:
-        """The same of other data."""
+        """The same search of other data."""
         other = Search(data, self.base, self.config, outliers=self.freedom is not None)
-        other.order, other.over = self.order, self.over
+        other.order, other.range_data = self.order, self.range_data
         return other
 
     def fitter(self, variant: Variant) -> Fitter:
-        """Of one variant."""
+        """The fitter of a variant, made once."""
         if variant not in self.fitters:
             like = next(iter(self.fitters.values()), None)
             self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom, like)
@@ -76,9 +83,9 @@ class Search:
 
     @cached_property
     def first(self) -> Trial | None:
-        """What the simplest model grows into, the better one of where offers join on the way and where none do.
+        """The better of two models grown from the simplest: offers join over short segments, or over the longest only.
 
-        Where inputs follow from the state, terms that join over short segments make up for one another.
+        If inputs are feedback of the state, offers that join over short segments make up for one another.
         """
         part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
@@ -89,13 +96,13 @@ class Search:
 
     @cached_property
     def full(self) -> Trial | None:
-        """The model of the whole dictionary over the longest segments that it follows."""
+        """The model of the whole dictionary over the longest segments that the model follows."""
         fitter = self.fitter(Variant(self.order))
         return self.grown(fitter, [offer.name for offer in fitter.offers])
 
     @inside()
     def run(self) -> Trial | None:
-        """The model that held-out time asks for; None where not even the shortest segments can be followed."""
+        """The best model by the score; None if no model follows even the shortest segments."""
         best = self.first
         part(MORE_TERMS)
         ends = [best]
@@ -114,18 +121,19 @@ class Search:
         best = self.better(best, ends[-1])
         if best is not None and best is not ends[-1]:
             ends.append(best := self.settled(best, swapped=True))
-        return self.stuck(best and self.braking(self.finalist(best, ends)))
+        found = best and without_injecting_friction(self, self.finalist(best, ends))
+        return found and with_sticking(self, found)
 
     def of_part(self, found: Trial | None, differ: bool) -> Zeroed:
-        """A model that was found in `part`, fitted to all data, with what more these ask for.
+        """The model found in `part`, fitted to all data and settled there.
 
-        `differ`: recordings of the part were found to have zeros of sensors of their own.
+        `differ`: zeros of sensors that differ between recordings were found in the part, and are fitted again.
         """
-        read, best, zeros = self.with_zeros(found and self.again(found), sure=differ)
+        read, best, zeros = self.with_zeros(found and self.again(found), accepted=differ)
         return read, best and read.settled(best), zeros
 
     def again(self, found: Trial) -> Trial | None:
-        """The model of a trial fitted to these data, from its values; None where it does not follow them."""
+        """The model of a trial fitted to these data from the values of the trial; None if no path is found."""
         if found.fitter.data is self.data:
             return found
         fitter = self.fitter(found.fitter.variant.crossing(self.data.typical_step / found.fitter.data.typical_step))
@@ -138,10 +146,10 @@ class Search:
         return other and self.finer(fitter.leap(other))
 
     def finalist(self, best: Trial, ends: Sequence[Trial | None]) -> Trial:
-        """Of the ends of the search and the simplest model the one that free runs over held-out time ask for.
+        """The best of `best`, the ends of the search and the simplest model by free runs over held-out time.
 
-        Blocks in between are foretold from both sides; where a force is missing, as residuals above the noise show,
-        terms that make up for it there may not carry on.
+        Unless `best` is at the noise: a force is then missing. Terms may make up for the force within blocks, which
+        samples on both sides determine, and yet fail in a free run.
         """
         if best.at_the_noise or not best.whole:
             return best
@@ -149,18 +157,18 @@ class Search:
         simple = fitter.fit(fitter.simple, best.values, best.length, best, 2 * ITERATIONS)
         every = (end for end in (simple, *ends) if end is not None and end.length == best.length)
         others = {(end.fitter.variant, end.taken): end for end in every}
-        scored = [(end, end.fitter.foretold(end)) for end in others.values()]
+        scored = [(end, end.fitter.free_run_score(end)) for end in others.values()]
         scored = sorted(((end, x) for end, x in scored if x is not None), key=lambda pair: pair[1].numbers)
-        winner, least, offered = best, None, max(end.fitter.offered for end in others.values())
+        winner, lowest, offered = best, None, max(end.fitter.offered for end in others.values())
         for end, found in scored:
-            if least is None or found.replaces(least, offered):
-                winner, least = end, found
+            if lowest is None or found.replaces(lowest, offered):
+                winner, lowest = end, found
         return winner
 
     def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
-        """Offers and values that one linear problem of smoothed accelerations gives; None where it gives none.
+        """Offers, and values of all numbers, from one linear fit of smoothed accelerations; None if the fit fails.
 
-        Its terms are those that do not stand for one another in noise.
+        Terms that are nearly collinear with others are left out (`special`, `spherical`).
         """
         local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
         every = every.only(set(every.names).difference(special(self.data), spherical(self.data.angles)))
@@ -174,61 +182,66 @@ class Search:
         return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
 
     def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float], joining=True) -> Trial | None:
-        """From the shortest segments on, offers joining at every length, over which motion is ever less linear."""
+        """A model fitted from the shortest segments on; with `joining`, offers join at every length, then settled.
+
+        The shorter the segments, the more linear is the motion, and the better are joining offers predicted.
+        """
         trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
         while trial is not None:
             trial = self.finer(trial)
             while joining and not trial.whole and (more := self.moved(trial)) is not None:
                 trial = self.finer(more)
             if (longer := trial.fitter.longer(trial)) is None:
-                return self.settled(needed(likeliest(trial, 2 * self.most), 2 * self.most))
+                return self.settled(needed(likeliest(trial, 2 * self.iterations), 2 * self.iterations))
             trial = longer
         return None
 
     def grown(self, fitter: Fitter, taken: Iterable[str]) -> Trial | None:
-        """A model as it is over the longest segments that it follows."""
+        """A model with these offers, over the longest segments that the model follows."""
         trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
         return trial and self.finer(fitter.grow(self.finer(trial)))
 
     def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
-        """The better one of two models."""
+        """The better of two models by the score."""
         if up is None or down is None:
             return up or down
         rich, simple = (up, down) if up.problem.P > down.problem.P else (down, up)
         return rich if rich.replaces(simple) else simple
 
     def settled(self, trial: Trial, *, swapped: bool = False) -> Trial:
-        """With offers that join and leave, and take the place of others, until none does."""
+        """The model after offers have joined, left and, if `swapped`, been exchanged, until no change is better."""
         seen = {trial.taken}
         while (other := self.moved(trial, seen, whole=True, swapped=swapped)) is not None:
             seen.add(other.taken)
-            trial = self.finer(other.fitter.grow(likeliest(other, 2 * self.most)))
+            trial = self.finer(other.fitter.grow(likeliest(other, 2 * self.iterations)))
         return trial
 
     def moved(
         self, trial: Trial, seen: Collection[frozenset[str]] = (), *, whole: bool = False, swapped: bool = False
     ) -> Trial | None:
-        """With the offers that its linear motion asks for; None where no fit of these is better.
+        """The first better model of the changes that `Moves` predicts; None if no fit of a change is better.
 
-        One offer joins, but no dry friction that pushes; in `whole` models many leave, and one is `swapped`.
+        One offer joins; if `whole`, many may leave; if `swapped`, one is exchanged. No change brings dry friction that
+        injects energy.
         """
         moves, at = Moves(trial), trial.taken
         kinds = [moves.joining, *([moves.leaving] if whole else []), *([moves.exchanges] if swapped else [])]
-        for taken in (taken for kind in kinds for taken in kind(at)[: self.tried]):
+        for taken in (taken for kind in kinds for taken in kind(at)[: self.fits]):
             if taken in seen:
                 continue
             values, states = moves.start(taken)
-            other = trial.fitter.fit(taken, values, trial.length, trial, 2 * self.most, states)
-            astray = other is not None and other.rms > max(trial.rms, ASTRAY * trial.fitter.spread)
-            if other is None or astray or not set(other.pushing) <= set(trial.pushing):
+            other = trial.fitter.fit(taken, values, trial.length, trial, 2 * self.iterations, states)
+            if other is None or other.rms > max(trial.rms, MAX_MISFIT * trial.fitter.spread):
+                continue
+            if not set(other.injecting_friction) <= set(trial.injecting_friction):
                 continue
             if self.better(trial, other) is other:
                 return other
         return None
 
     def finer(self, trial: Trial) -> Trial:
-        """With halved steps while that changes the motion by a good part of the misfit."""
-        while trial.fitter.variant.substeps < self.finest:
+        """The model with model steps halved while that changes the motion by more than `FINER` of the misfit."""
+        while trial.fitter.variant.substeps < self.max_substeps:
             fitter = trial.fitter
             other = self.fitter(replace(fitter.variant, substeps=2 * fitter.variant.substeps))
             problem = other.problem(trial.length).of(other.numbers(trial.taken), trial.problem.sigma)
@@ -241,24 +254,26 @@ class Search:
         return trial
 
     def better_on_a_line(self, trial: Trial | None) -> bool:
-        """Whether angles that are taken for positions on a line, as of a free spring, give a better model."""
+        """True if a model is better with every angle taken for a position on a line, as of a coil spring."""
         if not any(self.data.angles) or self.config.translations or (trial is not None and trial.at_the_noise):
             return False
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
         line = Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
+        # A search on the line is worth its time only if the angles fail or its first model is no worse.
         if trial is not None and trial.whole and (line.first is None or trial.replaces(line.first)):
-            return False  # the motion is followed as it is, and no worse model is worth a search
+            return False
         other = line.run()
         if other is None or trial is None or not other.replaces(trial):
             return other is not None and trial is None
-        ahead, its = other.fitter.foretold(other), trial.fitter.foretold(trial)
+        ahead, its = other.fitter.free_run_score(other), trial.fitter.free_run_score(trial)
         return ahead is not None and (its is None or ahead.replaces(its, trial.fitter.offered))
 
     def zeros(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
-        """Zeros of sensors (B, n), fitted together with the numbers and states of a model, and their deviations.
+        """Zeros of the sensors (B, n), fitted with the numbers and states of a model, and standard deviations.
 
-        None where the model is at the noise, unless the settings ask for zeros, or where the fit leads nowhere.
+        None if there is one recording, the fit fails, the settings exclude zeros or, unless they ask for zeros, the
+        model is at the noise.
         """
         wanted = self.config.find_zeros
         if len(self.data) == 1 or not (wanted or (wanted is None and not trial.at_the_noise)):
@@ -267,22 +282,22 @@ class Search:
         problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
         return differing_zeros(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
 
-    def with_zeros(self, best: Trial | None, sure: bool = False) -> Zeroed:
-        """The search of the sensors' readings less their zeros, and the model in it, where the score asks for them.
+    def with_zeros(self, best: Trial | None, accepted: bool = False) -> Zeroed:
+        """The search of the readings less the zeros, and the model there, if the score is better with zeros.
 
-        `sure`: a part of these recordings has been found to have them, and the score is not asked.
+        `accepted`: a part of these recordings has been found to have zeros, and the score does not decide again.
         """
         differ = best and self.zeros(best)
-        if best is None or differ is None or not (sure or bool(clear(*differ).any())):
+        if best is None or differ is None or not (accepted or bool(clear(*differ).any())):
             return self, best, None
         read = self.of(measured(self.data, differ[0].flatten().tolist()))
         other, more = read.again(best), (len(self.data) - 1) * self.data.dof
-        if other is None or not (sure or other.fits_better(best, more)):
+        if other is None or not (accepted or other.fits_better(best, more)):
             return self, best, None
         return read, other, differ
 
     def zeros_again(self, read: Search, best: Trial, differ: tuple[Tensor, Tensor]) -> Zeroed:
-        """The same with the zeros that this model asks for, which has been found with those of another one."""
+        """The zeros fitted again with the model `best`, which was found in `read` with the zeros of another model."""
         if (more := read.zeros(best)) is not None:
             zeros = differ[0] + more[0]
             other = self.of(measured(self.data, zeros.flatten().tolist()))
@@ -290,17 +305,20 @@ class Search:
                 return other, found, (zeros, more[1])
         return read, best, differ
 
-    def held(self, trial: Trial, holds: Sequence[str], *, alike: bool = False) -> str:
-        """The hold that the same model asks for; "" for none. `alike`: by the residuals of the fits themselves."""
+    def better_hold(self, trial: Trial, holds: Sequence[str], *, by_residuals: bool = False) -> str:
+        """The hold with which the same model is better than with that of the data, or "".
+
+        By the score of held-out blocks or, if `by_residuals`, of the fits themselves (`fitted_score`).
+        """
         best, found = trial, ""
         for hold in [] if trial.at_the_noise else [hold for hold in holds if hold != self.data.hold]:
             other = self.of(replace(self.data, hold=hold)).again(trial)
-            if other is not None and (other.fits_better(best) if alike else other.replaces(best)):
+            if other is not None and (other.fits_better(best) if by_residuals else other.replaces(best)):
                 best, found = other, hold
         return found
 
     def driven_by(self, terms: Sequence[str]) -> Search:
-        """The same of data whose inputs act by these terms as well: columns of u, and forces of the position."""
+        """The search of data whose inputs also act by these terms: columns of u, and forces of the position."""
         forces = input_forces(terms)
         data = with_input_terms(self.data, columns_of(terms))
         base = estimate_baseline(data, outliers=self.freedom is not None)
@@ -309,42 +327,5 @@ class Search:
         return other
 
     def input_terms(self, trial: Trial) -> tuple[str, ...]:
-        """The terms of the inputs that a model with all of them among its offers has taken, if it is better."""
+        """The terms of the inputs that a model takes if all are offered (`asked_terms`); () if that is no better."""
         return asked_terms(self, trial) if self.config.find_input_terms and not trial.at_the_noise else ()
-
-    def braking(self, trial: Trial) -> Trial:
-        """With a load in the place of dry friction that pushes, which would create energy, or with neither.
-
-        What made up for it leaves then, and what it stood for joins.
-        """
-        braked = self._braked(trial)
-        return trial if braked is trial else self._braked(self.settled(braked, swapped=True))
-
-    @staticmethod
-    def _braked(trial: Trial) -> Trial:
-        """The same before other offers leave and join."""
-        while pushing := trial.pushing:
-            every = {offer.name for offer in (*trial.fitter.offers, *trial.fitter.loads)}
-            loads = every & {f"load {i + 1}" for i in pushing.values()}
-            taken = standing(trial.fitter.offers, trial.taken - set(pushing)) | loads
-            other = trial.fitter.fit(taken, trial.values, trial.length, trial, 2 * ITERATIONS)
-            if other is None:
-                break
-            trial = other
-        return trial
-
-    def stuck(self, trial: Trial | None) -> Trial | None:
-        """With friction that can hold a joint still, where that is as likely."""
-        dry = trial is not None and any(name.startswith(DRY) for name in trial.taken)
-        if trial is None or not dry or self.config.sticking is False:
-            return trial
-        fitter = self.fitter(replace(trial.fitter.variant, sticking=True))
-        least = LEAST_GRIP * max(self.base.speed)  # at 0 and below friction is none, and has no slope
-        grip = {DRY: least, EXCESS: least / 100}
-        values = {
-            name: max(x, grip.get(name.split("[")[0], -math.inf)) if x != 0 else x for name, x in trial.values.items()
-        }
-        held = fitter.fit(trial.taken, values, trial.length, trial, 2 * ITERATIONS)
-        if held is None or trial.replaces(held):
-            return trial
-        return self.settled(self.finer(held))

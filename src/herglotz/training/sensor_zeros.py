@@ -1,10 +1,11 @@
-"""Sensors whose zeros differ from recording to recording: y = q + z. The recording of most samples is the reference.
+"""Zeros of sensors that differ between recordings, y = q + z, or drift, y = q + d t.
 
-A model cannot follow such recordings together, though each of them alone. Parameters, states and zeros are fitted
-together from 0 (`problems.zeros`), and are taken where the fit with them is worth so many numbers more
-(`score.fitted_score`). A model that is held says what a new recording reads at 0 (`zeros_of_one`).
+A model can follow each of several recordings alone, but not all together, if the zeros z of their sensors differ. The
+recording with the most samples is the reference, with z = 0. The zeros of the others are fitted with the parameters
+and states, starting from 0 (`problems.zeros`), and are kept if the fit is better for its number of parameters
+(`score.fitted_score`). With frozen parameters, `zeros_of_one` fits the zeros of a new recording.
 
-Zeros that drift, y = q + d t, are fitted with the whole dictionary in the same way, one rate d a coordinate (`drifts`).
+Drifts are fitted in the same way with the whole dictionary, one rate d for each coordinate (`drifts`).
 """
 
 from __future__ import annotations
@@ -27,38 +28,41 @@ from herglotz.training.problems.zeros import WithZeros, reference_of
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.trajectory_fit import STAGE
 
-ROUNDS = 5  # of fitting a drift
-CLEARLY = 5.0  # standard deviations by which a zero differs from 0
-THINNED = (1, 2, 4, 8)  # parts of a recording that tell its zeros: all, or every m-th where some cannot be followed
+# Fits of a drift, one after the other.
+DRIFT_FITS = 5
+# Least size of a significant zero, in standard deviations.
+SIGNIFICANT = 5.0
+# Strides in the parts of a recording whose zeros are fitted: all parts, or every m-th if some cannot be followed.
+STRIDES = (1, 2, 4, 8)
 
 
 class FoundZeros(NamedTuple):
-    """Zeros of the sensors, their standard deviations, and the misfit with them."""
+    """Zeros of the sensors as fitted, their standard deviations, and the RMS misfit over the balance."""
 
-    z: Tensor  # as many as there are unknowns
-    deviations: Tensor  # as z
+    z: Tensor  # (count,)
+    deviations: Tensor  # (count,)
     rms: float
 
 
 def clear(z: Tensor, deviations: Tensor) -> Tensor:
-    """Which zeros are clearly there."""
-    return z.abs() > CLEARLY * deviations
+    """True for zeros that differ significantly from 0, of the shape of z."""
+    return z.abs() > SIGNIFICANT * deviations
 
 
 def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...]:
-    """The zeros (n,) of the sensors of one recording, of which these are parts, by a model that is held.
+    """The zeros (n,) of the sensors of one recording, whose parts are `data`, with the parameters of the model frozen.
 
-    By multiple shooting, with the states where the parts start; 0 for zeros that are not clearly there. Where the model
-    cannot follow some part, every second one is taken, or fewer; zeros are 0 where it follows none of these either.
+    Multiple shooting over the zeros and the start states of the parts. A zero that is not significant is 0. If the
+    model cannot follow some part, every second part is fitted, or fewer (`STRIDES`); if none can be followed, all
+    zeros are 0.
     """
-    found = (
-        _of_parts(model, data.select(range(0, len(data), by)), sigma, max_step) for by in THINNED if by <= len(data)
-    )
+    strides = (stride for stride in STRIDES if stride <= len(data))
+    found = (_of_parts(model, data.select(range(0, len(data), stride)), sigma, max_step) for stride in strides)
     return next((zeros for zeros in found if zeros is not None), (0.0,) * data.dof)
 
 
 def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...] | None:
-    """By all of these parts; None where the model cannot follow one."""
+    """The zeros (n,) from all of these parts; None if the model cannot follow some part."""
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
     target = WithZeros(problem, torch.arange(problem.P), shared=True)
     found = _fitted(target, problem.parameters.get(), data)
@@ -66,14 +70,14 @@ def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_st
 
 
 def _fitted(target: WithZeros, theta: Tensor, begin: Trajectories) -> FoundZeros | None:
-    """The zeros as a vector, from 0 with these parameters, and states read off `begin`; None where nothing follows."""
+    """The zeros, fitted from 0 with these parameters and with start states from `begin`; None if the fit fails."""
     problem = target.problem
     problem.guess_from_states(states_of_pairs(problem.parameters.model, begin))
     return fitted(target, problem.pack(theta, first_states(problem, theta, begin)))
 
 
 def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
-    """The zeros as a vector, from 0 where all other unknowns are x; None where nothing follows."""
+    """The zeros, fitted from 0 with all other unknowns starting at x; None if the fit fails."""
     problem, x = target.problem, torch.cat([x, x.new_zeros(target.count)])
     result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
     if not math.isfinite(result.cost):
@@ -87,9 +91,9 @@ def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
 
 
 def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Zeros (B, n) that recordings have beside the reference, and deviations, where the fit of a problem ends at x.
+    """Zeros (B, n) of B recordings, 0 for the reference, and their standard deviations; None if the fit fails.
 
-    None where zeros lead nowhere.
+    x are the unknowns of the fitted problem without zeros.
     """
     found = fitted(WithZeros(problem), x)
     if found is None:
@@ -101,10 +105,11 @@ def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor
 
 
 def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
-    """Rates (n,) at which the zeros of the sensors drift, in units of q per time, and their deviations.
+    """Drift rates (n,) of the zeros of the sensors, in units of q per time, and their standard deviations.
 
-    `search` is a `herglotz.training.search.Search`. None where the model of the whole dictionary, which lacks no term
-    that a drift could stand for, is at the noise without it, or not with it.
+    `search` is a `herglotz.training.search.Search`. The model of the whole dictionary decides, because it lacks no
+    term for which a drift could make up. None if the model is at the noise without drifts, or not at the noise with
+    drifts.
     """
     if search.config.find_zeros is False:
         return None
@@ -112,7 +117,8 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
     if without is None or not without.whole or without.at_the_noise:
         return None
     trial, rates, deviations = without, t.new_zeros(search.data.dof), t.new_zeros(search.data.dof)
-    for _ in range(ROUNDS):  # terms that stood for a drift leave it step by step
+    # Each fit moves only a part of a drift out of the terms that made up for it.
+    for _ in range(DRIFT_FITS):
         problem = trial.problem.of(trial.problem.parameters.numbers, trial.problem.sigma, trial.prior)
         target = WithZeros(problem, shared=True, grow=t / t.max())
         found = fitted(target, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
@@ -127,12 +133,12 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
 
 
 def in_words(z: Tensor, deviations: Tensor, reference: int) -> str:
-    """Zeros with what they are known to."""
+    """The zeros and their standard deviations, as a note for the report."""
     return f"zeros that differ from those of recording {reference}: {sure(z, deviations)}"
 
 
 def sure(z: Tensor, deviations: Tensor) -> str:
-    """Numbers that were fitted with their deviations."""
+    """Fitted values as text, x ± deviation; values with a deviation of 0 were not fitted and are left out."""
     each = zip(z.flatten().tolist(), deviations.flatten().tolist(), strict=True)
     return ", ".join(f"{x:.4g} ± {d:.2g}" for x, d in each if d)
 

@@ -1,4 +1,4 @@
-"""Named stages of a fit: progress bars, history, and a checkpoint from which an interrupted fit goes on."""
+"""Named stages of a fit: progress, history, and a checkpoint from which an interrupted fit continues."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ from herglotz.telling import tell
 from herglotz.training.distributed import is_first
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, remind
 
-FORMAT = 2  # 2 holds all that a search goes on from
+# Format of the checkpoint. Format 2 has the whole state of an optimiser; format 1, which had less, is refused.
+FORMAT = 2
 REMEDY = "delete it and fit from the start"
 Progress = bool | Literal["lines", "iterations"] | None
-EVERY = 25  # iterations between two checkpoints inside a stage
+# Iterations between two checkpoints inside a stage.
+ITERATIONS_PER_CHECKPOINT = 25
 
 
 class _Stored(TypedDict):
-    """What a checkpoint holds."""
+    """The contents of a checkpoint."""
 
     format: Literal[2]
     key: str
@@ -39,14 +41,30 @@ class _Stored(TypedDict):
 
 @dataclass
 class Callback:
-    """What a stage's optimiser reports to; it shows progress and stores the search."""
+    """The callback of an optimiser: shows progress and stores the state of the optimiser in the checkpoint.
+
+    Parameters
+    ----------
+    bar
+        The progress bar.
+    store
+        Writes the state of the optimiser to the checkpoint.
+    resumed
+        The state to continue from, or None.
+    named
+        First words of a line on stderr after each iteration; no lines if empty.
+    log
+        Called with each iteration and its cost.
+    start
+        The first cost.
+    """
 
     bar: Any
     store: Callable[[dict[str, Any]], None]
     resumed: dict[str, Any] | None
-    named: str = ""  # begins a line on stderr for every iteration; "": no lines
-    log: Callable[[int, float], None] | None = None  # is told every iteration and its cost
-    start: float | None = None  # the first cost
+    named: str = ""
+    log: Callable[[int, float], None] | None = None
+    start: float | None = None
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
         """See `levenberg_marquardt.Progress`."""
@@ -58,25 +76,44 @@ class Callback:
             tell(f"{self.named}, iteration {iteration}: {share}")
         if self.log is not None:
             self.log(iteration, cost)
-        if iteration % EVERY == 0:
+        if iteration % ITERATIONS_PER_CHECKPOINT == 0:
             self.store(search())
 
 
 class Stages:
     """Run optimisations one after the other, and record them.
 
-    A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
-    and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives the same
-    bits as one that was not interrupted. One bar over all stages and searches shows their progress.
+    A fit is deterministic, so a resumed fit repeats the fit with the results that the checkpoint has: a finished stage
+    is not run again, and an unfinished stage continues from the stored state of its optimiser and problem. A resumed
+    fit gives the same bits as a fit without interruption.
+
+    Parameters
+    ----------
+    progress
+        True: one bar over all stages and searches. None: a bar on a terminal only. "lines": a line on stderr after
+        each stage. "iterations": also after each iteration.
+    checkpoint
+        File to write.
+    key
+        Identifies data and settings; the checkpoint of another fit is refused.
+    resume
+        Read the checkpoint if it exists.
+    log
+        TensorBoard's writer, which gets the cost of each iteration.
+
+    Raises
+    ------
+    InputError
+        If the checkpoint belongs to another fit or cannot be read.
     """
 
     def __init__(
         self,
-        progress: Progress = False,  # None: on a terminal only; "lines", "iterations": a line on stderr after each
-        checkpoint: Path | None = None,  # file to write
-        key: str = "",  # identifies data and settings; a checkpoint of another fit is refused
-        resume: bool = False,  # read the checkpoint if there is one
-        log: Any = None,  # TensorBoard's writer, which is told the cost of every iteration as it is reached
+        progress: Progress = False,
+        checkpoint: Path | None = None,
+        key: str = "",
+        resume: bool = False,
+        log: Any = None,
     ):
         self.log = log if is_first() else None
         self.lines = progress in ("lines", "iterations") and is_first()
@@ -100,20 +137,20 @@ class Stages:
             self.done, self.kept = stored["stages"], stored["kept"]
 
     def labelled(self, label: str) -> Stages:
-        """The same record; what is kept and run from here on has names that end with this label."""
+        """A view of this record in which `keep` and `run` append the label to the names of results and stages."""
         other = copy(self)
         other.label = label
         return other
 
     def keep(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Plain values that something else than an optimisation finds; those of the checkpoint where it has them."""
+        """The result of `make`, plain values that the checkpoint stores; not computed if the checkpoint has them."""
         name += self.label
         if name not in self.kept:
-            began, told = time.monotonic(), f"search for {name}"
-            self.bar.part(FINDING, told)
+            began, title = time.monotonic(), f"search for {name}"
+            self.bar.part(FINDING, title)
             self.kept[name] = make()
             if self.lines:
-                tell(f"{told}: {time.monotonic() - began:.1f} s")
+                tell(f"{title}: {time.monotonic() - began:.1f} s")
             self._write()
         return self.kept[name]
 
@@ -125,12 +162,14 @@ class Stages:
         optimise: Callable[[Tensor, Callback], OptimiserResult],
         problem: Any = None,
     ) -> OptimiserResult:
-        """Run one stage from x (or from where the checkpoint left it) and record its history.
+        """Run one stage from x, or from the state in the checkpoint, and record its history.
 
-        `problem` is what the stage optimises, where later work goes on from what it remembers.
+        `problem` is the optimised problem; if given, its memory is restored for later work when a finished stage is
+        not run again.
         """
         name += self.label
-        while name in self.begun:  # it starts elsewhere: the result of the first is not its own
+        # A second stage of a name starts elsewhere, and must not get the stored result of the first.
+        while name in self.begun:
             name += ", again"
         self.begun.add(name)
         stored = self.done.get(name)
@@ -147,9 +186,9 @@ class Stages:
                 self._write()
 
             start, log = len(self.history), self.log
-            told = None if log is None else lambda k, cost: log.add_scalar(f"cost/{name}", cost, start + k)
+            add = None if log is None else lambda k, cost: log.add_scalar(f"cost/{name}", cost, start + k)
             began = time.monotonic()
-            result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else "", told))
+            result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else "", add))
             if self.lines:
                 count, seconds = result.iterations, time.monotonic() - began
                 took = f"{count} iteration{'' if count == 1 else 's'}, {seconds:.1f} s"
@@ -172,7 +211,8 @@ def _read(checkpoint: Path) -> dict[str, Any]:
     check_seal(content, checkpoint, REMEDY)
     try:
         stored = torch.load(BytesIO(content), weights_only=True, map_location="cpu")
-    except Exception as error:  # torch raises many kinds for a damaged file
+    # Torch raises many kinds of exceptions for a damaged file.
+    except Exception as error:
         raise InputError(f"{checkpoint}: cannot be read ({type(error).__name__}); {REMEDY}") from None
     check_entries(_Stored, stored, str(checkpoint), REMEDY)
     return stored

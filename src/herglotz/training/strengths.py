@@ -1,4 +1,4 @@
-"""How strong functions are, and which bands of their waves a model needs."""
+"""Prior variances of learned functions by evidence, and the bands of their waves that a model needs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from herglotz.training.trials import Fitter, Trial
 
 
 def likeliest(trial: Trial, most: int) -> Trial:
-    """The model with strengths of its bands that follow from its fit, as long as held-out blocks are missed by less.
+    """The model refitted with the likeliest prior variances of its bands (`Trial.likeliest_scales`).
 
-    A fit takes `most` iterations. The last one gains less than a number costs. A model without functions has no
-    strengths, and stays.
+    Each refit has at most `most` iterations. Refits end when the held-out log-loss falls by less than the price of one
+    parameter. A refit with a larger log-loss is dropped. A model without functions is returned as it is.
     """
     gain = math.inf
-    while trial.sizes and gain > trial.score.of_a_number:
+    while trial.likeliest_scales and gain > trial.score.price_of_a_number:
         other = trial.fitter.fit(trial.taken, trial.values, trial.length, trial, most)
         if other is None or not (gain := float((trial.score.losses - other.score.losses).sum())) > 0:
             break
@@ -23,11 +23,11 @@ def likeliest(trial: Trial, most: int) -> Trial:
 
 
 def needed(trial: Trial, most: int) -> Trial:
-    """The model without the bands that are not worth their price, each tried once by a fit, the weakest first.
+    """The model without the bands that are not worth their price; each removal is fitted, the weakest band first.
 
-    `Moves` foretells what leaves by linear motion alone.
+    `Moves.leaving` removes bands too, but by the linearised motion alone.
     """
-    for name in sorted(trial.sizes, key=trial.sizes.__getitem__):
+    for name in sorted(trial.likeliest_scales, key=trial.likeliest_scales.__getitem__):
         other = trial.fitter.fit(trial.taken - {name}, trial.values, trial.length, trial, most)
         if other is not None and not trial.replaces(other):
             trial = likeliest(other, most)
@@ -35,6 +35,7 @@ def needed(trial: Trial, most: int) -> Trial:
 
 
 def of_terms(trial: Trial, plain: Fitter, most: int) -> Trial | None:
-    """The model of a trial that has taken no function, fitted by the fitter of its terms alone."""
-    powers = plain.simple - trial.fitter.simple  # no offers where functions are: every model has them there
+    """A trial without functions, fitted anew by `plain`, the fitter whose offers are named terms alone."""
+    # Powers of the simplest model are no offers beside functions, because every model has the powers there.
+    powers = plain.simple - trial.fitter.simple
     return plain.fit(trial.taken | powers, plain.values_of(trial), trial.length, trial, most)

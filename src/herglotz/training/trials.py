@@ -1,6 +1,7 @@
-"""A model of a search with its fit, and the fits of subsets of a dictionary's numbers.
+"""Trials, the fitted models of a search, and the fitter that fits any subset of a dictionary's parameters.
 
-A model is a set of offers (`offers`), fitted by multiple shooting over segments that grow while it follows the data.
+A model is a set of offers (`offers`), fitted by multiple shooting over segments that grow while the model follows the
+data.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
-from herglotz.training.functions import Band, prior_spreads, terms_with
+from herglotz.training.functions import prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
 from herglotz.training.named_terms import DRY, candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import ALWAYS, offers_of, without_offers
@@ -36,162 +36,158 @@ from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import EXACT, build_model, with_sticking
 from herglotz.training.trajectory_fit import FAR_OFF, FOLLOWED, LOST, NEAR
+from herglotz.training.variants import Compared, Variant
 
-ITERATIONS = 15  # of a fit: a trial that needs more starts too far off
-SEEN = 0.75  # of every trajectory: finalists are fitted to it, and run free over the rest
-SHORT = (5, 10)  # recorded steps of the first segments: over these motion is all but linear in the forces
-ASTRAY = 0.25  # of the spread: segments that are missed by more are not followed, whatever shorter ones miss
-FINER = 0.3  # of the misfit: a rule that changes the motion by more is worth trying
-ALIKE = 10.0  # times the σ of exact data: misfits below it are all as good
-SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
-
-
-@dataclass(frozen=True)
-class Variant:
-    """What a model is beside its numbers."""
-
-    order: int
-    substeps: int = 1
-    sticking: bool = False
-    functions: tuple[Band, ...] = ()  # of the coordinates, beside named terms
-    dissipation: tuple[str, ...] = ()  # powers of s in L
-    kept: frozenset[str] = frozenset()  # offers that stay where functions could stand for them
-
-    def crossing(self, times: float) -> Variant:
-        """The same with about as long model steps, where recorded steps are so many times as long."""
-        return replace(self, substeps=max(1, round(times * self.substeps)))
-
-
-class Compared(NamedTuple):
-    """A model that was scored."""
-
-    length: int  # recorded steps of its segments
-    numbers: int
-    held_out: float  # RMS error over held-out blocks, in units of q over the balance
-    taken: frozenset[str]
+# Iterations of a fit; a trial that needs more starts too far from its optimum.
+ITERATIONS = 15
+# Share of every trajectory to which finalists are fitted; they run free over the rest.
+FITTED_SHARE = 0.75
+# Lengths of the first segments, in recorded steps: over so few the motion is almost linear in the forces.
+SHORT_SEGMENTS = (5, 10)
+# Largest misfit, as a share of the spread of the data, with which a model follows segments.
+MAX_MISFIT = 0.25
+# Halved model steps are tried if they change the motion by more than this share of the misfit.
+FINER = 0.3
+# Misfits below this many σ of exact data are rounding.
+ALIKE = 10.0
+# Noise, as a share of the spread of the data, below which a rule of order 4 is worth its time.
+ORDER_4_NOISE = 1e-3
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A model with its fit."""
+    """A fitted model: the offers it has `taken`, the `values` of all numbers of the dictionary, and the path.
+
+    `scales` are the prior variances of its functions over those of the fitter.
+    """
 
     fitter: Fitter
     taken: frozenset[str]
-    values: dict[str, float]  # of all numbers
+    values: dict[str, float]
     problem: ShootingProblem
     path: Path
-    scales: Mapping[str, float] = field(default_factory=dict)  # variances of its functions, over those of `Fitter`
+    scales: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def theta(self) -> Tensor:
-        """(P,) of the free numbers."""
+        """Values of the free parameters, (P,)."""
         return self.path.x.new_tensor([self.values[name] for name in self.problem.parameters.numbers])
 
     @cached_property
     def rms(self) -> float:
-        """Misfit of the data, in units of q over the balance."""
+        """RMS misfit of the data, in units of q over the balance; a robust scale if the loss is Student's t."""
         r = self.problem.misfit(self.path)[self.problem.data.complete]
         return scale_of(r) if self.problem.freedom else float(r.square().mean().sqrt())
 
     @property
     def names(self) -> list[str]:
-        """What it has taken, in the order of the dictionary."""
+        """Names of the offers of the model, in the order of the dictionary."""
         return [offer.name for offer in (*self.fitter.offers, *self.fitter.loads) if offer.name in self.taken]
 
     @property
-    def pushing(self) -> dict[str, int]:
-        """Dry friction that would create energy, with its coordinate."""
+    def injecting_friction(self) -> dict[str, int]:
+        """Dry friction with an amplitude of 0 or less, which would inject energy: name → coordinate."""
         several = self.fitter.data.dof > 1
         every = {DRY + (f"[{i}]" if several else ""): i for i in range(self.fitter.data.dof)}
         return {name: i for name, i in every.items() if name in self.taken and self.values[name] <= 0}
 
     @property
     def length(self) -> int:
-        """Recorded steps of its segments."""
+        """Length of the fitted segments, in recorded steps."""
         return self.problem.grid.length
 
     @property
     def whole(self) -> bool:
-        """Whether it follows whole trajectories."""
+        """True if the segments of the fit are whole trajectories."""
         return not self.problem.jointed
 
     @property
     def near(self) -> bool:
-        """Whether it follows whole trajectories so closely that its linear motion says which offers are worth a fit."""
+        """True if the linearised motion of whole trajectories is close enough to the data to predict good offers."""
         return self.whole and self.rms <= FOLLOWED * self.fitter.spread
 
     @property
     def at_the_noise(self) -> bool:
-        """Whether it follows whole trajectories as precisely as they are known."""
+        """True if the misfit of whole trajectories is about the noise of the data."""
         return self.whole and self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
 
     @cached_property
-    def _own(self) -> HeldOut:
-        """Held-out blocks of this model."""
+    def _held_out(self) -> HeldOut:
+        """The fit linearised, with held-out blocks of time."""
         waves = self.fitter.waves(self.prior, self.problem.parameters.numbers)
         return HeldOut(self.problem, self.path, self.theta, waves=waves)
 
     @cached_property
-    def _told(self) -> Tensor:
-        """How much of each number the data tell, (P,)."""
-        return self._own.told([range(self.problem.P)])[0]
+    def _determined(self) -> Tensor:
+        """Share of each parameter that the data determine, (P,); 1 without a prior."""
+        return self._held_out.told([range(self.problem.P)])[0]
 
     @cached_property
     def score(self) -> Score:
-        """Its loss over held-out blocks."""
+        """Score over held-out blocks; computing the score records the model in `Fitter.compared`."""
         count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
-        (found,) = scores(self._own, [range(self.problem.P)], choices, count, self.fitter.floor)
+        (found,) = scores(self._held_out, [range(self.problem.P)], choices, count, self.fitter.floor)
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
         return found
 
     def replaces(self, simple: Trial) -> bool:
-        """Whether this richer model replaces a simpler one."""
+        """True if this richer model replaces a simpler model."""
         return self.gain(simple) > 0
 
     def gain(self, simple: Trial, more: int = 0) -> float:
-        """By how much it does, with so many numbers beside its own; infinite where it follows longer segments."""
+        """`Score.gain` over a simpler model, with `more` further numbers; ±infinite if segments differ in length.
+
+        The model that follows longer segments is better.
+        """
         if self.length != simple.length:
             return math.inf if self.length > simple.length else -math.inf
         offered = max(self.fitter.offered, simple.fitter.offered)
         return replace(self.score, zeros=more).gain(simple.score, offered)
 
     def fits_better(self, simple: Trial, zeros: int = 0) -> bool:
-        """Whether it replaces a model that has the same offers, with so many zeros of sensors beside its numbers."""
+        """True if this model, with `zeros` of sensors as further numbers, replaces a model with the same offers.
+
+        By the residuals of both fits (`fitted_score`); the model that follows longer segments is better.
+        """
         if self.length != simple.length:
             return self.length > simple.length
-        its = fitted_score(simple.problem, simple.path, self.fitter.floor)
+        theirs = fitted_score(simple.problem, simple.path, self.fitter.floor)
         own = fitted_score(self.problem, self.path, self.fitter.floor, zeros)
-        return own.replaces(its, self.fitter.offered)
+        return own.replaces(theirs, self.fitter.offered)
 
     @property
     def prior(self) -> Gaussian:
-        """Of its numbers."""
+        """Prior of the free parameters."""
         assert isinstance(self.problem.prior, Gaussian)
         return self.problem.prior
 
     @cached_property
-    def sizes(self) -> dict[str, float]:
-        """The variance of each function, over that of its prior, at which this fit is likeliest (MacKay 1992)."""
+    def likeliest_scales(self) -> dict[str, float]:
+        """Likeliest prior variance of each function, over the variance in the fitter (evidence, MacKay 1992)."""
         numbers, found = self.problem.parameters.numbers, {}
         place = {name: i for i, name in enumerate(numbers)}
         weight = self.fitter.prior(numbers).weight
         for name, waves in self.fitter.functions.items():
             if at := [place[wave] for wave in waves if wave in place]:
-                told = float(self._told[at].sum())
-                found[name] = float((self.theta[at].square() * weight[at]).sum()) / max(told, 1.0)
+                determined = float(self._determined[at].sum())
+                found[name] = float((self.theta[at].square() * weight[at]).sum()) / max(determined, 1.0)
         return {name: size for name, size in found.items() if size > 0}
 
 
 class Fitter:
-    """Fits of subsets of a dictionary's numbers to recordings, by one variant of its model."""
+    """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
+
+    `like` is another fitter of the same data, which shares its segments and noise levels. Numbers are scalar
+    parameters, by name; `keys` has the term of each number.
+    """
 
     def __init__(
         self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None,
         like: Fitter | None = None,
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
-        every_band, terms = variant.functions, candidates(data, config.translations)
-        terms = terms_with(every_band, terms, data.angles, variant.kept) if every_band else terms
+        bands, terms = variant.functions, candidates(data, config.translations)
+        terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
@@ -202,51 +198,54 @@ class Fitter:
         every = ParameterVector(self.model)
         self.keys = dict(zip(every.numbers, keys_of(every.numbers, self.model.config), strict=True))
         self.always, every_offer, self.simple = offers_of(
-            self.model, list(self.keys.values()), every_band, len(input_terms_of(data.columns))
+            self.model, list(self.keys.values()), bands, len(input_terms_of(data.columns))
         )
         without_offers(self.model, every_offer)
-        one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]  # is dry friction already
+        # On a joint that turns one way, a load is the same force as dry friction, which is offered already.
+        one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]
         self.offers = [offer for offer in every_offer if offer.name not in one_way]
         self.loads = [offer for offer in every_offer if offer.name in one_way]
         self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
-        own, self.weights = prior_of(self.model, base, None), {}
-        place = {key: name for name, key in self.keys.items()}
-        self.functions = {own.name: [place[text] for text in own.texts] for own in every_band}  # numbers of waves
-        for i, spread in zip(own.index.tolist(), own.spread.tolist(), strict=True):
-            self.weights[every.numbers[i]] = spread**-2
-        powers = [self.keys[name] for name in self.always if every_band and not name.startswith(ALWAYS)]
-        spreads = prior_spreads(every_band, base, data.balance, powers)
-        self.centred = {place[key]: spread**-2 for key, spread in spreads.items()}
-        self.weights |= self.centred
+        self.place = {key: name for name, key in self.keys.items()}
+        # Names of the coefficients of the waves of each function.
+        self.functions = {band.name: [self.place[text] for text in band.texts] for band in bands}
+        self.weights, self.centred = self._weights(every.numbers)
         lengths = segment_lengths(data)
-        self.lengths = [*(length for length in SHORT if length < lengths[0]), *lengths]
+        self.lengths = [*(length for length in SHORT_SEGMENTS if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
-        self.grids = Grids(data) if like is None else like.grids  # the same for all variants
+        self.grids = Grids(data) if like is None else like.grids
         self.floor = ALIKE * EXACT["float64"] * max(base.scale)
         self.offered = len(every_offer)
         known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
-        self.known = self.smooth, self.precision, self.spread = known  # of the data, whatever the variant
+        self.known = self.smooth, self.precision, self.spread = known
         self.compared: list[Compared] = []
 
+    def _weights(self, numbers: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+        """Prior weights 1/variance by number: all, and those of waves and of powers that waves can imitate."""
+        prior, bands = prior_of(self.model, self.base, None), self.variant.functions
+        names = [numbers[int(i)] for i in prior.index]
+        weights = {name: spread**-2 for name, spread in zip(names, prior.spread.tolist(), strict=True)}
+        powers = [self.keys[name] for name in self.always if bands and not name.startswith(ALWAYS)]
+        spreads = prior_spreads(bands, self.base, self.data.balance, powers)
+        centred = {self.place[key]: spread**-2 for key, spread in spreads.items()}
+        return weights | centred, centred
+
     def prior(self, names: Collection[str], scales: Mapping[str, float] | None = None) -> Gaussian:
-        """Of these numbers, in the order of the model; with `scales` of the variances of functions."""
+        """Prior of these numbers, in the order of the model; `scales` multiply the variances of functions."""
         names, weights = set(names), dict(self.weights)
         for name, scale in (scales or {}).items():
             weights |= {wave: weights[wave] / scale for wave in self.functions[name]}
-        own = [name for name in self.start if name in names]
-        like = self.data.q
-        return Gaussian(
-            like.new_tensor([self.start[name] for name in own]),
-            like.new_tensor([weights.get(name, 0.0) for name in own]),
-        )
+        own, q = [name for name in self.start if name in names], self.data.q
+        mean, weight = [self.start[name] for name in own], [weights.get(name, 0.0) for name in own]
+        return Gaussian(q.new_tensor(mean), q.new_tensor(weight))
 
     def waves(self, prior: Gaussian, numbers: Sequence[str]) -> Tensor:
-        """The weights of a prior of these numbers that are waves of functions, 0 of the others, (P,)."""
+        """Weights of a prior of these numbers, (P,): those of waves of functions, 0 for other numbers."""
         waves = {name for own in self.functions.values() for name in own}
         return torch.where(torch.tensor([name in waves for name in numbers], dtype=torch.bool), prior.weight, 0.0)
 
     def problem(self, length: int) -> ShootingProblem:
-        """Of all numbers."""
+        """The shooting problem over all numbers with segments of this length, made once."""
         if length not in self.problems:
             grid, u = self.grids.of(length, self.base.model_step)
             own = {"sigma": min(max(self.precision, self.floor), self.spread), "freedom": self.freedom}
@@ -254,13 +253,12 @@ class Fitter:
         return self.problems[length]
 
     def numbers(self, taken: Iterable[str]) -> list[str]:
-        """Of a model with these offers."""
-        taken = set(taken)
-        every = (*self.offers, *self.loads)
-        return [*self.always, *(name for offer in every if offer.name in taken for name in offer.numbers)]
+        """Names of the numbers of a model with these offers."""
+        taken, offers = set(taken), (*self.offers, *self.loads)
+        return [*self.always, *(name for offer in offers if offer.name in taken for name in offer.numbers)]
 
     def values_of(self, trial: Trial) -> dict[str, float]:
-        """The values of a trial by the names that its numbers have here, where other terms stand beside them."""
+        """The values of a trial of another fitter, by the names of the same numbers here."""
         value = {trial.fitter.keys[name]: x for name, x in trial.values.items()}
         return {name: value[key] for name, key in self.keys.items() if key in value}
 
@@ -268,26 +266,28 @@ class Fitter:
         self, taken: Iterable[str], values: dict[str, float], length: int, before: Trial | None, most: int = ITERATIONS,
         states: Tensor | None = None,
     ) -> Trial | None:  # fmt: skip
-        """From these values and states, or those of a fit before or of smoothed samples; None: no path is found."""
+        """A trial with the offers `taken` over segments of this length; None if no path is found.
+
+        The fit begins with `values`, and with `states` (S, d) or, if None, those of the trial `before` or, without
+        one, of smoothed samples. `before` also gives σ and the prior variances of functions.
+        """
         taken, every = frozenset(taken), self.problem(length)
         names = self.numbers(taken)
         sigma = every.sigma if before is None else max(before.rms, self.floor)
-        scales = {} if before is None else before.sizes
+        scales = {} if before is None else before.likeliest_scales
         problem = every.of(names, sigma, self.prior(names, scales))
         names = problem.parameters.numbers
         theta = self.data.q.new_tensor([values.get(name, self.start[name]) for name in names])
         if before is None:
             states = first_states(problem, theta, self.smooth)
-            if problem.compiled is None:
+        elif states is None:
+            states = before.problem.states_at(before.path, problem.grid.start_sample, problem.d)
+        if problem.compiled is None:
+            if before is None:
                 problem.guess_from_states(states_of_pairs(self.model, self.smooth))
-        else:
-            if states is None:
-                states = before.problem.states_at(before.path, problem.grid.start_sample, problem.d)
-            if problem.compiled is None:
+            else:
                 problem.guess_from(before.problem, before.path)
-        x = problem.pack(theta, states)
-        near = before is not None and before.length == length
-        damping = NEAR if near else FAR_OFF
+        x, damping = problem.pack(theta, states), NEAR if before is not None and before.length == length else FAR_OFF
         result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
         path = problem.solve(result.x) if math.isfinite(result.cost) else None
         if path is None:
@@ -295,11 +295,11 @@ class Fitter:
         found = dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
         return Trial(self, taken, self.start | found, problem, path, scales)
 
-    def foretold(self, trial: Trial) -> Score | None:
-        """The score of a free run over the last quarter of every trajectory, which is not fitted; None: no path."""
+    def free_run_score(self, trial: Trial) -> Score | None:
+        """The score of a free run over the last quarter of every trajectory, after a fit to the rest; None: no path."""
         names = trial.problem.parameters.numbers
         problem = self.problem(trial.length).of(names, max(trial.rms, self.floor), trial.prior)
-        part = torch.cat([torch.arange(length) < round(SEEN * length) for length in self.data.lengths])
+        part = torch.cat([torch.arange(length) < round(FITTED_SHARE * length) for length in self.data.lengths])
         problem.used, problem.path = part.to(self.data.t.device), trial.path
         problem._weigh()
         x = problem.pack(trial.theta, trial.path.x[:, 0, : problem.d])
@@ -308,39 +308,39 @@ class Fitter:
         return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
-        """Over segments of the next length; None where there is none, or the model does not follow the data so long."""
+        """The model over segments of the next length; None if there is none or the model does not follow so long."""
         if trial.whole:
             return None
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
-        followed = min(max(LOST * trial.rms, FOLLOWED * self.spread), ASTRAY * self.spread)
+        followed = min(max(LOST * trial.rms, FOLLOWED * self.spread), MAX_MISFIT * self.spread)
         return None if found is None or found.rms > followed else found
 
     def grow(self, trial: Trial) -> Trial:
-        """Over segments that grow as long as the model follows the data."""
+        """The model over the longest segments that it follows, lengthened step by step."""
         while (found := self.longer(trial)) is not None:
             trial = found
         return trial
 
     def leap(self, trial: Trial) -> Trial:
-        """Over whole trajectories at once where a model that is known follows these, or as `grow`."""
+        """The model over whole trajectories at once or, if it does not follow these closely, as `grow`."""
         whole = self.fit(trial.taken, trial.values, self.lengths[-1], trial)
         return self.grow(trial) if whole is None or whole.rms > FOLLOWED * self.spread else whole
 
 
 def is_precise(data: Trajectories) -> bool:
-    """Whether the data are worth a rule of order 4."""
-    return coarse(data) or precision(data) < SMOOTH * relative_spread(data)
+    """True if a rule of order 4 is worth its time: few samples a period, or little noise."""
+    return coarse(data) or precision(data) < ORDER_4_NOISE * relative_spread(data)
 
 
 def masses(data: Trajectories) -> tuple[float, ...]:
-    """Logarithms of the roots of masses but the first, 1, that make all coordinates alike, each over its balance."""
+    """Start of log √m_i for all masses but the first, which is 1, so that all q_i/balance_i weigh the same."""
     balance = data.balance.double()
     return tuple((balance[0] / balance[1:]).log().tolist())
 
 
 def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
-    """By how much the rule of another problem changes the motion of a trial, RMS."""
+    """RMS change of the motion of a trial, in units of q over the balance, by the step rule of another problem."""
     if problem.compiled is None:
         problem.guess_from(trial.problem, trial.path)
     path = problem.solve(problem.pack(theta, trial.path.x[:, 0, : problem.d]))

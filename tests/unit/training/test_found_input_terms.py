@@ -148,7 +148,7 @@ class Asked:
     """A search whose terms of the inputs are u² and u cos q; under another hold only `left` of them stay."""
 
     def __init__(self, data, terms=(), left=()):
-        self.data, self.terms, self.left, self.part = data, terms, left, SimpleNamespace(longer=1)
+        self.data, self.terms, self.left, self.part = data, terms, left, SimpleNamespace(step_ratio=1)
 
     def of(self, data):
         return Asked(data, self.terms, self.left)
@@ -159,8 +159,8 @@ class Asked:
     def input_terms(self, _):
         return ("u^2", "u1 cos(q1)")
 
-    def held(self, *_, alike):
-        return "smooth" if self.data.hold == "zero" and not alike else ""
+    def better_hold(self, *_, by_residuals):
+        return "smooth" if self.data.hold == "zero" and not by_residuals else ""
 
     def run(self):
         return self.trial(self.terms)

@@ -16,7 +16,7 @@ from herglotz.models.features import parse
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.function_search import with_functions
-from herglotz.training.functions import FRICTION, PLANE, REACH, bands, prior_spreads
+from herglotz.training.functions import FRICTION_PAIRS, PLANE_PAIRS, REACH, bands, prior_spreads
 from herglotz.training.moves import Moves
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.shooting import ShootingProblem
@@ -100,7 +100,7 @@ def test_what_a_function_costs_is_what_the_data_tell_of_it(searched):
     waves = len(every & set(found.problem.parameters.numbers))
     told = found.score.numbers - (found.problem.P - waves)
     assert 4 < told < waves
-    assert all(size > 0 for size in found.sizes.values())
+    assert all(size > 0 for size in found.likeliest_scales.values())
 
 
 def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(searched, monkeypatch):
@@ -116,7 +116,7 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
         return problem
 
     monkeypatch.setattr(ShootingProblem, "of", watched)
-    found.fitter.foretold(found)
+    found.fitter.free_run_score(found)
     Moves(found).scores([found.taken])
     at = {name: i for i, name in enumerate(found.problem.parameters.numbers)}
     assert len(asked) == 2
@@ -131,7 +131,7 @@ def test_waves_of_a_part_are_those_of_all(monkeypatch):
     monkeypatch.setattr(
         "herglotz.training.function_search.bands", lambda data, base: asked.append(data) or bands(data, base)
     )
-    monkeypatch.setattr("herglotz.training.search.PART", 170)
+    monkeypatch.setattr("herglotz.training.search.SAMPLES_OF_A_PART", 170)
     data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     named = search.part.run()
@@ -250,7 +250,7 @@ def test_waves_of_the_plane_are_periodic_on_the_rectangle_and_the_longest_come_f
     data = plane()
     own = [own for own in bands(data, estimate_baseline(data)) if own.name.startswith("V(q1, q2)")]
     texts, rates = [x for band in own for x in band.texts], [x for band in own for x in band.rates]
-    assert len(texts) == 2 * PLANE
+    assert len(texts) == 2 * PLANE_PAIRS
     assert rates == sorted(rates)
     assert [max(band.rates) / band.longest < 2 ** (k + 2) for k, band in enumerate(own)] == [True] * len(own)
     low, high = (x.tolist() for x in (data.q.amin(0), data.q.amax(0)))
@@ -259,7 +259,7 @@ def test_waves_of_the_plane_are_periodic_on_the_rectangle_and_the_longest_come_f
     assert not any(phases)
     turns = [tuple(round(w * s / (2 * math.pi), 4) for w, s in zip(form, size, strict=True)) for form in forms]
     assert all(number % 1 == 0 for turn in turns for number in turn)
-    assert len(set(turns)) == PLANE
+    assert len(set(turns)) == PLANE_PAIRS
     assert not set(turns) & {(-a, -b) for a, b in turns}
     assert {(0.0, 1.0), (1.0, 0.0), (1.0, 3.0), (1.0, -3.0)} <= set(turns)
     assert rates == pytest.approx([math.hypot(*form) for form in forms])
@@ -291,7 +291,7 @@ def test_friction_by_speed_is_periodic_beyond_what_was_recorded():
     every = bands(data, base)
     for name, largest in (("friction(v2)", base.speed[1]), ("friction(v2 - v1)", sum(base.speed))):
         texts = [text for own in every if own.name.startswith(name) for text in own.texts]
-        assert len(texts) == 2 * FRICTION
+        assert len(texts) == 2 * FRICTION_PAIRS
         features = [parse_drag(text, data.angles) for text in texts]
         assert all(f.of_speed and f.on == 1 and (f.of == 0) == ("-" in name) for f in features)
         assert features[0].rate == pytest.approx(math.pi / (REACH * largest), rel=1e-6)
@@ -299,8 +299,8 @@ def test_friction_by_speed_is_periodic_beyond_what_was_recorded():
 
 def test_a_potential_of_both_coordinates_is_learned(monkeypatch):
     # fails if waves of the plane are not offered: no sum of functions of one coordinate has the force of this bump
-    monkeypatch.setattr("herglotz.training.functions.PLANE", 12)
-    monkeypatch.setattr("herglotz.training.functions.OF_MANY", 4)
+    monkeypatch.setattr("herglotz.training.functions.PLANE_PAIRS", 12)
+    monkeypatch.setattr("herglotz.training.functions.POTENTIAL_WAVES_OF_MANY", 4)
     t = H * torch.arange(161, dtype=torch.float64)
     x, out = np.array([[1.0, -0.7, 0.5, -0.2], [0.2, 0.6, -0.9, 0.8], [0, 0.4, 0.6, -0.9], [0.7, 0.3, 0, 0.2]]), []
 

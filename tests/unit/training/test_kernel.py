@@ -128,7 +128,7 @@ def test_pieces_add_up_to_the_whole(length, monkeypatch):
     problem, x = problem_of(MODELS["joints"], length=length)
     assert problem.compiled is not None
     whole = problem.normal_equations(x)
-    monkeypatch.setattr(flow, "CHUNK", 8 * 2 * 40 * 7)  # seven samples at most
+    monkeypatch.setattr(flow, "CHUNK_BYTES", 8 * 2 * 40 * 7)  # seven samples at most
     problem.compiled.jobs.clear()
     pieces = problem.normal_equations(x)
     theta, starts = problem.unpack(x)
@@ -220,7 +220,7 @@ def test_threads_add_up_to_the_same(monkeypatch):
     # fails if jobs share what they write, leave a segment out, or if the number of processors decides a sum
     problem, x = problem_of(MODELS["joints"])
     whole = problem.normal_equations(x)
-    monkeypatch.setattr(flow, "WORK", 7)
+    monkeypatch.setattr(flow, "SAMPLES_PER_JOB", 7)
     found = []
     for processors in (1, 4):
         monkeypatch.setattr(flow.os, "cpu_count", lambda count=processors: count)

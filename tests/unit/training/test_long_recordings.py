@@ -63,7 +63,7 @@ def test_model_steps_are_about_as_long_in_a_part_and_in_all():
     noise = 1e-3 * torch.randn(9000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     data = Trajectories.of(t, t.sin() + noise)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    m = search.part.longer
+    m = search.part.step_ratio
     assert m == pytest.approx(4)
     assert search.part.base.max_step == pytest.approx(m * search.base.max_step)
     assert search.part.base.model_step == pytest.approx(m * search.base.model_step)

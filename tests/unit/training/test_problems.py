@@ -41,7 +41,7 @@ def model_of(level, n=1, seed=0, **settings):
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     """The steps' derivatives by parts of 20, so that there are several."""
-    monkeypatch.setattr(lifted_newton, "CHUNK", 20)
+    monkeypatch.setattr(lifted_newton, "CHUNK_STEPS", 20)
 
 
 def data_of(n=1, gaps=2, noise=0.01):

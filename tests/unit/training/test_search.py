@@ -17,9 +17,10 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, fit, flow, search as search_module, structure
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.found_model import settings
+from herglotz.training.friction_search import without_injecting_friction
 from herglotz.training.held_out import HeldOut, blocks
 from herglotz.training.look import look
-from herglotz.training.moves import BLOCKS, MEMORY, Moves
+from herglotz.training.moves import BLOCKS, MAX_VALUES_AT_ONCE, Moves
 from herglotz.training.offers import Offer
 from herglotz.training.score import Score, correlation_time, fitted_score
 from herglotz.training.search import Search
@@ -272,7 +273,7 @@ def test_a_free_run_of_few_independent_samples_decides_less(time, wins):
     # fails if what a free run misses early, and later too, counts anew with every sample
     def end(name, loss, numbers) -> Any:
         score = Score(torch.full((10,), loss), 400, numbers, 1, 1.0, time)
-        fitter = SimpleNamespace(offered=8, simple={"a"}, foretold=lambda _: score, variant=Variant(2))
+        fitter = SimpleNamespace(offered=8, simple={"a"}, free_run_score=lambda _: score, variant=Variant(2))
         return SimpleNamespace(
             fitter=fitter, taken=frozenset(name), whole=True, length=9, at_the_noise=False, values={}
         )  # fmt: skip
@@ -289,7 +290,7 @@ def test_misfits_below_the_floor_are_alike(duffing):
     assert fitted_score(problem, path, 10.0).losses.tolist() == pytest.approx(
         fitted_score(problem, replace(path, x=path.x + 0.5), 10.0).losses.tolist(), rel=1e-12
     )
-    assert there(search.fitter(Variant(2)).foretold(found)).choices == 0  # a free run has paid for these before
+    assert there(search.fitter(Variant(2)).free_run_score(found)).choices == 0  # a free run has paid for these before
 
 
 def test_numbers_that_come_together_are_one_choice():
@@ -414,7 +415,7 @@ def test_of_many_offers_some_leave_at_once_but_not_those_that_stand_for_one_anot
     names, asked = [f"{x}{i}" for i in range(16) for x in "ab"], []
 
     class Pairs(Moves):
-        def foretold(self, sets):
+        def computed(self, sets):
             asked.extend(sets)
             lost = [sum(not {f"a{i}", f"b{i}"} & own for i in range(16)) for own in sets]
             every = zip(sets, lost, strict=True)
@@ -433,14 +434,14 @@ def test_offers_of_many_numbers_are_compared_in_parts():
     asked = []
 
     class Parts(Moves):
-        def foretold(self, sets):
+        def computed(self, sets):
             asked.append(len(sets))
             return [Score(torch.zeros(10), 400, len(own), len(own), 1.0) for own in sets]
 
     fitter = SimpleNamespace(offered=9, offers=[], data=FEW, numbers=lambda own: range(300 * len(own)))
     Parts(cast(Any, SimpleNamespace(fitter=fitter))).scores([frozenset({str(i)}) for i in range(40)])
     assert sum(asked) == 40
-    assert max(asked) * BLOCKS * 300**2 <= MEMORY
+    assert max(asked) * BLOCKS * 300**2 <= MAX_VALUES_AT_ONCE
 
 
 def test_an_excess_comes_and_goes_with_what_it_is_of():
@@ -449,7 +450,7 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
     dry, excess = Offer("dry", ("dry",)), Offer("excess", ("excess",), on="dry")
 
     class Friction(Moves):
-        def foretold(self, sets):
+        def computed(self, sets):
             lost = [10.0 * ("excess" not in own) + 0.1 * ("dry" in own) for own in sets]
             every = zip(sets, lost, strict=True)
             return [Score(torch.full((10,), none), 400, len(own), len(own), 1.0) for own, none in every]
@@ -495,11 +496,11 @@ def test_a_model_that_goes_astray_takes_no_place(rms, joins, monkeypatch):
     monkeypatch.setattr(search_module, "Moves", lambda _: moves)
     search, other = (
         searched(Trajectories.of(torch.arange(9.0), torch.arange(9.0) ** 2)),
-        SimpleNamespace(rms=rms, pushing={}),
+        SimpleNamespace(rms=rms, injecting_friction={}),
     )
     monkeypatch.setattr(search, "better", lambda _, richer: richer)
     fitter = SimpleNamespace(spread=1.0, fit=lambda *_: other)
-    trial: Any = SimpleNamespace(taken=frozenset(), rms=0.1, pushing={}, length=5, fitter=fitter)
+    trial: Any = SimpleNamespace(taken=frozenset(), rms=0.1, injecting_friction={}, length=5, fitter=fitter)
     assert search.moved(trial) is (other if joins else None)
 
 
@@ -526,14 +527,15 @@ def test_friction_that_pushes_does_not_join():
     simple = there(fitter.fit(fitter.simple, {}, fitter.lengths[0], None))
     assert Moves(simple).joining(simple.taken)[0] - simple.taken == {"friction.coulomb"}
     pushed = there(fitter.fit(simple.taken | {"friction.coulomb"}, simple.values, simple.length, simple, 60))
-    assert pushed.pushing == {"friction.coulomb": 0}
+    assert pushed.injecting_friction == {"friction.coulomb": 0}
     assert pushed.replaces(simple)
     other = search.moved(simple)
     assert other is None or "friction.coulomb" not in other.taken
     both = fitter.fit(pushed.taken | {"friction.breakaway"}, pushed.values, pushed.length, pushed, 60)
-    assert "friction.breakaway" not in search.braking(there(both)).taken  # no excess of friction that is gone
-    braked = search.braking(pushed)
-    assert not braked.pushing
+    # No excess of a friction that is gone.
+    assert "friction.breakaway" not in without_injecting_friction(search, there(both)).taken
+    braked = without_injecting_friction(search, pushed)
+    assert not braked.injecting_friction
     assert search.moved(braked, whole=True, swapped=True) is None
 
 
@@ -581,8 +583,8 @@ def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
     other = SimpleNamespace(fits_better=lambda _: True, replaces=lambda _: False)
     monkeypatch.setattr(search, "of", lambda _: SimpleNamespace(again=lambda _: other))
     trial = cast(Any, SimpleNamespace(at_the_noise=False))
-    assert search.held(trial, ["first"], alike=True) == "first"
-    assert search.held(trial, ["first"]) == ""
+    assert search.better_hold(trial, ["first"], by_residuals=True) == "first"
+    assert search.better_hold(trial, ["first"]) == ""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
@@ -614,7 +616,7 @@ def test_a_search_of_many_samples_is_made_of_some(monkeypatch):
     # fails if every trial of a long recording is fitted to all of it, or the model to a part alone
     import herglotz.training.search as module
 
-    monkeypatch.setattr(module, "PART", 200)
+    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
     data, seen = simulate(scene("duffing"), trajectories=1, steps=900, h=0.05, noise=NOISE, seed=0), []
     fit = module.Fitter.fit
     monkeypatch.setattr(
@@ -642,7 +644,7 @@ def test_zeros_that_say_nothing_are_not_taken_off():
     best = there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))
     best = there(fitter.grow(best))
     assert search.with_zeros(best) == (search, best, None)
-    read, other, zeros = search.with_zeros(best, sure=True)
+    read, other, zeros = search.with_zeros(best, accepted=True)
     assert there(zeros)[0].abs().max() > 0
     assert there(other).fitter.data is read.data
 

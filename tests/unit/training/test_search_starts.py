@@ -120,7 +120,7 @@ class Asked:
 
     def __init__(self, data, base, config, *, told, seen, name="whole", **_):
         self.data, self.base, self.config, self.told, self.seen, self.name = data, base, config, told, seen, name
-        self.fitters, self.longer = {}, told.get("longer", 1.0)
+        self.fitters, self.step_ratio = {}, told.get("longer", 1.0)
         self.part = self if name != "whole" or not told.get("long") else self.of(data, "part")
         self.first, self.full = self.model("simple", 0.3, noise=bool(told.get("easy"))), None
         if not told.get("hard"):  # else the whole dictionary follows nothing
@@ -153,8 +153,8 @@ class Asked:
     def better(self, old, new):
         return old if new is None or self.told.get("worse") else new
 
-    def with_zeros(self, best, sure=False):
-        differ = self.answer("zeros") if not sure else self.told["zeros"]
+    def with_zeros(self, best, accepted=False):
+        differ = self.answer("zeros") if not accepted else self.told["zeros"]
         return (self, best, None) if differ is None else (self.of(self.data), best, differ)
 
     def zeros_again(self, read, best, differ):
@@ -163,7 +163,7 @@ class Asked:
 
     def of_part(self, found, differ):
         self.seen.append((self.name, f"of_part, {differ}"))
-        return self.with_zeros(found, sure=differ)
+        return self.with_zeros(found, accepted=differ)
 
     def better_on_a_line(self, _):
         return self.answer("line", False)
@@ -174,7 +174,7 @@ class Asked:
     def finalist(self, best, ends):
         return ends[0] if self.told.get("behind") else best
 
-    def held(self, best, holds, *, alike=False):  # noqa: ARG002
+    def better_hold(self, best, holds, *, by_residuals=False):  # noqa: ARG002
         wanted = self.answer(f"hold of {best.names[0]}", "")
         return wanted if wanted in holds else ""
 

@@ -22,10 +22,10 @@ class Fits:
 
 
 def trial(fits, taken, loss=0.0) -> Any:
-    sizes = {name: size for name, size in (("a", 1.0), ("b", 0.1), ("c", 0.5)) if name in taken}
+    scales = {name: size for name, size in (("a", 1.0), ("b", 0.1), ("c", 0.5)) if name in taken}
     return SimpleNamespace(
-        fitter=fits, taken=frozenset(taken), values={}, length=5, sizes=sizes,
-        score=SimpleNamespace(losses=torch.tensor([loss]), of_a_number=0.97),
+        fitter=fits, taken=frozenset(taken), values={}, length=5, likeliest_scales=scales,
+        score=SimpleNamespace(losses=torch.tensor([loss]), price_of_a_number=0.97),
         replaces=lambda other: "c" not in other.taken,
     )  # fmt: skip
 

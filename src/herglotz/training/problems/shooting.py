@@ -1,13 +1,13 @@
-"""Trajectory fitting by multiple shooting: what noisy positions need, because one-step errors amplify their noise.
+"""Multiple shooting: the fit of whole trajectories to noisy positions, whose noise one-step errors would amplify.
 
-Unknowns are the parameters and the state (q, p[, s]) at the start of every segment. Residuals are
+The unknowns are the parameters θ and the state (q, p[, s]) at the start of every segment. The residuals are
 
-    (q_model − q_data) / σ     at every sample, σ of each coordinate being one number times its `balance`,
-    (end of a segment − start of the next) / weight     between segments,
-    (s − s_known or 0) / weight                         at the start of a trajectory, where the motion depends on s,
+    (q_model − q_data) / σ_i                           at every sample, with σ_i = σ · `balance` of the coordinate i,
+    (end of a segment − start of the next) / weight    at every joint between segments,
+    (s − s_known or 0) / weight                        at the start of a trajectory, if the motion depends on s,
 
 and the prior. Derivatives run through every implicit step (`lifted_newton.parameter_derivatives`). Segments grow
-until each trajectory is one.
+until each trajectory is one segment.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.interpolation import between_nodes, between_samples
 from herglotz.training.problems.joint_masses import JointMasses
 from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.problems.prior import Gaussian
@@ -43,12 +44,20 @@ from herglotz.training.solvers.lifted_newton import (
 )
 from herglotz.training.sums import Sums
 
-START = 3  # samples that a free run starts from: they tell q and q̇, and too little of a force to tell it
-KNOWN = 1e3  # times σ: a start that is known so much better is known
+# Leading samples that determine the start of a free run: q and q̇ follow from three samples, forces do not.
+START_SAMPLES = 3
+# Largest σ over the noise: a start state that is known so well does not move.
+MAX_PRECISION_RATIO = 1e3
 
 
 class ShootingProblem(StatesProblem):
-    """½ Σ (q − q_data)²/σ² + ½ Σ (joint defects / weight)² + prior, over parameters and segment states."""
+    """½ Σ (q − q_data)²/σ² + ½ Σ (joint defects / weight)² + prior, over parameters and segment states.
+
+    `used` are the samples in the sum, by default all; the others are outliers. If `s` is known, in the model's unit,
+    trajectories start from `s`, otherwise near 0. With `compiled` a kernel evaluates the model if there is one; for a
+    few evaluations a kernel is not worth its compilation. `settings` are those of `LeastSquares`; `freedom` is for the
+    residuals of data and joints.
+    """
 
     def __init__(
         self,
@@ -56,38 +65,43 @@ class ShootingProblem(StatesProblem):
         data: Trajectories,
         grid: SegmentGrid,
         *,
-        used: Tensor | None = None,  # (N,) which samples have a say; all without it. The others are outliers
-        s: Tensor | None = None,  # (N,) in the model's unit, where it is known: trajectories start from it, not near 0
-        compiled: bool = True,  # by a kernel, where there can be one: not worth it for a few evaluations
-        **settings: Any,  # of `LeastSquares`; `freedom` is for the residuals of data and joints
+        used: Tensor | None = None,  # (N,)
+        s: Tensor | None = None,  # (N,)
+        compiled: bool = True,
+        **settings: Any,
     ):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
-        self.s, self._precise, self.jointed = s, None, bool(grid.joined.any())
-        self.masses = JointMasses(self.parameters, data.q)  # that momenta of joints are over
+        self.s, self._noise, self.jointed = s, None, bool(grid.joined.any())
+        # Defects of momenta at joints are divided by the masses.
+        self.masses = JointMasses(self.parameters, data.q)
         self._weigh()
         self._solved: tuple[Tensor, Path | None] | None = None
-        self._at: Tensor | None = None  # the unknowns of `path`
-        self._slopes: tuple[Path, Tensor] | None = None  # a path and its `sensitivities`, which end in P + d or d
-        self.path: Path | None = None  # the last trajectory solved: where the next solve starts
-        self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
-        self.zeros = data.q.new_zeros(())  # what the sensors read at 0, (N, n), where `WithZeros` fits it
+        # The last path, from which the next solve starts, and its unknowns.
+        self.path: Path | None = None
+        self._at: Tensor | None = None
+        # A path and its `sensitivities`, with P + d or d columns.
+        self._slopes: tuple[Path, Tensor] | None = None
+        # True: if sweeps from the last path do not converge, step through the trajectories.
+        self.patient = True
+        # Readings of the sensors at q = 0, (N, n), if `WithZeros` fits them.
+        self.zeros = data.q.new_zeros(())
         placed = kernel_of(model) if compiled and s is None and world()[1] == 1 else None
         sharpest = dict(model.named_buffers()).get("friction.sharpest")
         self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, sharpest, self.n)
 
     def _weigh(self) -> None:
-        """What residuals are divided by, which follows from σ."""
-        self.better = self._known_better()  # (N, n)
+        """Set the weights (N, n) of samples and the scales (d,) of joint defects, which follow from σ."""
+        self.better = self._precision_ratios()
         observed = 1.0 if self.data.observed is None else self.data.observed
-        self.weight = self.used.to(self.data.q)[:, None] * self.better * observed  # (N, n)
-        # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
+        self.weight = self.used.to(self.data.q)[:, None] * self.better * observed
+        # The scale of a joint defect is the noise for q, and the same share of the motion for p (mass 1) and s.
         relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
         self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
 
     def of(self, free: Collection[str], sigma: float, prior: Gaussian | None = None) -> ShootingProblem:
-        """The same problem over some of the parameters, by name, the rest being what they are in the model."""
+        """The same problem over the parameters named `free`; the others keep their values in the model."""
         other = copy(self)
         other.parameters, other.prior, other.sigma = ParameterVector(self.parameters.model, free), prior, sigma
         other.P, other.deviations = len(other.parameters.numbers), sigma * self.data.balance
@@ -99,23 +113,26 @@ class ShootingProblem(StatesProblem):
             other.compiled.placed = placed
         return other
 
-    def _known_better(self) -> Tensor:
-        """How much better than by σ the samples are known that free runs over whole trajectories start from, (N, n).
+    def _precision_ratios(self) -> Tensor:
+        """σ over the noise for the leading samples of whole trajectories, 1 for other samples, (N, n).
 
-        Where the model misses more than the noise, states fitted to what it misses would make up for forces: parameters
-        with the least misfit would then not be those of the least error of a free run from the recorded start.
+        If σ, the misfit of the model, exceeds the noise, start states fitted with σ would make up for missing forces.
+        The parameters of the least misfit would then not have the least error in a free run from the recorded start.
         """
         if self.jointed:
             return torch.ones_like(self.data.q)
-        if self._precise is None:
-            self._precise = precisions(self.data).to(self.data.q)
-        better = (self.sigma / self._precise).clamp(max=KNOWN)
+        if self._noise is None:
+            self._noise = precisions(self.data).to(self.data.q)
+        ratio = (self.sigma / self._noise).clamp(max=MAX_PRECISION_RATIO)
         first = torch.zeros_like(self.data.t, dtype=torch.bool)
-        first[(torch.tensor(self.data.offsets)[:, None] + torch.arange(START)).to(first.device)] = True
-        return torch.where(first[:, None] & (better > AT_THE_NOISE), better, 1.0)
+        first[(torch.tensor(self.data.offsets)[:, None] + torch.arange(START_SAMPLES)).to(first.device)] = True
+        return torch.where(first[:, None] & (ratio > AT_THE_NOISE), ratio, 1.0)
 
     def memory(self) -> dict[str, Any]:
-        """The last path and where it was solved: the next solve starts there, and its last bits depend on it."""
+        """The last path and its unknowns, from which the next solve starts: the last bits of the result depend on them.
+
+        Empty if a kernel ran, which starts from no path.
+        """
         if self.path is None or self._at is None or self.compiled is not None:
             return {}
         return {"at": self._at, "x": self.path.x, "A": self.path.A}
@@ -126,7 +143,7 @@ class ShootingProblem(StatesProblem):
         self._at, self.path = at, Path(x, A)
 
     def states(self, q: Tensor, p: Tensor, s: Tensor | None = None) -> Tensor:
-        """Join states (S, n), (S, n), (S,) into the unknowns' layout (S, d)."""
+        """Join q (S, n), p (S, n) and s (S,) into states (S, d) as the unknowns have them."""
         parts = [q, p] if self.d == 2 * self.n else [q, p, (torch.zeros_like(q[:, 0]) if s is None else s)[:, None]]
         return torch.cat(parts, -1)
 
@@ -139,11 +156,12 @@ class ShootingProblem(StatesProblem):
         return x[: self.P], x[self.P :].reshape(-1, self.d)
 
     def solve(self, x: Tensor) -> Path | None:
-        """The trajectories of all segments at x, or None where a step has no solution."""
+        """The trajectories of all segments at x; None if a step has no solution."""
         if self._at is not None and torch.equal(self._at, x):
             return self.path
+        # The path of an accepted step was solved for its cost.
         if self._solved is not None and torch.equal(self._solved[0], x):
-            return self._solved[1]  # an accepted step has been solved for its cost
+            return self._solved[1]
         theta, states = self.unpack(x)
         if self.compiled is not None:
             nodes = self.compiled.run(theta, self.with_s(states), self._observed())
@@ -155,7 +173,8 @@ class ShootingProblem(StatesProblem):
             path = None
             if self.path is not None:
                 path = solve_path(L_d, start, self.grid.h, self._guess(x, self.path), tol)
-            if path is None and (self.path is None or self.patient):  # no trajectory near by to start from
+            # Without a path close enough to start from, step through the trajectories.
+            if path is None and (self.path is None or self.patient):
                 out = Stepper(L_d).rollout(*state_of(start), h=self.grid.h, inputs=self.u)
                 if bool(out.ok.all()):
                     path = solve_path(L_d, start, self.grid.h, out.states.joined, tol)
@@ -163,7 +182,7 @@ class ShootingProblem(StatesProblem):
         return path
 
     def _guess(self, x: Tensor, path: Path) -> Tensor:
-        """The states (S, K+1, 2n+1) at x, by the derivatives where the last normal equations were made."""
+        """Predicted states (S, K+1, 2n+1) at x, linearised about the unknowns of the last normal equations."""
         if self._at is None or self._slopes is None:
             return path.x
         theta, states = self.unpack(x - self._at)
@@ -174,14 +193,14 @@ class ShootingProblem(StatesProblem):
         return guess
 
     def _slopes_of(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
-        """`sensitivities`, made once for a path: a fit that ends there is asked for them again."""
+        """`sensitivities`, computed once for a path: after a fit the results need them again."""
         width = self.d + (0 if held else self.P)
         if self._slopes is None or self._slopes[0] is not path or self._slopes[1].shape[-1] != width:
             self._slopes = path, self.sensitivities(theta, path, held=held)
         return self._slopes[1]
 
     def cost(self, x: Tensor) -> Tensor:
-        """½|r|²; infinite where a step fails."""
+        """½|r|², or the loss of Student's t; infinite if a step has no solution."""
         path = self.solve(x)
         if path is None:
             return x.new_full((), torch.inf)
@@ -189,7 +208,7 @@ class ShootingProblem(StatesProblem):
         return self.loss(fit, joints) + self._anchor(x).square().sum() / 2 + self.prior_cost(x[: self.P])
 
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Arrowhead, Tensor]:
-        """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: of the states alone, θ as it is."""
+        """(cost, JᵀJ, Jᵀr); keeps the path for the next solve. With `held`, θ is frozen and only states are unknown."""
         theta, _ = self.unpack(x)
         path, sums = self.solve(x), Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
         if path is not None and self.compiled is not None:
@@ -222,12 +241,12 @@ class ShootingProblem(StatesProblem):
         return cost, matrix, torch.cat([sums.by_theta, sums.by_state.flatten()])
 
     def _observed(self) -> Observed:
-        """What the kernel has to know of the samples."""
+        """The samples, less the zeros of their sensors, and their weights for the kernel."""
         y, weight = self.data.q - self.zeros, self.weight / self.deviations
         return Observed(y.contiguous(), weight.contiguous(), float(self.freedom or 0.0))
 
     def _eliminate(self, diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
-        """T⁻¹ columns of a block tridiagonal T, (S, d, R)."""
+        """T⁻¹ columns, (S, d, R), for a block tridiagonal matrix T; None if that fails."""
         if self.compiled is not None:
             return self.compiled.kernel.eliminate(diagonal, upper, columns)
         lower = torch.cat([torch.zeros_like(upper[:1]), upper[:-1].mT])
@@ -235,10 +254,10 @@ class ShootingProblem(StatesProblem):
         return x if bool(torch.isfinite(x).all()) else None
 
     def states_at(self, path: Path, samples: Tensor, d: int | None = None) -> Tensor:
-        """The fitted state (…, d) at recorded samples, where the segments of the next stage, of its own `d`, start.
+        """The fitted state (…, d) at recorded samples, where the segments of the next stage, with its own d, start.
 
-        At a joint the end of the earlier segment is taken, unless the loss lets joints break: then the start of the
-        later one, because the end of the earlier is somewhere else.
+        At a joint this is the end of the earlier segment. With Student's t it is the start of the later segment,
+        because joints may break, and the earlier segment then ends elsewhere.
         """
         rows = self.grid.node.clone()
         if self.freedom is not None:
@@ -247,38 +266,17 @@ class ShootingProblem(StatesProblem):
         return path.x[..., : d or self.d].flatten(0, 1)[rows[samples]]
 
     def guess_from(self, other: ShootingProblem, path: Path) -> Tensor:
-        """Start the next solve from a path over other segments, samples or model steps, linear between its nodes.
+        """Start the next solve from a path over other segments, samples or model steps, interpolated linearly.
 
-        Return the states (S, d) that it has where segments start.
+        Return the interpolated states (S, d) at the starts of segments.
         """
-        old, new = other.grid.times(other.data), self.grid.times(self.data)
-        values, x = path.x.flatten(0, 1), path.x.new_empty(*new.shape, path.x.shape[-1])
-        trajectories = [problem.data.trajectory[problem.grid.start_sample] for problem in (other, self)]
-        for b in range(len(self.data)):
-            rows, own = (trajectories[0] == b).nonzero()[:, 0], (trajectories[1] == b).nonzero()[:, 0]
-            inside = torch.arange(old.shape[1], device=old.device) <= other.grid.end[rows, None]
-            node = (rows[:, None] * old.shape[1] + torch.arange(old.shape[1], device=old.device))[inside]
-            t, order = old[rows][inside].sort(stable=True)
-            known = values[node[order]]
-            at = torch.searchsorted(t, new[own].contiguous(), right=True).clamp(1, len(t) - 1)
-            gap = t[at] - t[at - 1]
-            share = torch.where(gap > 0, (new[own] - t[at - 1]) / torch.where(gap > 0, gap, 1.0), 1.0)[..., None]
-            x[own] = known[at - 1] + share.clamp(0, 1) * (known[at] - known[at - 1])
+        x = between_nodes(self.grid, self.data, other.grid, other.data, path.x)
         self.path = Path(x, path.A)
         return x[:, 0, : self.d]
 
     def guess_from_states(self, states: Tensor) -> None:
-        """Start the next solve from states (N, 2n+1) at the samples, with cubics between them (Hermite's)."""
-        data, times = self.data, self.grid.times(self.data)
-        owner, x = data.trajectory[self.grid.start_sample], states.new_empty(*times.shape, states.shape[-1])
-        for b, (first, length) in enumerate(zip(data.offsets, data.lengths, strict=True)):
-            t, known, own = data.t[first : first + length].contiguous(), states[first : first + length], owner == b
-            at = torch.searchsorted(t, times[own].contiguous()).clamp(1, length - 1)
-            h, rise = (t[at] - t[at - 1])[..., None], known[at] - known[at - 1]
-            share = ((times[own] - t[at - 1])[..., None] / h).clamp(0, 1)
-            slope = torch.gradient(known, spacing=(t,), dim=0)[0]
-            bend = (1 - share) * (h * slope[at - 1] - rise) - share * (h * slope[at] - rise)
-            x[own] = known[at - 1] + share * rise + share * (1 - share) * bend
+        """Start the next solve from states (N, 2n+1) at the samples, interpolated by cubics."""
+        x = between_samples(self.grid, self.data, states)
         self.path = Path(x, x[..., None])
 
     def misfit(self, path: Path) -> Tensor:
@@ -286,26 +284,27 @@ class ShootingProblem(StatesProblem):
         return self._missed(path.x) / self.data.balance
 
     def _missed(self, x: Tensor) -> Tensor:
+        """q_model − q_data at every sample, (N, n), with the zeros of the sensors taken off the data."""
         return self.grid.at_samples(x[..., : self.n]) - (self.data.q - self.zeros)
 
     def joint_residuals(self, path: Path, theta: Tensor) -> Tensor:
-        """End of each segment less the start of the next, (S, d), over the joint's weight."""
+        """End of the previous segment minus the start of each segment, (S, d), over the weight of joints."""
         return self._joints(path.x, self._weights(theta))
 
     def _missed_by(self, x: Tensor) -> Tensor:
-        """Data residuals (N, n)."""
+        """Residuals (N, n) of the data at states x (S, K+1, 2n+1)."""
         return self.weight * self._missed(x) / self.deviations
 
     def _joints(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Joint residuals (S, d), zero for a segment that starts a trajectory."""
+        """Residuals (S, d) of joints at states x (S, K+1, 2n+1), 0 for a segment that starts a trajectory."""
         ends = x[torch.arange(len(x), device=x.device), self.grid.end, : self.d]
         joints = (ends.roll(1, 0) - x[:, 0, : self.d]) / weights
         return torch.where(self.grid.joined[:, None], joints, 0.0)
 
     def _weights(self, theta: Tensor) -> Tensor:
-        """What joints are divided by at θ, (d,): momenta by a speed times the mass there.
+        """Scales (d,) of joint defects; the scale of a momentum is that of the speed times the mass at θ.
 
-        With a mass that is held, a fit would let it go to 0, and all defects of momenta with it.
+        With a constant mass in the scale, a fit would reduce defects of momenta by a mass that tends to 0.
         """
         with torch.no_grad():
             mass = self.masses.at(theta) if self.masses.move and self.jointed else self.mass
@@ -314,7 +313,7 @@ class ShootingProblem(StatesProblem):
 
     @property
     def _anchor_weight(self) -> float:
-        """Standard deviation of the first s of a trajectory: its natural size or, where s is known, as a joint's."""
+        """Standard deviation of the first s of a trajectory: the size of the action or, if s is known, of joints."""
         return self.action if self.s is None else float(self.joint_weight[-1])
 
     def _anchor(self, x: Tensor) -> Tensor:
@@ -325,12 +324,12 @@ class ShootingProblem(StatesProblem):
         return first / self._anchor_weight
 
     def _anchored(self) -> Tensor:
-        """Where in the unknowns the first s of each trajectory stands; none where s does not enter the motion."""
+        """Indices of the first s of each trajectory among the unknowns; empty if s does not enter the motion."""
         first = (~self.grid.joined).nonzero()[:, 0]
         return self.P + first * self.d + 2 * self.n if self.d > 2 * self.n else first[:0]
 
     def slopes_at_samples(self, theta: Tensor, path: Path) -> Tensor:
-        """Derivatives of positions at samples by the parameters and the start of the segment, (N, n, P + d)."""
+        """Derivatives of positions at samples by the parameters and by the start of the segment, (N, n, P + d)."""
         if self.compiled is None:
             return self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
         plain = Observed(self.data.q, torch.ones_like(self.data.q), 0.0)
@@ -339,7 +338,7 @@ class ShootingProblem(StatesProblem):
         return rows
 
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
-        """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
+        """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; if `held` by the start alone."""
         (S, K), d, L_d = self.grid.h.shape, self.d, self.parameters.at(theta, self.u)
         q1, A = path.x[:, 1:, : self.n], step_derivatives(L_d, path, self.grid)[..., :d, :d]
         B = theta.new_zeros(S, K, d, 0)
