@@ -333,7 +333,16 @@ def _smoothed(run: FittedRun, data: Trajectories) -> tuple[Tensor, float] | None
     # If the training data had outliers, new recordings may have outliers too.
     freedom = FREEDOM if run.metrics.get("outliers") else None
     grid, process = segment_grid(data, data.samples, max_step), process_noise(run.model, max_step)
-    problem = SmoothingProblem(run.model, data, grid, sigma=_sigma(run), process=process, freedom=freedom)
+    # The noise is that of the fit: a coordinate that rests in a warm-up is measured no better for it.
+    problem = SmoothingProblem(
+        run.model,
+        data,
+        grid,
+        sigma=_sigma(run),
+        process=process,
+        freedom=freedom,
+        balance=run.data.balance.to(data.q),
+    )
     found = smoothed_states(problem)
     return None if found is None else (problem.states(found[0]), found[1])
 

@@ -17,6 +17,7 @@ data replaces the noise.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -301,7 +302,8 @@ def _unseen_motion(errors: Errors) -> str:
         return f"no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
     names, move = ",".join(errors.rough), "moves" if len(errors.rough) == 1 else "move"
     what = f"{names} {move} from sample to sample as no mass does; {errors}"
-    return f"{what}. Try --inputs {names} where the others follow what is commanded, else --drop {names}"
+    flag = shlex.quote(names)
+    return f"{what}. Try --inputs {flag} where the others follow what is commanded, else --drop {flag}"
 
 
 def _worse(errors: Errors) -> str:
