@@ -110,6 +110,16 @@ def kind_of(unit: str) -> str:
     return next((kind for kind, pattern in KINDS.items() if pattern.fullmatch(unit)), "")
 
 
+def is_of_others(unit: str, units: Collection[str]) -> bool:
+    """Whether an acceleration in this unit is none of coordinates in `units`: these are all of the other kind.
+
+    The two kinds are angles and lengths.
+    """
+    angular = bool(ANGLES.fullmatch(re.split(r"[/ ·*]", unit)[0]))
+    known = all(unit not in ("", "1") for unit in units)
+    return kind_of(unit) == "acceleration" and known and angular not in {bool(ANGLES.fullmatch(x)) for x in units}
+
+
 def is_angular(name: str) -> bool:
     """Whether a name is usual for angles."""
     return bool(words_of(name) & WORDS["angle"])

@@ -348,3 +348,14 @@ def test_a_command_among_the_coordinates_is_named():
     assert text.endswith(
         ". Try --inputs 'beam angle' where the others follow what is commanded, else --drop 'beam angle'"
     )
+
+
+def test_inputs_that_follow_are_said_beside_what_residuals_show(monkeypatch):
+    # fails if a pendulum that a controller balances, whose law is found with both signs wrong, is told of kicks alone
+    monkeypatch.setattr(verdict, "_reason_of_residuals", lambda *_: "Kicks")
+    for said, missed, expected in (("Inputs", True, "Inputs. Kicks"), ("", True, "Kicks"), ("Inputs", False, "Inputs")):
+        monkeypatch.setattr(verdict, "reason_of_inputs", lambda *_, said=said: said)
+        seen: Any = SimpleNamespace(spikes=torch.zeros(1, dtype=torch.bool))
+        fitted: Any = SimpleNamespace(model=None, states=torch.zeros(1, 3))
+        task: Any = SimpleNamespace(data=None, base=SimpleNamespace(model_step=1.0))
+        assert verdict._shown_reason(task, fitted, seen, missed) == expected
