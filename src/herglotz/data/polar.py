@@ -240,7 +240,7 @@ def _changes(data: Trajectories, pair: Pair, r: Tensor, read: Tensor) -> list[st
     unit, spec = _unit(data, pair), replace(pair, distance=True).spec(pair.centre or ("X", "Y"))
     where = "" if pair.centre else ", with the centre in numbers or columns,"
     return [
-        f"warning: the distance of {pair.x}, {pair.y} from there changes by {moved:.2g}{unit}, and its noise is "
+        f"warning: the distance of {pair.x}, {pair.y} from the centre changes by {moved:.2g}{unit}, and its noise is "
         f"{noise:.2g}{unit}; {LENGTH}--polar {spec}{where} keeps it as a coordinate r"
     ]
 

@@ -45,8 +45,8 @@ def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
     if hints := with_hints(replace(data, notes=())).notes:
         return hints[0].removeprefix("warning: ")
-    if changes := [note for note in data.notes if LENGTH in note]:
-        return changes[0].removeprefix("warning: ")
+    if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note]:
+        return changes[0][0].upper() + changes[0][1:]
     if others := [x for x, role, unit in data.columns if role == "left aside" and is_of_others(unit, data.units)]:
         verb, they = ("was", "it is") if len(others) == 1 else ("were", "they are")
         names = ",".join([*(x for x, role, _ in data.columns if role == "input"), *others])
