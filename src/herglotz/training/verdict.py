@@ -96,8 +96,8 @@ def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: flo
 def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: str = "") -> str:
     """The reason that the inputs, and residuals above the noise (`missed`), show, or ""; `longer` is a remedy too."""
     known = fitted.states[~seen.spikes]
-    reasons = [reason_of_inputs(fitted.model, task.data, known, task.base.model_step, longer)]
-    return ". ".join(filter(None, [*reasons, missed and _reason_of_residuals(task, fitted, seen)]))
+    reason = reason_of_inputs(fitted.model, task.data, known, task.base.model_step, longer)
+    return ". ".join(filter(None, (reason, _reason_of_residuals(task, fitted, seen) if missed else "")))
 
 
 def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:

@@ -24,7 +24,7 @@ H = 0.1
 
 
 def model_of(level, **settings):
-    sizes = {"scale": (1.5,), "speed": (1.2,), "stiffness": (1.0,)}
+    sizes: dict[str, Any] = {"scale": (1.5,), "speed": (1.2,), "stiffness": (1.0,)}
     model: Any = ContactLagrangian(ModelConfig(level=level, rate=0.2, potential_width=0, **sizes | settings))
     make = torch.Generator().manual_seed(2)
     with torch.no_grad():
@@ -88,7 +88,7 @@ def test_a_coordinate_that_rests_in_the_warm_up_has_the_noise_of_the_fit(monkeyp
     # length hardly changed at first was started with an angle off by five times the noise
     of_problem, seen = predict_module.SmoothingProblem, []
     monkeypatch.setattr(predict_module, "SmoothingProblem", lambda *a, **k: seen.append(of_problem(*a, **k)) or seen[0])
-    sizes = dict.fromkeys(("scale", "speed", "stiffness", "tilt"), (1.0, 1.0))
+    sizes: dict[str, Any] = dict.fromkeys(("scale", "speed", "stiffness", "tilt"), (1.0, 1.0))
     t, model = 0.1 * torch.arange(40.0).double(), model_of("linear", angles=(True, False), **sizes)
     data = Trajectories.of(t, torch.stack([t.cos(), 0.5 * t.sin()], 1), (40,), angles=(True, False), units=("rad", "m"))
     run = Run(model, FitConfig(), {"sigma": 0.01}, data, (40,), State(data.q, data.q, t), H, {}, [])
