@@ -7,7 +7,7 @@ from collections.abc import Collection
 from typing import NamedTuple
 from unicodedata import combining, normalize
 
-ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|gon|rev|turns?")
+ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|Grad|degrés|grados|gradi|gon|rev|turns?")
 # Kinds of units, in the order of trial. With other units, such as counts or 1, the name decides the role.
 KINDS = {
     "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
