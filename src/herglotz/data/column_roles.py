@@ -7,7 +7,7 @@ from collections.abc import Collection
 from typing import NamedTuple
 from unicodedata import combining, normalize
 
-ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|gon|rev|turns?")
+ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|Grad|degrés|grados|gradi|gon|rev|turns?")
 # Kinds of units, in the order of trial. With other units, such as counts or 1, the name decides the role.
 KINDS = {
     "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
@@ -108,6 +108,16 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
 def kind_of(unit: str) -> str:
     """The kind of a unit, a key of `KINDS`; "" for no unit, or a unit that many quantities have."""
     return next((kind for kind, pattern in KINDS.items() if pattern.fullmatch(unit)), "")
+
+
+def is_of_others(unit: str, units: Collection[str]) -> bool:
+    """Whether an acceleration in this unit is none of coordinates in `units`: these are all of the other kind.
+
+    The two kinds are angles and lengths.
+    """
+    angular = bool(ANGLES.fullmatch(re.split(r"[/ ·*]", unit)[0]))
+    known = all(unit not in ("", "1") for unit in units)
+    return kind_of(unit) == "acceleration" and known and angular not in {bool(ANGLES.fullmatch(x)) for x in units}
 
 
 def is_angular(name: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -10,12 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from herglotz.data.column_roles import (
-    ANGLES,
     READING,
     ROLES,
     Guess,
     is_effort,
     is_goal,
+    is_of_others,
     is_timed,
     is_usual,
     kind_of,
@@ -239,19 +238,13 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
 
 
 def _accelerations_of_others(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> list[int]:
-    """Accelerations that are left aside and belong to no coordinate: all coordinates are of the other kind of unit.
-
-    The two kinds are angles and lengths.
-    """
+    """Accelerations that are left aside and belong to no coordinate."""
     units = [found.units[i] for i in found.q]
-    turning = {bool(ANGLES.fullmatch(unit)) for unit in units}
-    others = []
-    for i, (name, unit, guess) in enumerate(zip(found.names, found.units, guesses, strict=True)):
-        angular = bool(ANGLES.fullmatch(re.split(r"[/ ·*]", unit)[0]))
-        new = wanted.role(name) is None and wanted.before(name) is None
-        if new and guess == Guess("rate") and kind_of(unit) == "acceleration" and all(units) and angular not in turning:
-            others.append(i)
-    return others
+    return [
+        i for i, (name, unit, guess) in enumerate(zip(found.names, found.units, guesses, strict=True))
+        if wanted.role(name) is None and wanted.before(name) is None and guess == Guess("rate")
+        and is_of_others(unit, units)
+    ]  # fmt: skip
 
 
 def _of_controllers(found: Columns, inputs: Sequence[int]) -> list[str]:
@@ -285,7 +278,7 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
     if set(columns) == set(found.q):
         ways = ["--inputs or --drop with the names of those that are none"]
     verb = ("is" if one else "are") + (f" taken for {role}" if role else " left aside")
-    return f"warning: {few} {verb}, but {doubt}; else give {' or '.join(ways)}"
+    return f"warning: {few} {verb}, but {doubt}; {'else' if role else 'if so,'} give {' or '.join(ways)}"
 
 
 def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:

@@ -23,6 +23,8 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import check_coordinates, refuse
 from herglotz.least_squares import least_squares
 
+# Begins the remedy for a distance that changes.
+LENGTH = "if a length changes: "
 # Role, in the table of columns, of an angle that was computed from positions.
 POLAR = "polar"
 # More samples do not change a circle.
@@ -238,8 +240,8 @@ def _changes(data: Trajectories, pair: Pair, r: Tensor, read: Tensor) -> list[st
     unit, spec = _unit(data, pair), replace(pair, distance=True).spec(pair.centre or ("X", "Y"))
     where = "" if pair.centre else ", with the centre in numbers or columns,"
     return [
-        f"warning: the distance of {pair.x}, {pair.y} from there changes by {moved:.2g}{unit}, and its noise is "
-        f"{noise:.2g}{unit}; if a length changes: --polar {spec}{where} keeps it as a coordinate r"
+        f"warning: the distance of {pair.x}, {pair.y} from the centre changes by {moved:.2g}{unit}, and its noise is "
+        f"{noise:.2g}{unit}; {LENGTH}--polar {spec}{where} keeps it as a coordinate r"
     ]
 
 

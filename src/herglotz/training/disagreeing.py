@@ -3,19 +3,20 @@
 Of every recording the part that a fit uses is followed over short segments from starts of its own, with the numbers of
 the model fixed. A recording disagrees if the scale of its misfit is an outlier (`TAIL`) of the misfit of the others, so
 that more than half of its samples are. A bad recording may have bent the model so far that none stands out. Where the
-model is not at the noise, the recording whose accelerations are least like the others' is left out if the whole
-dictionary would follow the others to their noise. The model is then found anew. What is left out stays so if the others
-agree, whose model is at their noise, and if it is an outlier of that model. Most recordings have to agree.
+model is not at the noise, the recording that it misses most, or else the one whose accelerations are least like the
+others', is left out if the whole dictionary would follow the others to their noise. The model is then found anew. What
+is left out stays so if the others agree, whose model is at their noise, and if it is an outlier of that model. Most
+recordings have to agree.
 
-Where no terms are searched (more than three coordinates, a given plan, own terms) nothing is left out: an outlier of
-the finished model is named (`outlying`).
+Where nothing is left out, as where no terms are searched (more than three coordinates, a given plan, own terms), an
+outlier of the finished model is named (`outlying`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,23 +27,12 @@ from herglotz.data.splits import cuts_of, held_out_whole, leading
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import differences, estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.look import Look, look, read_like
+from herglotz.training.look import LeftOut, Look, look, read_like
 from herglotz.training.problems.robust import FREEDOM, TAIL, robust_fit, scale_of
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import SegmentStages
 from herglotz.training.verdict import EXACT_ENOUGH, STATE_ITERATIONS
-
-
-class LeftOut(NamedTuple):
-    """A recording, counted from 0, and the scales of what the model of the others misses it and them by.
-
-    In units of q, over the balance of several kinds of coordinates.
-    """
-
-    recording: int
-    missed: float
-    others: float
 
 
 def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) -> tuple[Look, tuple[LeftOut, ...]]:
@@ -60,8 +50,8 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         worst = max(rest, key=lambda b: scale[b])
         outlier = scale[worst] > TAIL * _scale(missed, [b for b in rest if b != worst], seen)
         if not outlier and not out and not _agree(seen, _noise_of_each(seen)):
-            worst = _least_alike(seen)
-            outlier = _would_agree(seen, worst)
+            bad = next((b for b in dict.fromkeys((worst, _least_alike(seen))) if _would_agree(seen, b)), None)
+            worst, outlier = (worst, False) if bad is None else (bad, True)
         if outlier:
             now = sorted([*out, worst])
         else:
@@ -79,20 +69,32 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
     return whole, ()
 
 
-def searched(seen: Look) -> bool:
-    """Whether a search found named terms, by which recordings can be left out."""
-    return seen.found is not None and seen.found.sigma is not None
-
-
 def outlying(seen: Look, model: ContactLagrangian, sigma: float) -> tuple[LeftOut, ...]:
-    """The recording that a finished model misses most, if it is an outlier; () if none is, or of two recordings."""
+    """The recording that a finished model misses most, if it is an outlier; () if none is, or of two recordings.
+
+    That recording may have bent the model. If it is missed by more than the noise, the numbers of the model are fitted
+    once more to short segments of the others, and it is compared with these.
+    """
     if len(seen.data) < 3:
         return ()
-    missed = _missed_by(seen, model, sigma, _followed(seen.data, seen.settings))
+    followed, noise = _followed(seen.data, seen.settings), _noise_of_each(seen)
+    worst = _worst(seen, _missed_by(seen, model, sigma, followed))
+    if worst.missed <= max(AT_THE_NOISE * noise, TAIL * EXACT_ENOUGH * relative_spread(seen.data)):
+        return ()
+    others = followed.select([b for b in range(len(followed)) if b != worst.recording])
+    stages = SegmentStages(replace(seen.task(Stages()), data=others), own := deepcopy(model))
+    if (found := stages.fit(stages.lengths[0], noise, None, None)) is None:
+        return (worst,) if worst.stands_out else ()
+    found.problem.parameters.set(found.theta)
+    now = _worst(seen, _missed_by(seen, own, noise, followed))
+    return (now,) if now.stands_out and now.recording == worst.recording else ()
+
+
+def _worst(seen: Look, missed: Sequence[Tensor]) -> LeftOut:
+    """The recording that is missed most."""
     scale = [scale_of(own) for own in missed]
     worst = max(range(len(scale)), key=lambda b: scale[b])
-    least = _scale(missed, [b for b in range(len(scale)) if b != worst], seen)
-    return (LeftOut(worst, scale[worst], least),) if scale[worst] > TAIL * least else ()
+    return LeftOut(worst, scale[worst], _scale(missed, [b for b in range(len(scale)) if b != worst], seen))
 
 
 def _scale(missed: Sequence[Tensor], recordings: Sequence[int], seen: Look) -> float:

@@ -36,12 +36,10 @@ def reason_of_inputs(
     data: Trajectories,
     states: Tensor,  # (N, 2n+1) of the fit at the samples
     max_step: float,
-    missed: bool,
     longer: str = "",
 ) -> str:
     """The fact in the head of this module that the training part shows, and what to try, in sentences; "" for none.
 
-    `missed`: the model misses the training part by more than the noise, which inputs that follow do not explain.
     `longer` is a recording, in words, that would tell as well what inputs do that follow.
     """
     if data.u is None or not model.inputs or not bool(torch.isfinite(states).all()):
@@ -56,7 +54,7 @@ def reason_of_inputs(
             "and longer runs tell a wrong start from a wrong force no more. Try several recordings, each no longer "
             "than that"
         )
-    if not missed and (left := unexplained(data, states)) < HALF:
+    if (left := unexplained(data, states)) < HALF:
         ways = filter(None, ("a small random signal on the inputs", "set points that jump", longer))
         return (
             f"The inputs follow from positions and velocities, all but {100 * left:.2g} % of their spread, as those of "

@@ -26,7 +26,7 @@ from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
-from herglotz.training.disagreeing import look_at_agreeing, outlying, searched
+from herglotz.training.disagreeing import look_at_agreeing, outlying
 from herglotz.training.distributed import is_first
 from herglotz.training.equation import equation_of
 from herglotz.training.equation_notes import notes_of
@@ -196,7 +196,8 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         fitted = OBJECTIVES[plan.objective](task, seen, plan)
-        found["outlying"] = [] if searched(seen) else [x._asdict() for x in outlying(seen, fitted.model, fitted.sigma)]
+        seen = replace(seen, outlying=() if left_out else outlying(seen, fitted.model, fitted.sigma))
+        found["outlying"] = [one._asdict() for one in seen.outlying]
         _tell_outlying(found, data)
         run = evaluate(task, seen, plan, fitted, config)
     if seen.found is not None and plan.network == "none":

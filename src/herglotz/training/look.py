@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ from herglotz.training.hold import with_arrival
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import MANY
+from herglotz.training.problems.robust import TAIL
 from herglotz.training.stages import Stages
 from herglotz.training.structure import (
     Structure,
@@ -60,6 +62,28 @@ class Probe:
         return self.residuals >= 2 * self.unknowns
 
 
+class LeftOut(NamedTuple):
+    """A recording, counted from 0, and the scales of what the model of the others misses it and them by.
+
+    In units of q, over the balance of several kinds of coordinates.
+    """
+
+    recording: int
+    missed: float
+    others: float
+
+    @property
+    def reason(self) -> str:
+        """The reason of a misfit, with a remedy."""
+        far = f"is missed {self.missed / self.others:.2g} times as far as the others, and may be of something else"
+        return f"Trajectory {self.recording}, counted from 0, {far}. Try the fit without it"
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether the recording is an outlier of the others."""
+        return self.missed > TAIL * self.others
+
+
 @dataclass(frozen=True)
 class Look:
     """The properties of the data that a plan depends on.
@@ -72,7 +96,8 @@ class Look:
     an upper bound of the noise. `settings` are the user's, with the level and the structure that the data call for;
     `base` has sizes and starting values. `structure` says in words what was found about the terms (None: no terms were
     searched), and `found` are named terms that follow whole trajectories. `baseline_motion` are motions of a baseline
-    that explains exact data, with their error; `probe` is None where the objective is known without it.
+    that explains exact data, with their error; `probe` is None where the objective is known without it. `outlying` is
+    the recording that stands out from a finished model.
     """
 
     data: Trajectories
@@ -93,6 +118,7 @@ class Look:
     found: Structure | None = None
     baseline_motion: tuple[Triples, float] | None = None
     probe: Probe | None = None
+    outlying: tuple[LeftOut, ...] = ()
 
     def task(self, stages: Stages) -> Task:
         """What the stages of a fit to these data share."""

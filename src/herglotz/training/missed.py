@@ -1,10 +1,11 @@
 """`reason_of`: why a model does not fit, as far as the residual shows, in words.
 
 Free runs of 20 recorded steps, whose starts are fitted, leave a residual. The curvature of parabolas through nine
-samples of the residual is the acceleration that the model lacks, known to the noise of the data. Four reasons are
+samples of the residual is the acceleration that the model lacks, known to the noise of the data. Five reasons are
 looked for:
 
-* positions on a circle, which one angle gives;
+* positions on a circle, which one angle gives, or a distance from its centre that changes;
+* an acceleration of something else, a crane's trolley, that was left aside;
 * an input that was recorded more slowly than the motion and filled in: its steps act at times between rows;
 * the past: the lacking accelerations differ where positions, velocities and inputs of two times are alike, so that no
   function of these gives the accelerations;
@@ -13,13 +14,15 @@ looked for:
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.polar import with_hints
+from herglotz.data.column_roles import is_of_others
+from herglotz.data.polar import LENGTH, with_hints
 from herglotz.data.rates import filled_inputs
 from herglotz.data.roughness import SAMPLES, precisions
 from herglotz.data.units import size
@@ -42,6 +45,12 @@ def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
     if hints := with_hints(replace(data, notes=())).notes:
         return hints[0].removeprefix("warning: ")
+    if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note]:
+        return changes[0][0].upper() + changes[0][1:]
+    if others := [x for x, role, unit in data.columns if role == "left aside" and is_of_others(unit, data.units)]:
+        verb, they = ("was", "it is") if len(others) == 1 else ("were", "they are")
+        names = ",".join([*(x for x, role, _ in data.columns if role == "input"), *others])
+        return f"{', '.join(others)} {verb} left aside, and {they} of no coordinate. Try --inputs {shlex.quote(names)}"
     if names := filled_inputs(data):
         some, was, its = ("input", "was", "its") if len(names) == 1 else ("inputs", "were", "their")
         return (

@@ -155,7 +155,7 @@ WORDS = {
     "zeros": "what the sensors read at 0, recording after recording",
     "drifts": "what the zeros of the sensors gain in a unit of time",
     "turning": "angles turn",
-    "drag": "friction beside the viscous one",
+    "drag": "forces beside viscous friction",
     "dissipation": "damping by s, beside −γ s in L",
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",

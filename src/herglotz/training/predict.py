@@ -333,8 +333,9 @@ def _smoothed(run: FittedRun, data: Trajectories) -> tuple[Tensor, float] | None
     # If the training data had outliers, new recordings may have outliers too.
     freedom = FREEDOM if run.metrics.get("outliers") else None
     grid, process = segment_grid(data, data.samples, max_step), process_noise(run.model, max_step)
-    problem = SmoothingProblem(run.model, data, grid, sigma=_sigma(run), process=process, freedom=freedom)
-    found = smoothed_states(problem)
+    # The noise is that of the fit: a coordinate that rests in a warm-up is measured no better for it.
+    settings: dict[str, Any] = {"sigma": _sigma(run), "freedom": freedom, "balance": run.data.balance.to(data.q)}
+    found = smoothed_states(problem := SmoothingProblem(run.model, data, grid, process=process, **settings))
     return None if found is None else (problem.states(found[0]), found[1])
 
 

@@ -45,8 +45,8 @@ def outlying_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
     unit = common_unit(data.units)
     return [
         f"trajectory {one['recording']}, counted from 0, may be of something else: the model misses it by "
-        f"{size(one['missed'], unit, digits=2)}, and the others by {size(one['others'], unit, digits=2)}; without a "
-        "search for terms nothing is left out: fit once more without it"
+        f"{size(one['missed'], unit, digits=2)}, and the others by {size(one['others'], unit, digits=2)}; "
+        "fit once more without it"
         for one in metrics.get("outlying", ())
     ]
 

@@ -17,6 +17,7 @@ data replaces the noise.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -93,18 +94,19 @@ def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: flo
 
 
 def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: str = "") -> str:
-    """The reason that residuals above the noise (`missed`) or else the inputs show, or ""; `longer` is a remedy too."""
-    reason = _reason_of_residuals(task, fitted, seen.train) if missed else ""
+    """The reason that the inputs, and residuals above the noise (`missed`), show, or ""; `longer` is a remedy too."""
     known = fitted.states[~seen.spikes]
-    return reason or reason_of_inputs(fitted.model, task.data, known, task.base.model_step, missed, longer)
+    reason = reason_of_inputs(fitted.model, task.data, known, task.base.model_step, longer)
+    return ". ".join(filter(None, (reason, _reason_of_residuals(task, fitted, seen) if missed else "")))
 
 
-def _reason_of_residuals(task: Task, fitted: Fitted, train: Trajectories) -> str:
-    """The reason of a misfit in words, from the residuals of the training part; "" if they show none.
+def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:
+    """The reason of a misfit in words: a recording that stands out, or what the residuals show; "" if they show none.
 
     If steps are so short that noise hides the curvature, every second, fourth, … sample is tried.
     """
-    reason, steps = reason_of_data(train.liveliest(MOST)) or None, 1
+    train, steps = seen.train, 1
+    reason = "".join(one.reason for one in seen.outlying) or reason_of_data(train.liveliest(MOST)) or None
     while reason is None:
         data, base = train.liveliest(MOST), task.base.stepped(steps)
         found = with_own_starts(replace(task, base=base), fitted, data, None)
@@ -301,9 +303,9 @@ def _unseen_motion(errors: Errors) -> str:
     """The verdict where no motion stands out from the noise: of all coordinates, or of those without inertia."""
     if not errors.rough:
         return f"no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
-    names, move = ",".join(errors.rough), "moves" if len(errors.rough) == 1 else "move"
-    what = f"{names} {move} from sample to sample as no mass does; {errors}"
-    return f"{what}. Try --inputs {names} where the others follow what is commanded, else --drop {names}"
+    names, verb = ",".join(errors.rough), "moves" if len(errors.rough) == 1 else "move"
+    what, flag = f"{names} {verb} from sample to sample as no mass does; {errors}", shlex.quote(names)
+    return f"{what}. Try --inputs {flag} where the others follow what is commanded, else --drop {flag}"
 
 
 def _worse(errors: Errors) -> str:

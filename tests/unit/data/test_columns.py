@@ -76,6 +76,18 @@ def test_degrees_and_milliseconds(tmp_path):
     torch.testing.assert_close(data.q[:, 0], torch.tensor([170.0, 185.0, 200.0]).double() * math.pi / 180)
 
 
+@pytest.mark.parametrize(
+    "head", ["Winkel [Grad]", "Winkel_Grad", "angle [degrés]", "ángulo [grados]", "angolo [gradi]"]
+)
+def test_degrees_have_a_name_in_each_language(tmp_path, head):
+    # fails if a pendulum in Grad is a length of 25, which no warning says
+    path = tmp_path / "a.csv"
+    path.write_text(f"t [s],{head}\n" + "".join(f"{k / 10},{25 - k}\n" for k in range(9)), encoding="utf-8")
+    data = load(path)
+    assert (data.units, data.angles) == (("rad",), (True,))
+    assert float(data.q[0, 0]) == pytest.approx(math.radians(25))
+
+
 def test_degrees_are_reported_and_written_back(tmp_path):
     # fails if a file in degrees is written in radians, the archive forgets what the columns were, or a table written
     # in degrees is read as another motion

@@ -94,7 +94,9 @@ def test_an_acceleration_of_something_else_may_be_an_input(tmp_path, capsys, hea
     # fails if the acceleration of a crane's trolley, which drives the sway of its load, is left aside without a word
     name = header.split(",")[-1].split("[")[0]
     data = read(tmp_path, table(header))
-    text = f"{name} is left aside, but no coordinate has its kind of unit, and it may be an input; else give --inputs '"
+    text = (
+        f"{name} is left aside, but no coordinate has its kind of unit, and it may be an input; if so, give --inputs '"
+    )
     assert (text in capsys.readouterr().err) is said
     read(tmp_path, table(header), like=data)
     read(tmp_path, table(header), drop=name)
@@ -130,7 +132,7 @@ GUESSES = {
     "pivot_y[m]": "is taken for a coordinate, but it may be moved from outside; else give --inputs pivot_y or",
     "u_x[m]": "is taken for an input, but it has the unit of a position",
     "control[rad]": "is taken for an input, but it has the unit of a position",
-    "q_d": "is left aside, but it may be a desired value or a derivative; else give --inputs q_d or",
+    "q_d": "is left aside, but it may be a desired value or a derivative; if so, give --inputs q_d or",
     "q_d[rad]": "is taken for an input, but it may be a desired value or a derivative",
     "x_dot[m]": "is left aside, but it has the unit of a position",
     "dx[m]": "is left aside, but it has the unit of a position",

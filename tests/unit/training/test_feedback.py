@@ -46,19 +46,17 @@ def test_noise_of_a_start_grows_as_the_unstable_motion_does():
 
 
 @pytest.mark.parametrize(
-    ("stiffness", "moved", "missed", "expected"),
+    ("stiffness", "moved", "expected"),
     [
-        (-9.0, 0.15, False, "The motion is unstable and its inputs hold it: "),
-        (-9.0, 0.15, True, "The motion is unstable and its inputs hold it: "),
-        (9.0, 0.15, False, ""),  # it is stable, and the goals act
-        (9.0, 0.0, False, "The inputs follow from positions and velocities, "),
-        (9.0, 0.0, True, ""),  # what follows is no reason of a misfit
+        (-9.0, 0.15, "The motion is unstable and its inputs hold it: "),
+        (9.0, 0.15, ""),  # it is stable, and the goals act
+        (9.0, 0.0, "The inputs follow from positions and velocities, "),
     ],
 )
-def test_the_reason_is_what_is_measured(stiffness, moved, missed, expected):
+def test_the_reason_is_what_is_measured(stiffness, moved, expected):
     # fails if a controller's recording is told to be longer, or a stable motion, or inputs of their own, to be shorter
     model, data, states = balanced(stiffness, moved=moved)
-    reason = reason_of_inputs(model, data, states, H, missed)
+    reason = reason_of_inputs(model, data, states, H)
     assert reason.startswith(expected)
     assert bool(reason) == bool(expected)
     if stiffness < 0:
@@ -66,8 +64,8 @@ def test_the_reason_is_what_is_measured(stiffness, moved, missed, expected):
         t = math.log(2 * float(data.q.std(correction=0)) / NOISE) / 2.95
         said = float(re.findall(r"within ([\d.]+)", reason)[0])
         assert said == pytest.approx(t, rel=0.05)
-    assert reason_of_inputs(model, replace(data, u=None), states, H, missed) == ""
-    assert reason_of_inputs(model, data, states * math.nan, H, missed) == ""
+    assert reason_of_inputs(model, replace(data, u=None), states, H) == ""
+    assert reason_of_inputs(model, data, states * math.nan, H) == ""
 
 
 def test_inputs_that_hold_a_motion():
@@ -80,7 +78,7 @@ def test_inputs_that_hold_a_motion():
 def test_inputs_that_follow():  # fails if a motion is not the state's, or a signal of its own counts as following
     model, data, states = balanced(9.0, moved=0.0)
     assert unexplained(data, states) < 0.05
-    said = reason_of_inputs(model, data, states, H, False, "a longer one")
+    said = reason_of_inputs(model, data, states, H, "a longer one")
     assert said.endswith("Try a small random signal on the inputs, or set points that jump, or a longer one")
     signal = torch.randn(K, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert unexplained(replace(data, u=signal), states) > 0.9

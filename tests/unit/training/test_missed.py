@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
+from herglotz.data.polar import in_polar, pairs_of
 from herglotz.data.rates import filled_inputs
 from herglotz.training import FitConfig, fit, verdict
 from herglotz.training.baseline import estimate_baseline
@@ -129,6 +130,21 @@ def test_a_body_on_an_arm_is_told():
     found = reason_of_data(Trajectories.of(T, q, names=("x", "y"), units=("m", "m")))
     assert found.startswith("x, y stay on a circle about ")
     assert "--polar x,y" in found
+
+
+def test_what_was_warned_of_when_the_table_was_read_is_the_reason():
+    # fails if a misfit is said to be "the past" where the acceleration of a crane's trolley was left aside, or where
+    # the length of a swing changes: what was printed above stands a page before the verdict
+    columns = (("wind", "input", "N"), ("sway", "angle", "rad"), ("trolley acc", "left aside", "m/s²"))
+    data = Trajectories.of(T, Q[:, None], angles=(True,), units=("rad",), names=("sway",), columns=columns)
+    assert (
+        reason_of_data(data)
+        == "trolley acc was left aside, and it is of no coordinate. Try --inputs 'wind,trolley acc'"
+    )
+    assert reason_of_data(replace(data, columns=columns[:-1])) == ""
+    arm = torch.stack([Q.sin(), -Q.cos()], 1) * (1 + 0.2 * torch.sin(0.7 * T))[:, None]
+    swing = in_polar(Trajectories.of(T, arm, names=("x", "y"), units=("m", "m")), pairs_of("x,y"))
+    assert "if a length changes: --polar x,y,X,Y,r" in reason_of_data(swing)
 
 
 def test_neighbours_that_are_far_tell_nothing():

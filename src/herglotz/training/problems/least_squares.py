@@ -26,8 +26,8 @@ class LeastSquares:
 
     An objective derives `cost` and `normal_equations` (`solvers.levenberg_marquardt.SumOfSquares`) from these parts.
     The parameters of `model` are the start; the model is not changed. `sigma` is the standard deviation of the noise of
-    q over its `balance`, `freedom` the ν of Student's t (`robust`; None: least squares). `u` are the inputs of all
-    steps, or of the model steps of a grid, where these are known.
+    q over its `balance`, that of the data unless it is given, `freedom` the ν of Student's t (`robust`; None: least
+    squares). `u` are the inputs of all steps, or of the model steps of a grid, where these are known.
     """
 
     def __init__(
@@ -40,12 +40,13 @@ class LeastSquares:
         freedom: float | None = None,
         grid: SegmentGrid | None = None,
         u: Tensor | None = None,
+        balance: Tensor | None = None,  # (n,)
     ):
         self.parameters, self.data, self.n = ParameterVector(model), data, data.dof
         self.P = len(self.parameters.get())
         self.sigma, self.prior, self.freedom = sigma, prior, freedom
         # Standard deviation of each coordinate, in its unit.
-        self.deviations = sigma * data.balance  # (n,)
+        self.deviations = sigma * (data.balance if balance is None else balance)  # (n,)
         self.u = step_inputs(model, data, grid) if u is None else u  # (N, m), or (S, K, m) of a grid
 
     def loss(self, *residuals: Tensor) -> Tensor:
