@@ -41,11 +41,14 @@ def taught(task: Task, network: str, *, outliers: bool) -> Taught | None:
     None for a model whose motion does not depend on s, and where the user names terms or supervises s, or a search
     finds no terms that follow whole trajectories.
     """
-    # The recording stays as it is read: what terms miss may look like zeros of the sensors.
-    free = replace(task.config, level="auto", objective="auto", sticking=None, find_zeros=False)
     task = replace(task, base=replace(task.base, start={}))
-    model = task.build(network)
-    if not model.s_enters_motion or not terms_are_free(task.data, free):
+    model, c = task.build(network), task.config
+    # A search has one optimiser, and steps of its own.
+    if not model.s_enters_motion or c.optimiser != "lm" or c.substeps != 1:
+        return None
+    # The recording stays as it is read: what terms miss may look like zeros of the sensors.
+    free = replace(c, level="auto", objective="auto", sticking=None, find_zeros=False)
+    if not terms_are_free(task.data, free):
         return None
     lesson = _lesson(task, free, outliers)
     if lesson is None or lesson.s is None:

@@ -73,7 +73,8 @@ class Questions:
         """Find terms by which the inputs act, search the terms of the model anew with them, then the hold.
 
         A hold may have made up for a missing term of the inputs. If another hold is found now, terms of the inputs
-        that only made up for the hold leave.
+        that only made up for the hold leave. The rate of an input makes up for another hold so well, u(t + τ) being
+        u + τ u′, that no other is found beside it: every other hold is then tried without rates.
         """
         if self.best is None or not (terms := self.read.input_terms(self.best)):
             return
@@ -83,11 +84,19 @@ class Questions:
         if found is None or not found.replaces(self.best) or read.finalist(found, (self.best, found)) is not found:
             return
         self._drive(terms, self.wanted, read, found)
+        tried = []
         if self.how_inputs_hold():
-            left = taken_terms(self.read.settled(self.best, swapped=True), terms)
-            wanted, read = (x.of(replace(x.data, hold=self.hold)) for x in recorded)
-            found = _searched(read := read.driven_by(left)) if left != terms else None
+            tried = [(self.hold, taken_terms(self.read.settled(self.best, swapped=True), terms))]
+        elif self.wanted.part.step_ratio == 1:
+            others = (hold for hold in self.holds if hold != self.read.data.hold)
+            tried = [(hold, tuple(term for term in terms if not term.endswith("'"))) for hold in others]
+        for hold, left in tried:
+            if left == terms:
+                continue
+            wanted, read = (x.of(replace(x.data, hold=hold)) for x in recorded)
+            found = _searched(read := read.driven_by(left))
             if found is not None and not self.best.replaces(found):
+                self.hold = hold
                 self._drive(left, wanted, read, found)
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:

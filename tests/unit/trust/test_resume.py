@@ -40,7 +40,7 @@ def numbers(run):
 def test_the_same_numbers(case, shares, data, tmp_path, monkeypatch):
     # fails if a checkpoint lacks the damping, the scaling, the count of quiet steps, Adam's moments, the order of its
     # batches, or the path that a shooting problem starts its next solve from
-    monkeypatch.setattr(stages, "EVERY", 3)
+    monkeypatch.setattr(stages, "ITERATIONS_PER_CHECKPOINT", 3)
     written, stop = 0, 10**9
 
     def counted(path, content):
