@@ -132,7 +132,8 @@ def beside(trial: Trial, more: int) -> Trial:
 def taken_terms(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     """Those terms of `every` that a model has taken; the last inputs of its data are those that are columns."""
     columns, own = len(found.fitter.data.input_labels), columns_of(every)
-    gains = (int(name.partition("[")[2].rstrip("]")) % columns for name in found.taken if name.startswith(INPUTS))
+    # The only gain of a model has no number.
+    gains = (int(name.partition("[")[2].rstrip("]") or 0) % columns for name in found.taken if name.startswith(INPUTS))
     recorded, forces = columns - len(own), set(input_forces(every)) & found.taken
     taken = {own[k - recorded] for k in gains if k >= recorded} | forces
     return tuple(term for term in every if term in taken)

@@ -73,8 +73,8 @@ class Questions:
         """Find terms by which the inputs act, search the terms of the model anew with them, then the hold.
 
         A hold may have made up for a missing term of the inputs. If another hold is found now, terms of the inputs
-        that only made up for the hold leave. The rate of an input makes up for another hold so well, u(t + τ) being
-        u + τ u′, that no other is found beside it: every other hold is then tried without rates.
+        that only made up for the hold leave. Terms make up so well for a wrong hold, u(t + τ) being u + τ u′, that no
+        other may be found beside them: where there are rates, or the noise is not met, every hold is tried without.
         """
         if self.best is None or not (terms := self.read.input_terms(self.best)):
             return
@@ -86,16 +86,16 @@ class Questions:
         self._drive(terms, self.wanted, read, found)
         tried = []
         if self.how_inputs_hold():
-            tried = [(self.hold, taken_terms(self.read.settled(self.best, swapped=True), terms))]
+            left = taken_terms(self.read.settled(self.best, swapped=True), terms)
+            tried = [(self.hold, left)] if left != terms else []
         elif self.wanted.part.step_ratio == 1:
-            others = (hold for hold in self.holds if hold != self.read.data.hold)
-            tried = [(hold, tuple(term for term in terms if not term.endswith("'"))) for hold in others]
+            left = tuple(term for term in terms if not term.endswith("'"))
+            open_to = self.holds if left != terms or not found.at_the_noise else ()
+            tried = [(hold, left) for hold in open_to if hold != self.read.data.hold]
         for hold, left in tried:
-            if left == terms:
-                continue
             wanted, read = (x.of(replace(x.data, hold=hold)) for x in recorded)
-            found = _searched(read := read.driven_by(left))
-            if found is not None and not self.best.replaces(found):
+            read = read.driven_by(left)
+            if (found := _searched(read)) and self.read.better(self.best, found) is found:
                 self.hold = hold
                 self._drive(left, wanted, read, found)
 

@@ -14,7 +14,7 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import saturation
 from herglotz.models import ModelConfig
 from herglotz.training import questions
-from herglotz.training.acting_inputs import beside, offered_terms
+from herglotz.training.acting_inputs import beside, offered_terms, taken_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import by_position, dictionary
@@ -113,6 +113,23 @@ def test_an_accelerated_pivot_is_found():
     assert (run.predict(recorded(on_a_crane(later), later, -0.3, True, noise=0)).rms or 1) < 1e-3
 
 
+def test_a_rate_does_not_stand_for_a_hold():
+    # fails if u′ stays beside u cos q, in the place of lines between the samples: half a step of it
+    slow = lambda s: np.sin(1.1 * s) + 0.6 * np.sin(1.9 * s + 1)  # noqa: E731
+    crane = lambda s, q, v: -9.81 * np.sin(q) - 0.1 * v - 3 * slow(s) * np.cos(q)  # noqa: E731
+    data = replace(recorded(crane, slow, 0.4, True, samples=300, noise=1e-3), hold="")
+    run = hz.fit(data, train_fraction=1, progress=False)
+    assert run.metrics["plan"]["drag"] == ("u1 cos(q1)",)
+    assert run.data.input_labels == data.input_labels
+    assert run.arrival.hold != "zero"
+
+
+def test_the_only_gain_of_a_model_has_no_number():  # fails if its place is read from its name
+    fitter = SimpleNamespace(data=SimpleNamespace(input_labels=(("u", ""),)))
+    found: Any = SimpleNamespace(fitter=fitter, taken=frozenset({INPUTS, "u1 cos(q1)"}))
+    assert taken_terms(found, ("u1 cos(q1)",)) == ("u1 cos(q1)",)
+
+
 def test_forces_of_inputs_are_offered_on_the_angle_and_on_lengths():
     # fails if a thruster's force on a length is no offer, or the numbers of an arm grow with the square of its joints
     assert by_position((False, True), [2]) == (
@@ -173,6 +190,9 @@ class Asked:
 
     def finalist(self, best, _):
         return best
+
+    def better(self, _, other):
+        return other
 
     def trial(self, terms) -> Any:
         taken = {f"{INPUTS}[1]" if term == "u^2" else term for term in terms}
