@@ -111,11 +111,9 @@ def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:
         data, base = train.liveliest(MOST), task.base.stepped(steps)
         found = with_own_starts(replace(task, base=base), fitted, data, None)
         # A model that cannot be stepped explains nothing: what it misses is the motion.
-        miss, owner = data.q, data.trajectory
-        if found is not None:
-            grid = found.problem.grid
-            miss, owner = found.problem.misfit(found.path) * data.balance, grid.node // (grid.longest + 1)
-        reason = reason_of(data, miss, owner)
+        miss = data.q if found is None else found.problem.misfit(found.path) * data.balance
+        grid = found and found.problem.grid
+        reason = reason_of(data, miss, data.trajectory if grid is None else grid.node // (grid.longest + 1))
         if min(train.lengths) < 2 * FIRST_SEGMENT or coarse(half := train.thinned(2)):
             break
         train, steps = half, 2 * steps

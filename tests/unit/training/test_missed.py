@@ -1,7 +1,7 @@
 """What the residual of a model that does not fit shows of the reason."""
 
 import math
-from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -111,9 +111,11 @@ def test_a_model_that_cannot_be_stepped_is_judged_by_the_motion(monkeypatch):
     monkeypatch.setattr(verdict, "with_own_starts", lambda *_: None)
     data = Trajectories.of(T, noisy()[:, None])
     task = Task(data, estimate_baseline(data), FitConfig(), Stages())
-    assert "It misses differently" in verdict._reason_of_residuals(task, None, data)  # pyright: ignore
-    plain = Trajectories.of(T, noisy(torch.sin(T))[:, None])
-    assert verdict._reason_of_residuals(replace(task, data=plain), None, plain) == ""  # pyright: ignore
+    none: Any = None
+    seen: Any = SimpleNamespace(train=data, outlying=())
+    assert "It misses differently" in verdict._reason_of_residuals(task, none, seen)
+    seen.train = Trajectories.of(T, noisy(torch.sin(T))[:, None])
+    assert verdict._reason_of_residuals(task, none, seen) == ""
 
 
 def test_few_samples_show_nothing():  # fails if an empty table of neighbours raises
