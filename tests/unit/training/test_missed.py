@@ -1,6 +1,7 @@
 """What the residual of a model that does not fit shows of the reason."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
