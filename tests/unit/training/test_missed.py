@@ -119,6 +119,19 @@ def test_a_model_that_cannot_be_stepped_is_judged_by_the_motion(monkeypatch):
     assert verdict._reason_of_residuals(task, none, seen) == ""
 
 
+def test_residuals_are_in_units_of_q(monkeypatch):
+    # fails if what a model misses stays over the balance, where its noise is in units of q
+    grid = SimpleNamespace(node=torch.arange(N), longest=N)
+    problem, asked = SimpleNamespace(misfit=lambda _: torch.ones(N, 2), grid=grid), []
+    monkeypatch.setattr(verdict, "with_own_starts", lambda *_: SimpleNamespace(problem=problem, path=None))
+    monkeypatch.setattr(verdict, "reason_of", lambda _, miss, __: asked.append(miss) or "")
+    data = Trajectories.of(T, torch.stack([Q, 100 * Q], -1), units=("rad", "mm"))
+    seen: Any = SimpleNamespace(train=data, outlying=())
+    fitted: Any = None
+    verdict._reason_of_residuals(Task(data, estimate_baseline(data), FitConfig(), Stages()), fitted, seen)
+    assert asked[0][0].tolist() == pytest.approx([0.01, 1.0])
+
+
 def test_few_samples_show_nothing():  # fails if an empty table of neighbours raises
     rows = FEW + 7
     data = Trajectories.of(T[:rows], noisy()[:rows, None])
