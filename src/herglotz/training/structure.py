@@ -190,7 +190,8 @@ def search(
     settings = replace(settings, dtype=config.dtype, device=config.device)
     base = replace(found_base, low=base.low, high=base.high)
     if asked.hold:
-        why["hold"] = f"the terms that were found with hold {data.hold} miss the data by less with {asked.hold}"
+        better = "the data are missed by less, or met with fewer terms"
+        why["hold"] = f"with hold {asked.hold} {better} than with {data.hold}"
     if asked.input_terms:
         why["input_terms"] = "held-out blocks of time are missed by less with them"
     if differ is not None:

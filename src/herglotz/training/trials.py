@@ -325,7 +325,7 @@ class Fitter:
     def leap(self, trial: Trial) -> Trial:
         """The model over whole trajectories at once or, if it does not follow these closely, as `grow`."""
         whole = self.fit(trial.taken, trial.values, self.lengths[-1], trial)
-        return self.grow(trial) if whole is None or whole.rms > FOLLOWED * self.spread else whole
+        return whole if whole is not None and whole.near else self.grow(trial)
 
 
 def is_precise(data: Trajectories) -> bool:
