@@ -39,8 +39,8 @@ POTENTIAL_WAVES_OF_MANY = 15
 PLANE_PAIRS = 80
 # Waves of the mass of the only coordinate.
 MASS_WAVES = 7
-# Pairs of cos and sin of the damping as a function of position.
-DAMPING_PAIRS = 3
+# Pairs of cos and sin of the damping as a function of position: of the only coordinate, and of each of several.
+DAMPING_PAIRS, DAMPING_PAIRS_OF_MANY = 7, 3
 # Pairs of cos and sin of the friction as a function of speed.
 FRICTION_PAIRS = 7
 
@@ -74,7 +74,9 @@ def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Ban
     """
     found: dict[str, list[tuple[str, float]]] = {}
     several = data.dof > 1
-    pairs, mass = (POTENTIAL_WAVES // 2, POTENTIAL_WAVES) if fine and not several else (DAMPING_PAIRS, MASS_WAVES)
+    pairs, mass = DAMPING_PAIRS_OF_MANY if several else DAMPING_PAIRS, MASS_WAVES
+    if fine and not several:
+        pairs, mass = POTENTIAL_WAVES // 2, POTENTIAL_WAVES
     count = POTENTIAL_WAVES_OF_MANY if several else POTENTIAL_WAVES
     for i, angle in enumerate(data.angles):
         own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], count)

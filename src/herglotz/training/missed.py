@@ -7,9 +7,10 @@ looked for:
 * positions on a circle, which one angle gives, or a distance from its centre that changes;
 * an acceleration of something else, a crane's trolley, that was left aside;
 * an input that was recorded more slowly than the motion and filled in: its steps act at times between rows;
+* kicks, as of blows and end stops: a twentieth of the samples has more than half of the sum of squares, in several
+  places with little before and after each;
 * the past: the lacking accelerations differ where positions, velocities and inputs of two times are alike, so that no
-  function of these gives the accelerations;
-* kicks: the same, and a twentieth of the samples has more than half of the sum of squares.
+  function of these gives the accelerations; or the past of the motion explains half of what these do not (`past`).
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from herglotz.data.polar import LENGTH, with_hints
 from herglotz.data.rates import filled_inputs
 from herglotz.data.roughness import SAMPLES, precisions
 from herglotz.data.units import size
+from herglotz.training.feedback import HALF
+from herglotz.training.past import left_by_the_past
 
 # Most samples: the distances between all of them take 32 MB.
 MOST = 2000
@@ -39,6 +42,12 @@ NEAR = 0.5
 OTHER = 0.15
 # The same over the noise: curvatures of windows that share samples differ by 1.5 times the noise by chance.
 CLEAR = 2.0
+# Samples of a kick: blows of a ball that bounces follow one another within 20 samples, and noise is less in five.
+KICK_SAMPLES = (3, 5)
+# Share of its square that an acceleration has before and after a kick, at the most.
+QUIET = 0.1
+# Fewest kicks. Motion that decays has its largest accelerations in one or two places.
+KICKS = 5
 
 
 def reason_of_data(data: Trajectories) -> str:
@@ -67,44 +76,68 @@ def reason_of(
     owner: Tensor,  # (N,) free run of each sample
 ) -> str | None:
     """The reason of a misfit, and what to try, in sentences; "" where none is shown, None where noise hides it."""
-    first = torch.arange(max(0, data.samples - SAMPLES + 1), device=data.t.device)
-    first = first[owner[first] == owner[first + SAMPLES - 1]]
-    if len(first) < FEW:
+    at = _Parabolas(data, owner, SAMPLES)
+    if len(at.rows) < FEW:
         return ""
-    rows = first[:, None] + torch.arange(SAMPLES, device=data.t.device)
-    h = data.t[rows].diff(dim=1).mean(1)[:, None]
-    place = torch.arange(SAMPLES).to(data.q) - SAMPLES // 2
-    value, slope, bend = torch.linalg.pinv(torch.stack([place**0, place, place**2 / 2], -1))
-    at = lambda weights, x: (weights[:, None] * x[rows]).sum(1)  # noqa: E731
-    noise = precisions(data).to(data.q) * data.balance * bend.norm() / h**2
-    lacking = at(bend, miss) / h**2
-    lacking, noise = lacking / lacking.std(0), noise / lacking.std(0)
-    q, turning = at(value, data.q), torch.tensor(data.angles, device=miss.device)
-    state = [q[:, ~turning], q[:, turning].sin(), q[:, turning].cos(), at(slope, data.q) / h]
-    state += [] if data.u is None else [at(value, data.u)]
-    x = torch.cat(state, 1)
-    middle = rows[:, SAMPLES // 2]
+    lacking = at(miss, 2)
+    noise = precisions(data).to(data.q) * data.balance * at.weights[2].norm() / at.h**2 / lacking.std(0)
+    lacking = lacking / lacking.std(0)
+    q, turning = at(data.q), torch.tensor(data.angles, device=miss.device)
+    state = [q[:, ~turning], q[:, turning].sin(), q[:, turning].cos(), at(data.q, 1)]
+    state += [] if data.u is None else [at(data.u)]
+    x, middle = torch.cat(state, 1), at.rows[:, SAMPLES // 2]
     hidden = float(noise.square().mean())
-    if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle):
-        return None if hidden > OTHER else ""
-    if (kick := _kick(lacking)) is not None:
-        row, unit = int(middle[kick]), "" if data.time_unit == "1" else data.time_unit
+    if (row := _kick(data, miss, owner)) is not None:
+        unit = "" if data.time_unit == "1" else data.time_unit
         when = f"t = {size(float(data.t[row]), unit)} of trajectory {int(data.trajectory[row])}"
         return (
             f"What is missed comes in kicks, the hardest at {when}. Try what strikes as an input (--inputs), or "
             "recordings that are cut there"
         )
+    if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle):
+        by_state, by_past = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
+        if not (by_state > OTHER * (1 - hidden) and by_past < HALF * by_state):
+            return None if hidden > OTHER else ""
     return (
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
         "what was not recorded. Try --level full, whose action remembers, or record what else acts (--inputs)"
     )
 
 
-def _kick(lacking: Tensor) -> int | None:
-    """Row of the largest acceleration of (K, n), if the accelerations are kicks; else None."""
-    square = lacking.square().sum(1)
-    top = square.argsort(descending=True)[: len(square) // FEW]
-    return int(top[0]) if float(square[top].sum()) > 0.5 * float(square.sum()) else None
+class _Parabolas:
+    """Parabolas through all windows of so many samples that lie in one free run: `rows` (K, width) and mean steps `h`.
+
+    `weights` (3, width) give the value in the middle, the slope and the curvature, in steps.
+    """
+
+    def __init__(self, data: Trajectories, owner: Tensor, width: int):
+        first = torch.arange(max(0, data.samples - width + 1), device=data.t.device)
+        first = first[owner[first] == owner[first + width - 1]]
+        self.rows = first[:, None] + torch.arange(width, device=data.t.device)
+        self.h = data.t[self.rows].diff(dim=1).mean(1)[:, None]
+        place = torch.arange(width).to(data.q) - width // 2
+        self.weights = torch.linalg.pinv(torch.stack([place**0, place, place**2 / 2], -1))
+
+    def __call__(self, x: Tensor, order: int = 0) -> Tensor:
+        """The derivative of this order of x (N, m) in the middle of each window, (K, m)."""
+        return (self.weights[order][:, None] * x[self.rows]).sum(1) / self.h**order
+
+
+def _kick(data: Trajectories, miss: Tensor, owner: Tensor) -> int | None:
+    """Row of the hardest kick, if the lacking accelerations are kicks; else None."""
+    for width in KICK_SAMPLES:
+        at = _Parabolas(data, owner, width)
+        square = (at(miss, 2) / miss.std(0)).square().sum(1)
+        top = square.argsort(descending=True)[: len(square) // FEW]
+        # Windows of a kick share its sample; those before and after it do not.
+        around = torch.nn.functional.pad(square, (2 * width, 2 * width)).unfold(0, 4 * width + 1, 1)[top]
+        beside = torch.cat([around[:, : width + 1], around[:, 3 * width :]], 1)
+        alone = top[beside.amax(1) < QUIET * square[top]]
+        places = 1 + int((alone.sort().values.diff() > width).sum())
+        most = float(square[top].sum())
+        if places >= KICKS and most > HALF * float(square.sum()) and float(square[alone].sum()) > HALF * most:
+            return int(at.rows[top[0], width // 2])
+    return None
 
 
 def _is_other(lacking: Tensor, noise: float, x: Tensor, row: Tensor) -> bool:

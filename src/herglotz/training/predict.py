@@ -184,8 +184,7 @@ def predict(
     x = state_of(states)
     # p at a sample belongs to the last model step before the sample, which is shorter than the recorded step.
     v = velocities(run.model, x, torch.tensor(run.h if most == 1 else float(h.median())))
-    free = ~leading(data.lengths, (warmup,) * len(data))
-    rows = [(free & (data.trajectory == b)).nonzero()[:, 0] for b in range(len(data))]
+    rows = [(data.trajectory == b).nonzero()[:, 0] for b in range(len(data))]
     beyond = farthest(quantities_outside(run.box, data, data.t[r], x.q[r], x.p[r]) for r in rows)
     return Prediction(data, x, warmup, every, most, outside, zeros, beyond, v)
 
