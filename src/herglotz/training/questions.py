@@ -128,10 +128,10 @@ class Questions:
                 self.best = best and (best if best is self.best else self.read.settled(best, swapped=True))
             return
         longer = self.wanted.part.step_ratio > 1
-        self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
+        self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
         if longer and self.best is not None and (hold := self.read.better_hold(self.best, self.holds)):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
-            self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ is not None)
+            self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
 
 
 def _searched(search: Search) -> Trial | None:

@@ -124,12 +124,18 @@ class Search:
         found = best and without_injecting_friction(self, self.finalist(best, ends))
         return found and with_sticking(self, found)
 
-    def of_part(self, found: Trial | None, differ: bool) -> Zeroed:
+    def of_part(self, found: Trial | None, differ: tuple[Tensor, Tensor] | None) -> Zeroed:
         """The model found in `part`, fitted to all data and settled there.
 
-        `differ`: zeros of sensors that differ between recordings were found in the part, and are fitted again.
+        `differ` are zeros of sensors that were found in the part, and are fitted again: from these values if the part
+        is of all recordings.
         """
-        read, best, zeros = self.with_zeros(found and self.again(found), accepted=differ)
+        if found is not None and differ is not None and len(differ[0]) == len(self.data):
+            read = self.of(measured(self.data, differ[0].flatten().tolist()))
+            best = read.again(found)
+            read, best, zeros = (read, best, differ) if best is None else self.zeros_again(read, best, differ)
+        else:
+            read, best, zeros = self.with_zeros(found and self.again(found), accepted=differ is not None)
         return read, best and read.settled(best), zeros
 
     def again(self, found: Trial) -> Trial | None:
