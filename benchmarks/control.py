@@ -1,10 +1,10 @@
 """The exported step in control: `python benchmarks/control.py [--quick] [--only PART ...] [--out FOLDER]`.
 
 `nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
-as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `loop`: a real-time iteration in
-closed loop (`control_loop.py`). `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time;
-what is compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and
-control.md.
+as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `l4casadi`: the same by L4CasADi,
+where it is installed (`control_l4casadi.py` says how). `loop`: a real-time iteration in closed loop
+(`control_loop.py`). `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time; what is
+compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and control.md.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +139,45 @@ def nlp(quick: bool, folder: Path) -> list[Row]:
     return rows
 
 
+def l4casadi(quick: bool, folder: Path) -> list[Row]:
+    """What all gaps and their Jacobian take, over ours, and what IPOPT makes of them."""
+    from benchmarks.control_l4casadi import interval
+
+    calls, at = [], np.concatenate([np.linspace(np.zeros(5), UPRIGHT, N + 1).ravel(), np.full(N, 0.1)])
+    forms = (exported(folder)[1], interval(N, STEPS, folder))
+    for ahead in forms:
+        of = problem(ahead)[0]
+        calls.append(ca.Function("both", [of["x"], of["p"]], [of["g"], ca.jacobian(of["g"], of["x"])]))
+    (ours, slopes), (theirs, others) = ([np.array(ca.densify(x)) for x in call(at, np.zeros(5))] for call in calls)
+    apart = max(float(abs(ours - theirs).max()), float(abs(slopes - others).max() / abs(slopes).max()))
+    assert apart < 1e-3, apart  # the same functions, in float32
+    ratios, ms = [], []
+    for k in range(15 if quick else 50):
+        taken = []
+        for call, count in zip(calls, (20, 2), strict=True):
+            began = time.process_time()
+            for _ in range(count):
+                call(at, np.zeros(5))
+            taken.append((time.process_time() - began) / count)
+        if k >= 10:  # TorchScript compiles in the first calls
+            ratios.append(taken[1] / taken[0])
+            ms.append(1e3 * taken[1])
+    of, options = problem(forms[1])
+    options["ipopt"] |= {"max_iter": 500}
+    solved = ca.nlpsol("solver", "ipopt", of, options)
+    with suppress(AssertionError):
+        solve(solved)
+    stats = solved.stats()
+    inside = sum(x for key, x in stats.items() if key.startswith("t_proc_nlp"))
+    note = f"{statistics.median(ms):.1f} ms; {min(ratios):.0f} to {max(ratios):.0f}"
+    ended = f"{stats['return_status']}, at a tolerance of 1e-4 in float32; functions took {inside:.1f} s"
+    what = "gaps of the swing-up with their Jacobian, L4CasADi over ours"
+    return [
+        {"what": what, "value": statistics.median(ratios), "target": ">= 10", "note": note},
+        {"what": "iterations of IPOPT on L4CasADi's", "value": stats["iter_count"], "note": ended},
+    ]
+
+
 def loop(quick: bool, folder: Path) -> list[Row]:
     """From random starts: up for 10 s after at most 5 s, and the time of an iteration."""
     export_casadi(model(), folder / "model.c", h=H, name="model")
@@ -194,7 +235,7 @@ def jacobian(quick: bool, folder: Path) -> list[Row]:
     return rows
 
 
-PARTS = {"nlp": nlp, "loop": loop, "jacobian": jacobian}
+PARTS = {"nlp": nlp, "l4casadi": l4casadi, "loop": loop, "jacobian": jacobian}
 
 
 def table(rows: list[Row]) -> str:
@@ -219,6 +260,9 @@ def main(argv: list[str] | None = None) -> None:
     path = harness.json_file(arguments, "control")
     parts = harness.load(path, {"parts": {}})["parts"]
     for name in arguments.only or PARTS:
+        if name == "l4casadi" and find_spec(name) is None:
+            print("l4casadi is not installed: its rows are those of the last run with it")
+            continue
         with tempfile.TemporaryDirectory(prefix="herglotz-bench-") as folder:
             parts[name] = PARTS[name](arguments.quick, Path(folder))
         rows = [row for part in PARTS for row in parts.get(part, [])]
