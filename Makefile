@@ -89,8 +89,8 @@ coverage: .venv/installed
 	$(PY) -m coverage combine --quiet
 	$(PY) -m coverage report --fail-under 92
 
-# Break the package place by place: 25 mutants a room and more, each to be noticed by the tests of its own room. It can
-# be stopped and goes on where it was; CONTRIBUTING.md has what was noticed.
+# Break the package place by place: 40 mutants a room, each to be noticed by the tests of its own room. It can be
+# stopped and goes on where it was; CONTRIBUTING.md has what was noticed.
 mutants: .venv/installed
 	$(ENV) $(PY) tests/mutants.py
 

@@ -1,10 +1,9 @@
 """Break the package on purpose, one place at a time, and see whether the tests of that room notice: `make mutants`.
 
-Two kinds of mutants: those of `mutant_list.py`, written by hand, and a sample of all that `mutant_operators.py` finds,
-which fills every room up to `--least` mutants. First the tests of the rooms run on the sound sources, which says what
-each test costs and which functions it calls; then each mutant, on a copy of the sources, meets the tests of its own
-room that call its function, the cheapest first, until one fails. All of it forks from one process that has torch
-loaded.
+The mutants are a sample of all that `mutant_operators.py` finds, `--number` of each room. First the tests of the rooms
+run on the sound sources, which says what each test costs and which functions it calls; then each mutant, on a copy of
+the sources, meets the tests of its own room that call its function, the cheapest first, until one fails. All of it
+forks from one process that has torch loaded.
 
 What was found is kept in `runs/mutants`: a run that was stopped goes on where it stopped, and only what changed since
 (the mutated file, a test file, for a survivor) is tried again. `--shard 2/4` takes every fourth mutant.
@@ -34,7 +33,6 @@ import matplotlib.pyplot  # noqa: F401
 import pytest
 import torch
 
-from mutant_list import ALIKE, MUTANTS
 from mutant_operators import sample
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,7 +53,6 @@ ROOMS = {  # room → where its tests are
 }
 SURVEY_SECONDS = 150  # of processor time for the sound run of a test file; tests beyond are not used
 MUTANT_SECONDS = 30  # of processor time for all tests of a mutant; what has not noticed by then, has not
-C_WRITER = "export/c_header.py"  # whose tests meet the mutants of the C runtime
 MOST_SECONDS = 900  # by the clock, for a child that blocks
 SHARED = ""  # the name of what the tests of a file share: its import, and fixtures that are set up once
 PATIENCE = 5  # a test that takes so many times what it took on the sound sources, and 10 s more, has noticed
@@ -86,30 +83,13 @@ def _digest(*parts: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
-def everything(least: int, seed: int) -> list[Mutant]:
-    """The mutants of the list, and drawn ones of the rooms of which it has fewer than `least`."""
-    found, alike = written(), {same[:4] for same in ALIKE}
-    for room in ROOMS:
-        missing = max(0, least - sum(m.room == room for m in found))
-        found += [Mutant(*m) for m in sample(ROOT / "src" / "herglotz", room, missing, seed, alike)]
-    return found
-
-
-def written() -> list[Mutant]:
-    """The mutants of the list; one whose line is gone is an error of the list."""
-    found = []
-    for name, old, new in MUTANTS:
-        at = source(name).find(old)
-        if at < 0:
-            raise SystemExit(f"{name}: no line with {old!r}; the list of mutants is out of date")
-        found.append(Mutant(name, at, old, new))
-    return found
+def drawn(number: int, seed: int) -> list[Mutant]:
+    """So many mutants of each room."""
+    return [Mutant(*m) for room in ROOMS for m in sample(ROOT / "src" / "herglotz", room, number, seed)]
 
 
 def function_of(mutant: Mutant) -> int | None:
     """The first line of the innermost function around the mutant, as code objects count it; None outside functions."""
-    if not mutant.name.endswith(".py"):
-        return None
     text = source(mutant.name)
     line = text.count("\n", 0, mutant.at) + 1
     inside = [
@@ -316,7 +296,7 @@ def tests_of(mutant: Mutant, found: dict[str, dict[str, Any]]) -> dict[str, floa
 
     Last come those of files whose tests share what it makes. The cost has what is shared: any test may pay for it.
     """
-    line, files, python = function_of(mutant), ROOMS[mutant.room], mutant.name.endswith(".py")
+    line, files = function_of(mutant), ROOMS[mutant.room]
     chosen: list[tuple[bool, float, str, float]] = []
     for name, tests in found.items():
         if not tests or not any(name.startswith(folder + "/") for folder in files):
@@ -325,7 +305,7 @@ def tests_of(mutant: Mutant, found: dict[str, dict[str, Any]]) -> dict[str, floa
             test
             for test, row in tests.items()
             for file, at in row["calls"]
-            if file == (mutant.name if python else C_WRITER) and line in (None, at)
+            if file == mutant.name and line in (None, at)
         }
         shared = tests[SHARED]["seconds"]
         chosen += [
@@ -368,18 +348,12 @@ def main() -> int:
     """Run the mutants that are chosen and print a line each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="mutants whose file name contains this")
-    parser.add_argument(
-        "--least",
-        type=int,
-        default=25,
-        metavar="N",
-        help="mutants a room; where the list has fewer, others are drawn (default: 25)",
-    )
+    parser.add_argument("--number", type=int, default=40, help="mutants a room (default: 40)")
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
     parser.add_argument("--shard", default="1/1", metavar="K/N", help="every N-th mutant, from the K-th")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="at the same time (default: cores)")
     arguments = parser.parse_args()
-    chosen = [m for m in everything(arguments.least, arguments.seed) if arguments.only in m.name]
+    chosen = [m for m in drawn(arguments.number, arguments.seed) if arguments.only in m.name]
     k, n = map(int, arguments.shard.split("/"))
     chosen = chosen[k - 1 :: n]
     KEPT.mkdir(parents=True, exist_ok=True)

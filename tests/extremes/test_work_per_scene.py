@@ -142,7 +142,7 @@ def test_a_separable_scene_solves_nothing(name, monkeypatch):
     model = build(0.1, **settings)
     calls = count_calls(
         monkeypatch,
-        (engine, "find_root") if hasattr(engine, "find_root") else (engine, "solve_step"),
+        (engine, "find_root"),
         (newton, "solve"),
         (torch.linalg, "solve_ex"),
         (Network, "forward"),
@@ -151,7 +151,7 @@ def test_a_separable_scene_solves_nothing(name, monkeypatch):
     )
     with torch.no_grad():
         Stepper(model).rollout(*starts(3, dof=model.dof), h=0.1, steps=10)
-    solves = calls["find_root"] + calls["solve_step"]
+    solves = calls["find_root"]
     if name in EXPLICIT:
         assert solves == calls["solve"] == calls["solve_ex"] == calls["forward"] == 0
         assert calls["__call__"] == 11  # the force at q0, then once a step

@@ -6,9 +6,7 @@ import copy
 import ctypes
 import math
 import re
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -17,7 +15,8 @@ from herglotz.codegen.c_compiler import build, compiler
 from herglotz.data import Trajectories
 from herglotz.data.gaps import complete
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_DERIVATIVES, export_c, runtime
+from herglotz.export.c_header import MAX_DERIVATIVES, runtime
+from herglotz.export.c_wrappers import header_of
 from herglotz.export.lower.c_parameters import without_parameters
 from herglotz.mechanics import legendre_minus
 from herglotz.models import ContactLagrangian
@@ -111,9 +110,7 @@ def _likelihood(run: FittedRun) -> Callable[[Tensor], float]:
     """−2 log p of the run's data as a function of the logarithms of the levels (2n,); infinite where a step fails."""
     model = copy.deepcopy(run.model).double()
     data = complete(run.data).unwrapped().to(dtype=torch.float64, device="cpu")
-    with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
-        path = export_c(model, Path(folder, "noise.h"), h=run.h, name="noise", extras=["filter"])
-        header = path.read_text(encoding="utf-8")
+    header = header_of(model, "noise", {"h": run.h, "extras": ["filter"]})
     library = build(header, re.sub(r"\bhz_", "noise_", without_parameters(runtime("innovations.c"))))
     parts, rows, places, steps = _parts(data, run.h_range[1])
     starts, slopes = [], []

@@ -1,6 +1,7 @@
 """A law that is nonlinear in s, L = v²/2 − V − γ s − β s², found from positions by a fit with default settings."""
 
 import math
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,6 +14,7 @@ from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dissipation import with_dissipation
 from herglotz.training.search import Search
+from tests import runge_kutta
 
 GAMMA, BETA, GAIN = 0.1, 0.2, 0.8
 H, STEPS, FINE = 0.1, 150, 4
@@ -35,11 +37,7 @@ def recorded(count, noise, seed, driven=False, steps=STEPS, s0=0.0):
     found = [x[:, 0]]
     for k in range(steps):
         for _ in range(FINE):
-            h = H / FINE
-            k1 = slope(x, u[:, k])
-            k2 = slope(x + h / 2 * k1, u[:, k])
-            k3 = slope(x + h / 2 * k2, u[:, k])
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(x + h * k3, u[:, k]))
+            x = runge_kutta.step(partial(slope, u=u[:, k]), x, H / FINE)
         found.append(x[:, 0])
     q = torch.stack(found, 1)
     q = (q + noise * torch.randn(q.shape, generator=make, dtype=torch.float64)).reshape(-1, 1)

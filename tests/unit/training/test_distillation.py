@@ -1,6 +1,7 @@
 """Networks whose motion depends on s: they recover laws that positions alone leave open, and start at named terms."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from herglotz.training.problems.recorded_action import action
 from herglotz.training.stages import Stages
 from herglotz.training.structure import Structure
 from herglotz.training.task import Task
+from tests import runge_kutta
 
 H, SUBSTEPS = 0.1, 5
 GAMMA, BETA = 0.1, 0.15
@@ -43,10 +45,7 @@ def recorded(law, noise=0.0, trajectories=4, steps=60):
     x = torch.cat([3 * draw(trajectories, 1) - 1.5, 2 * draw(trajectories, 1) - 1, torch.zeros(trajectories, 1)], 1)
     rows, h = [x], H / SUBSTEPS
     for k in range(steps * SUBSTEPS):
-        a = field(law, x)
-        b = field(law, x + h / 2 * a)
-        c = field(law, x + h / 2 * b)
-        x = x + h / 6 * (a + 2 * b + 2 * c + field(law, x + h * c))
+        x = runge_kutta.step(partial(field, law), x, h)
         rows += [x] if (k + 1) % SUBSTEPS == 0 else []
     q, _, s = torch.stack(rows, 1).flatten(0, 1).unbind(-1)
     true = rates(law, q, s)

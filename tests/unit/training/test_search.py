@@ -27,6 +27,7 @@ from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
 from herglotz.training.trials import Variant
+from tests import runge_kutta
 
 NOISE = 0.003
 T = TypeVar("T")
@@ -102,15 +103,15 @@ def test_friction_that_holds_is_fitted_as_such():
 
 def rolled(acceleration, starts, steps, h, noise, angles=(False, True)):
     """Motion of two coordinates by Runge and Kutta: q″ = acceleration(q, q′)."""
+
+    def rate(x):
+        return torch.cat([x[:, 2:], torch.stack(acceleration(*x.T), -1)], -1)
+
     state, samples = starts, []  # (B, 4)
     for _ in range(steps + 1):
         samples.append(state[:, :2])
         for _ in range(4):
-            slopes, part = [torch.zeros_like(state)], h / 4
-            for reach in (0, part / 2, part / 2, part):
-                y = state + reach * slopes[-1]
-                slopes.append(torch.cat([y[:, 2:], torch.stack(acceleration(*y.T), -1)], -1))
-            state = state + part / 6 * (slopes[1] + 2 * slopes[2] + 2 * slopes[3] + slopes[4])
+            state = runge_kutta.step(rate, state, h / 4)
     q = torch.stack(samples, 1).flatten(0, 1)
     q = q + noise * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
     t = (h * torch.arange(steps + 1, dtype=q.dtype)).repeat(len(starts))

@@ -9,6 +9,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import _wide_enough
+from tests import runge_kutta
 
 NOISE = 1e-3
 
@@ -23,10 +24,7 @@ def stiffening(count=81, h=0.1):
     positions = [y[0]]
     for _ in range(count - 1):
         for _ in range(20):
-            k1 = rate(y)
-            k2 = rate(y + d / 2 * k1)
-            k3 = rate(y + d / 2 * k2)
-            y = y + d / 6 * (k1 + 2 * k2 + 2 * k3 + rate(y + d * k3))
+            y = runge_kutta.step(rate, y, d)
         positions.append(y[0])
     noise = NOISE * torch.randn(count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     t = torch.arange(count, dtype=torch.float64) * h
