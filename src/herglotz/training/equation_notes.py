@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import NamedTuple
 
 from torch import Tensor
@@ -10,7 +11,8 @@ from torch import Tensor
 from herglotz.data.trajectories import GAP
 from herglotz.data.units import common_unit, size
 from herglotz.errors import InputError
-from herglotz.models import refuse_own
+from herglotz.models import ContactLagrangian, refuse_own
+from herglotz.models.drag import input_forces
 from herglotz.training.baseline import JITTER
 from herglotz.training.equation_terms import is_formula, newtonian
 from herglotz.training.equation_words import plain
@@ -57,11 +59,25 @@ def _inputs(run: FittedRun) -> str:
     if not run.model.inputs or run.decided.frequencies:
         return ""
     hold, unit = run.arrival.hold, "" if run.data.time_unit == "1" else f" {run.data.time_unit}"
-    names = ", ".join(name for name, _ in run.data.input_labels)
+    every, acting = [name for name, _ in run.data.input_labels], set(acting_inputs(run.model))
+    if idle := ", ".join(name for k, name in enumerate(every) if k not in acting):
+        idle = f"{idle}: without effect of its own, and still an argument of the model's steps"
+    if not acting:
+        return idle
+    names = ", ".join(name for k, name in enumerate(every) if k in acting)
     delay, lag = run.arrival.late
     late = [f"acting {delay:.6g}{unit} later"] if delay else []
     late += [f"through a lag T = {lag:.6g}{unit}, T f′ = {names} − f, f being what acts"] if lag else []
-    return ", ".join([f"{names}: {BETWEEN.get(hold or 'zero', hold)}", *late])
+    acts = ", ".join([f"{names}: {BETWEEN.get(hold or 'zero', hold)}", *late])
+    return f"{acts}; {idle}" if idle else acts
+
+
+def acting_inputs(model: ContactLagrangian) -> list[int]:
+    """Indices of the inputs that a force of the model depends on: by the map from inputs to forces, or by its drag."""
+    assert model.friction is not None
+    by_map = model.friction.input_map.detach().abs().sum(0).tolist()
+    forces = " ".join(input_forces(model.config.drag))
+    return [k for k, gain in enumerate(by_map) if gain or re.search(rf"\bu{k + 1}\b", forces)]
 
 
 def _sensors(run: FittedRun) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from copy import deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,7 +17,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace
 from herglotz.training.equation import equation_of
-from herglotz.training.equation_notes import _is_lost, notes_of
+from herglotz.training.equation_notes import _is_lost, acting_inputs, notes_of
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.identifiability import joint_of
 from herglotz.training.recorded_range import box_of
@@ -186,6 +187,23 @@ def driven(**more):
 def test_what_moves_the_model_beside_its_equation_stands_below_it(more, words):
     # fails if nobody can know what an input is between samples, or that a coordinate is not what the sensor reads
     assert words in driven(**more)
+
+
+def test_an_input_without_effect_is_said_to_be_one():
+    # fails if an input that no force depends on is said to be held, as if it acted; or one that acts through a position
+    # alone is said to be idle
+    run = run_of(*MODELS["joints"], count=2, steps=20)
+    friction = run.model.friction
+    assert friction is not None
+    with torch.no_grad():
+        friction.input_map[:, 1] = 0
+    assert "u1: held from each sample to the next; u2: without effect of its own, and still" in " ".join(notes_of(run))
+    with torch.no_grad():
+        friction.input_map[:] = 0
+    assert "u1, u2: without effect of its own, and still" in " ".join(notes_of(run))
+    model = deepcopy(run.model)
+    model.config = replace(model.config, drag=("u2 cos(q2)",))
+    assert acting_inputs(model) == [1]
 
 
 def test_delay_and_lag_stand_below_the_equation(monkeypatch):
