@@ -73,10 +73,14 @@ def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
 
 
 def by_position(angles: tuple[bool, ...], inputs: Iterable[int]) -> tuple[str, ...]:
-    """Forces u cos q and u sin q of these inputs, counted from 1, and all angles, on the angle and on every length."""
+    """Forces of these inputs, counted from 1: u cos q and u sin q of every angle, on the angle and on every length, and
+    u q and u q² of every length, on that length.
+    """
     to = [(j, "" if i == j else f" on q{i}") for j, angle in enumerate(angles, 1) if angle
           for i, other in enumerate(angles, 1) if i == j or not other]  # fmt: skip
-    return tuple(f"u{k} {f}(q{j}){on}" for k in inputs for j, on in to for f in ("cos", "sin"))
+    turned = [f"{f}(q{j}){on}" for j, on in to for f in ("cos", "sin")]
+    moved = [f"q{j}{power}" for j, angle in enumerate(angles, 1) if not angle for power in ("", "^2")]
+    return tuple(f"u{k} {factor}" for k in inputs for factor in (*turned, *moved))
 
 
 def _inputs_by_position(c: ModelConfig) -> tuple[str, ...]:

@@ -113,6 +113,15 @@ def test_an_accelerated_pivot_is_found():
     assert (run.predict(recorded(on_a_crane(later), later, -0.3, True, noise=0)).rms or 1) < 1e-3
 
 
+def test_a_force_factor_that_falls_with_the_stroke_is_found():
+    # fails if inputs act through angles alone: the coil of a loudspeaker had a mass that changes with its position
+    coil = lambda s, q, v: -20 * q - v + 3 * sway(s) * (1 - 4 * q * q)  # noqa: E731
+    run = hz.fit(recorded(coil, sway, 0.02, False, samples=150), train_fraction=1, progress=False)
+    assert run.metrics["plan"]["drag"] == ("u1 q1^2",)
+    assert run.model.get_parameter("drag.coefficient").item() == pytest.approx(-12, abs=0.1)
+    assert run.metrics["verdict"].startswith("fits to the noise")
+
+
 def test_a_rate_does_not_stand_for_a_hold():
     # fails if u′ stays beside u cos q, in the place of lines between the samples: half a step of it
     slow = lambda s: np.sin(1.1 * s) + 0.6 * np.sin(1.9 * s + 1)  # noqa: E731
@@ -133,10 +142,10 @@ def test_the_only_gain_of_a_model_has_no_number():  # fails if its place is read
 def test_forces_of_inputs_are_offered_on_the_angle_and_on_lengths():
     # fails if a thruster's force on a length is no offer, or the numbers of an arm grow with the square of its joints
     assert by_position((False, True), [2]) == (
-        "u2 cos(q2) on q1", "u2 sin(q2) on q1", "u2 cos(q2)", "u2 sin(q2)",
+        "u2 cos(q2) on q1", "u2 sin(q2) on q1", "u2 cos(q2)", "u2 sin(q2)", "u2 q1", "u2 q1^2",
     )  # fmt: skip
     assert len(by_position((True, True), [1, 2])) == 8
-    assert by_position((False,), [1]) == ()
+    assert by_position((False,), [1]) == ("u1 q1", "u1 q1^2")
 
 
 def test_one_kernel_serves_all_forces_of_an_input():
