@@ -74,12 +74,12 @@ def run(arguments: argparse.Namespace) -> int:
         check_output_file(out, (".csv", ".npz"), arguments.force)
     import_torch()
 
-    from herglotz.data import load
     from herglotz.training import load_run
+    from herglotz.training.fitted_run import as_recorded
     from herglotz.training.recorded_range import warning
 
     result = load_run(arguments.source)
-    data = load(arguments.data, like=result.data, **columns_of(arguments))
+    data = as_recorded(result, arguments.data, **columns_of(arguments))
     _tell_of_names(data.names, result.data.names)
     if data.input_labels and not result.model.inputs:
         names = ", ".join(name for name, _ in data.input_labels)

@@ -62,6 +62,23 @@ def run_of(model, sigma=1e-8) -> Run:
     return Run(model, FitConfig(), {"sigma": sigma}, data, (n // 2,) * 2, states, H, {}, [])
 
 
+def test_another_recording_has_the_sensors_of_the_run(tmp_path, capsys):
+    # fails if counts of an encoder, whose scale the fit was told, are predicted as so many rad, or positions are scaled
+    model = model_of("linear")
+    run, other, path = run_of(model), recording(model, count=1), tmp_path / "counts.csv"
+    told = replace(run, reading={"sensor_scales": [0.001], "sensor_zeros": [250.0]})
+    rows = (f"{t},{250 + 1000 * q}" for t, q in zip(other.t.tolist(), other.q[:, 0].tolist(), strict=True))
+    path.write_text("\n".join(["t,q", *rows]) + "\n")
+    assert (told.predict(path).rms or 1) < 1e-9
+    assert "sensor scales are those of the run, 0.001; for others --sensor-scales" in capsys.readouterr().err
+    assert (told.predict(other).rms or 1) < 1e-9
+    assert (told.predict(path, sensor_scales=[0.002]).rms or 0) > 0.01
+    # fails if the scale of another recording is taken
+    several = replace(run, reading={"sensor_scales": [0.001, 0.002]})
+    with pytest.raises(InputError, match=r"sensor scales of its own; give those of this one: --sensor-scales"):
+        several.predict(path)
+
+
 @pytest.mark.parametrize("level", ["conservative", "linear", "affine", "full", "forced"])
 def test_own_motion_is_predicted_by_every_level(level):
     # fails if the state handed from the warm-up to the free run lacks p or s, or belongs to another sample
