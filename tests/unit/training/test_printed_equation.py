@@ -12,6 +12,7 @@ from printed_check import compared
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import Arrival
+from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace
@@ -246,6 +247,16 @@ def test_a_combination_that_is_not_determined_is_said_beside_the_equation(closed
     free = text_of(run_of(*MODELS["waves"]))
     assert "next to no effect" not in free
     assert "tell apart" not in free
+
+
+def test_a_motion_that_rounding_errors_change_has_no_deviations():
+    # fails if numbers of a motion that passes an upper equilibrium have 24 digits, and each "next to no effect"
+    posterior: Any = SimpleNamespace(
+        theta=torch.tensor([6.3], dtype=torch.float64), sigma=1e-3, inflation=1.0,
+        information=torch.tensor([[1e32]], dtype=torch.float64),
+    )  # fmt: skip
+    with pytest.raises(InputError, match="rounding errors of the model's numbers"):
+        joint_of(posterior, 0.0)
 
 
 def test_digits_follow_the_joint_information(closed_loop):
