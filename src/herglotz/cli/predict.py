@@ -31,8 +31,8 @@ DESCRIPTION = """\
 Score a trained model on a recording it has not seen: another start, other steps, its own inputs. The state is
 estimated from the first K samples of each trajectory, the model held; from there the model runs on alone, driven by
 the inputs recorded beside the positions. Printed: the RMS error of each coordinate; the same from the best start, which
-is fitted to the whole recording: the model's own error; and the share of the samples that the free run did not reach
-because a step failed.
+is fitted to the whole recording: what no other start makes smaller; and the share of the samples that the free run did
+not reach because a step failed.
 
 A recorded step that is longer than those the model was fitted to is crossed in equal model steps. A recording that is
 sampled faster is thinned, its inputs averaged: K counts the samples that are left. A note says where the free run

@@ -1,4 +1,4 @@
-"""The part of a prediction's error that is not the start's: free runs from the start that suits all samples."""
+"""The part of a prediction's error that no other start makes smaller: free runs from the best start."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def missed_from_best_start(run: FittedRun, data: Trajectories) -> tuple[float, .
     """RMS misfit of each coordinate, in its units, by free runs whose start states are fitted to whole recordings.
 
     A warm-up tells a velocity to about σ √12 / (T √K), K samples over a time T, and a free run carries the error on.
-    What is left from the best start is the error of the model. `data` are those of a `Prediction`. None if the model
+    From no other start does the model miss less. `data` are those of a `Prediction`. None if the model
     follows only parts of the recordings.
     """
     base = estimate_baseline(data, substeps=run.decided.substeps)

@@ -61,6 +61,7 @@ def _inputs(run: FittedRun) -> str:
     delay, lag = run.arrival.late
     late = [f"acting {delay:.6g}{unit} later"] if delay else []
     late += [f"through a lag T = {lag:.6g}{unit}, T f′ = {names} − f, f being what acts"] if lag else []
+    late += ["taken as exact in the deviations above"] if late else []
     return ", ".join([f"{names}: {BETWEEN.get(hold or 'zero', hold)}", *late])
 
 

@@ -190,13 +190,14 @@ def test_what_moves_the_model_beside_its_equation_stands_below_it(more, words):
 
 
 def test_delay_and_lag_stand_below_the_equation(monkeypatch):
-    # fails if an input of the equation is taken for the one that was recorded
+    # fails if an input of the equation is taken for the one that was recorded, or deviations seem to hold those of T
     run = run_of(*MODELS["joints"], count=2, steps=20)
     monkeypatch.setattr(Run, "arrival", Arrival("zero", 0.02, 0.05))
     monkeypatch.setattr(Run, "decided", run.config)
     run.metrics["plan"] = {"zeros": (0.01, 0.02)}
     notes = " ".join(notes_of(run))
     assert "acting 0.02 s later, through a lag T = 0.05 s" in notes
+    assert "being what acts, taken as exact in the deviations above" in notes
     assert "less the zero of its sensor (x 0.01; theta 0.02)" in notes
 
 
