@@ -30,8 +30,9 @@ WARMUP = 20
 DESCRIPTION = """\
 Score a trained model on a recording it has not seen: another start, other steps, its own inputs. The state is
 estimated from the first K samples of each trajectory, the model held; from there the model runs on alone, driven by
-the inputs recorded beside the positions. Printed: the RMS error of each coordinate, and the share of the samples that
-the free run did not reach because a step failed.
+the inputs recorded beside the positions. Printed: the RMS error of each coordinate; the same from the best start, which
+is fitted to the whole recording: what no other start makes smaller; and the share of the samples that the free run did
+not reach because a step failed.
 
 A recorded step that is longer than those the model was fitted to is crossed in equal model steps. A recording that is
 sampled faster is thinned, its inputs averaged: K counts the samples that are left. A note says where the free run
@@ -74,12 +75,13 @@ def run(arguments: argparse.Namespace) -> int:
         check_output_file(out, (".csv", ".npz"), arguments.force)
     import_torch()
 
-    from herglotz.data import load
     from herglotz.training import load_run
+    from herglotz.training.best_start import missed_from_best_start
+    from herglotz.training.fitted_run import as_recorded
     from herglotz.training.recorded_range import warning
 
     result = load_run(arguments.source)
-    data = load(arguments.data, like=result.data, **columns_of(arguments))
+    data = as_recorded(result, arguments.data, **columns_of(arguments))
     _tell_of_names(data.names, result.data.names)
     if data.input_labels and not result.model.inputs:
         names = ", ".join(name for name, _ in data.input_labels)
@@ -93,10 +95,12 @@ def run(arguments: argparse.Namespace) -> int:
         same_zeros=arguments.sensor_zeros is not None,
     )  # fmt: skip
     written = [] if out is None else _write(found, out, arguments.momenta)
+    best = None if arguments.windows else missed_from_best_start(result, found.data)
     if arguments.json:
-        print_json(found.metrics())
+        named = None if best is None else dict(zip(found.data.names, best, strict=True))
+        print_json({**found.metrics(), "rms_from_best_start": named})
     else:
-        _report(found, arguments)
+        _report(found, arguments, best)
         if written:
             print(f"Written: {', '.join(map(str, written))}")
     if drifts := (result.metrics.get("plan") or {}).get("drifts"):
@@ -120,7 +124,7 @@ def _tell_of_names(names: tuple[str, ...], known: tuple[str, ...]) -> None:
         say(f"herglotz: note: the run has no coordinate {', '.join(others)}: left aside", sys.stderr)
 
 
-def _report(found: Prediction, arguments: argparse.Namespace) -> None:
+def _report(found: Prediction, arguments: argparse.Namespace, best: tuple[float, ...] | None) -> None:
     from herglotz.data.units import size
 
     numbers = found.metrics()
@@ -135,6 +139,9 @@ def _report(found: Prediction, arguments: argparse.Namespace) -> None:
         (f"RMS {name}", "not reached" if (error := each[name]) is None else size(error, unit, name in degrees, 4))
         for name, unit in zip(found.data.names, found.data.units, strict=True)
     ]
+    if best is not None:
+        every = zip(best, found.data.names, found.data.units, strict=True)
+        rows.append(("from best start", ", ".join(size(x, unit, name in degrees, 4) for x, name, unit in every)))
     rows.append(("failed steps", f"{100 * found.failed_steps:.3g} %"))
     steps = f"at most {found.most_substeps} model steps in a recorded step" if found.most_substeps > 1 else ""
     if found.every > 1:

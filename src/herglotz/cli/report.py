@@ -33,14 +33,14 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.out or arguments.source
     import_torch()
 
-    from herglotz.data import load
     from herglotz.report import write_report
     from herglotz.training import load_run
+    from herglotz.training.fitted_run import as_recorded
 
     result, against = load_run(arguments.source), None
     check_output_folder(folder)
     if arguments.against is not None:
-        against = load(arguments.against, like=result.data, **columns_of(arguments))
+        against = as_recorded(result, arguments.against, **columns_of(arguments))
     for path in write_report(result, folder, against, name=str(arguments.source)):
         print(path)
     return 0

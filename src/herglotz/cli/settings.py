@@ -123,7 +123,8 @@ MODEL = (
     setting("--coupled", "friction of differences of speeds: hinges (forced)", action="store_true"),
     setting("--drag", "a force beside viscous friction, its coefficient learned: '|v1| v1', 'q1^2 v1', '(v1 - v2)' of "
             "a damper between two, '|v| v' of air, a constant one, 'load 1', dry friction by position, 'q1^2 sgn(v1)', "
-            "'cos(q1) sgn(v1)', or an input by position, 'u1 cos(q1)' (forced); may be given again",
+            "'cos(q1) sgn(v1)', an input by position, 'u1 cos(q1)', or one that brakes, 'u1^2 v1' (forced); may be "
+            "given again",
             action="append", metavar="TEXT"),
     setting("--dissipation", "a power of s in L beside -gamma s, its coefficient learned: 's^2' or 's^3' (full, "
             "forced); may be given again", action="append", metavar="POWER"),

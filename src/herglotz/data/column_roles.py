@@ -69,7 +69,8 @@ _WORDS = {
               "strom spannung couple courant tension fuerza corriente voltaje coppia corrente forza tensione grf",
     "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse",
     "reading": "pot potentiometer lvdt encoder laser",
-    "excitation": "road ground floor shaker excitation disturbance seismic",
+    "excitation": "road ground floor shaker exciter excitation erreger anregung excitateur excitador disturbance "
+                  "seismic",
     "support": "base pivot support platform",
 }  # fmt: skip
 WORDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}

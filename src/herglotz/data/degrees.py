@@ -17,6 +17,8 @@ from herglotz.errors import check_coordinates
 
 # One full turn in each unit of angle.
 TURN = {"rad": 2 * math.pi, "deg": 360.0}
+# Part of the warning of positions in counts, by which the warning is found among notes.
+COUNTS = "counts of an encoder"
 
 
 def with_angles_in_degrees(
@@ -38,6 +40,11 @@ def with_angles_in_degrees(
     radians = data.names if angles is True else as_names(angles or ())
     notes = []
     for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
+        if unit == "1" and angles is None and name not in known and are_counts(q):
+            notes.append(
+                f"warning: whole numbers without a unit, {name} may be {COUNTS}: if a turn is N of them, give "
+                f"--sensor-scales with the number 2π/N, and --angles {name}"
+            )
         in_radians = unit == "rad" or name in radians
         angular = in_radians or (unit == "1" and angles is None and is_angular(name))
         if not angular or name in {*known, *data.degrees} or float(q.abs().max()) <= TURN["rad"]:
@@ -54,11 +61,14 @@ def is_in_degrees(data: Trajectories, q: Tensor) -> bool:
     """Whether a coordinate, (N,), is an angle in degrees, and not in rad.
 
     Removing turns of 360 from the steps of an angle in degrees leaves a steadier motion than removing turns of 2π. An
-    angle in rad that is sampled often enough loses only its jumps by turns of 2π. Whole numbers beyond 360 may be
-    counts of an encoder.
+    angle in rad that is sampled often enough loses only its jumps by turns of 2π.
     """
-    counts = float(q.abs().max()) > TURN["deg"] and bool((q == q.round()).all())
-    return not counts and _unsteady(data, q, TURN["rad"]) > _unsteady(data, q, TURN["deg"])
+    return not are_counts(q) and _unsteady(data, q, TURN["rad"]) > _unsteady(data, q, TURN["deg"])
+
+
+def are_counts(q: Tensor) -> bool:
+    """Whether a coordinate, (N,), may be counts of an encoder: whole numbers beyond 360."""
+    return float(q.abs().max()) > TURN["deg"] and bool((q == q.round()).all())
 
 
 def _unsteady(data: Trajectories, q: Tensor, turn: float) -> float:

@@ -22,6 +22,8 @@ from herglotz.errors import refuse
 Place = Callable[[int], str]
 # A gap of so many typical steps is crossed in any recording, because the model takes so many steps in little time.
 MAX_CROSSED_STEPS = 1000
+# Part of the note on inputs that were recorded more often than the motion, by which it is found among notes.
+MEANS = "most steps have the mean of their inputs"
 
 
 def with_missing(data: Trajectories, known: Tensor, place: Place, lacking: Tensor | None = None) -> Trajectories:
@@ -35,7 +37,9 @@ def with_missing(data: Trajectories, known: Tensor, place: Place, lacking: Tenso
     data = replace(data, observed=known.to(data.q))
     if count := int(missing.sum()):
         what = f"{'a row is' if count == 1 else f'{count} rows are'} left out, without a value"
-        data = replace(data, notes=(*data.notes, f"{what}: the first is {place(int(missing.long().argmax()))}"))
+        first = f"the first is {place(int(missing.long().argmax()))}"
+        means = data.u is not None and 2 * count > data.samples
+        data = replace(data, notes=(*data.notes, f"{what}: {first}{f'; {MEANS}' if means else ''}"))
         data = _trimmed(data, ~missing)
     assert data.observed is not None
     known = data.observed > 0

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.codegen.c_compiler import compiler
-from herglotz.data import Trajectories, as_trajectories
+from herglotz.data import Trajectories
 from herglotz.data.gaps import complete
 from herglotz.errors import InputError, refuse
 from herglotz.export.c_compile import compile_c
@@ -23,7 +23,7 @@ from herglotz.export.noise import input_at, momentum_at, noise_of, parts_of
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 from herglotz.stepping.filter import Belief, KalmanFilter, Noise
-from herglotz.training.fitted_run import FittedRun
+from herglotz.training.fitted_run import FittedRun, as_recorded
 from herglotz.training.predict import of_the_run
 from herglotz.training.problems.grid import step_inputs
 
@@ -94,7 +94,7 @@ def filter(
             raise InputError(f"parameters: {name} needs two finite numbers >= 0, (deviation, wander), got {pair}")
     refuse({f"filter takes a run, got {type(run).__name__}; load_run(folder) reads one": not hasattr(run, "model")})
     model = copy.deepcopy(run.model).double()
-    data = of_the_run(run, as_trajectories(recording, like=run.data))
+    data = of_the_run(run, as_recorded(run, recording))
     data = complete(data).unwrapped().to(dtype=torch.float64, device="cpu")
     # A recording without the model's inputs is refused.
     step_inputs(model, data)

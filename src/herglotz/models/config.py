@@ -60,7 +60,7 @@ class ModelConfig:
     alike, diagonal
         One mass for all coordinates and a potential of features alone; a diagonal mass matrix.
     coupled, drag
-        Friction of velocity differences; further forces such as "|v1| v1", and "u1 cos(q1)" of an input
+        Friction of velocity differences; further forces such as "|v1| v1", "u1 cos(q1)" and "u1^2 v1" of an input
         (`herglotz.models.drag`). Both need the forced level.
     order
         Order of the rule, 2 or 4; at 4 L_d has the error term of the rule, from the features

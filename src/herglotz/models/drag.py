@@ -13,12 +13,14 @@ that changes with the position, or with the load that a position puts on a beari
 
     q1^2 sgn(v1)        cos(q1) sgn(v1)        sin(q2) sgn(v1)
 
-An input that acts through the position drives the coordinate that it names, or another one:
+An input that acts through the position drives the coordinate that it names, or another one, and an input that brakes
+has a speed:
 
-    u1 cos(q1)        u2 sin(q1)        u1 q1        u1 sin(q2) on q1
+    u1 cos(q1)        u2 sin(q1)        u1 q1        u1 sin(q2) on q1        u1 v1        u1^2 v1
 
 A pendulum on a pivot with the horizontal acceleration u1 has −u1 cos(q1)/l, and a force u1 with a fixed direction on a
-crank u1 cos(q1). A thruster of a body with the heading q2 pushes the length q1 by u1 sin(q2).
+crank u1 cos(q1). A thruster of a body with the heading q2 pushes the length q1 by u1 sin(q2). A brake by eddy currents
+with the current u1 has u1² v.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ _PAIR = r"v\d+ - v\d+"
 _SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
 _WAVE = r"(?P<wave>cos|sin)\((?:(?P<rate>\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?)?"
 _AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
-_DRIVEN = rf"u(?P<input>\d+) {_AT}(?: on q(?P<driven>\d+))?"
+_DRIVEN = rf"u(?P<input>\d+)(?: {_AT}(?: on q(?P<driven>\d+))?|(?:\^(?P<power>\d+))? (?P<braked>v\d+))"
 _TEXTS = [
     re.compile(text)
     for text in (
@@ -63,7 +65,7 @@ class DragFeature:
     b is 0 or 1, and with b = c = 0 the force is constant. A `dry` feature is q_at^a sgn(v). A `wave`, cos or sin, of
     rate · q_at replaces the power of q_at; with `of_speed` the wave of rate · v is the whole feature. `air` is |v| v of
     the whole velocity, on every coordinate. With an `input`, a column of u, −u takes the place of the factors of v: the
-    force drives `on`.
+    force drives `on`. With a `power` as well uᵖ v takes their place: the force brakes `on`.
     """
 
     on: int
@@ -78,6 +80,7 @@ class DragFeature:
     rate: float = 1.0
     of_speed: bool = False
     input: int | None = None
+    power: int = 0
 
     @property
     def even(self) -> bool:
@@ -121,10 +124,15 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     speed = found["v"] or found["pair"]
     place = found["angle"] or found["q"]
     on, *of = map(
-        int, re.findall(r"\d+", speed or found["dry"] or found["load"] or found["even"] or found["driven"] or place)
+        int,
+        re.findall(
+            r"\d+",
+            speed or found["dry"] or found["load"] or found["even"] or found["driven"] or found["braked"] or place,
+        ),
     )
     at, given = int(place or on), int(found["input"]) - 1 if found["input"] else None
     a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
+    power = int(found["power"] or 1) if found["braked"] else 0
     rate, b, second = float(found["rate"] or 1), int(bool(found["size"] or found["even"])), of[0] - 1 if of else None
     refuse({
         f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
@@ -133,7 +141,18 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
         f"drag '{text}': inputs are numbered from 1": given == -1,
     })  # fmt: skip
     feature = DragFeature(
-        on - 1, at - 1, a, b, c, second, dry=dry, wave=found["wave"], rate=rate, of_speed=of_speed, input=given
+        on - 1,
+        at - 1,
+        a,
+        b,
+        c,
+        second,
+        dry=dry,
+        wave=found["wave"],
+        rate=rate,
+        of_speed=of_speed,
+        input=given,
+        power=power,
     )
     _check_periods(text, feature, angles[at - 1])
     _check_powers(text, feature, of_a_speed=bool(speed))
@@ -146,7 +165,7 @@ def _parts(text: str, plain: str) -> Mapping[str, str]:
     if match is None:
         raise InputError(
             f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1', "
-            "'cos(q1) sgn(v1)' or 'u1 cos(q1)'"
+            "'cos(q1) sgn(v1)', 'u1 cos(q1)' or 'u1^2 v1'"
         )
     return defaultdict(str, {name: part for name, part in match.groupdict().items() if part is not None})
 
@@ -163,8 +182,8 @@ def _check_periods(text: str, f: DragFeature, angle: bool) -> None:
 def _check_powers(text: str, f: DragFeature, *, of_a_speed: bool) -> None:
     """Raise InputError if a power of a position or of a speed is too high, or 0."""
     of_the_speed = 1 <= f.c <= MAX_POWER or not of_a_speed or f.of_speed
-    by_position = f.dry or f.input is not None
-    fit = f.a <= MAX_POWER and (f.a >= 1 or bool(f.wave) if by_position else of_the_speed)
+    by_position = f.dry or (f.input is not None and not f.power)
+    fit = max(f.a, f.power) <= MAX_POWER and (f.a >= 1 or bool(f.wave) if by_position else of_the_speed)
     refuse({f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not fit})
 
 
@@ -176,6 +195,7 @@ class Drag(nn.Module):
     Pol's oscillator has negative viscous friction and the term q² v. The part of dry friction that depends on the
     position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; set-valued friction takes the part `held` at q0.
     An input that acts through the position is θ u_k q̄_j^a, or θ u_k cos q̄_j; a potential stands for its sensor's zero.
+    An input that brakes is −θ u_kᵖ v.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):
@@ -215,8 +235,9 @@ class Drag(nn.Module):
             if f.input is None:
                 factor, by_v = f.speed(y[..., g], None if widths is None else widths[f.on])
             else:
-                by_v = torch.zeros_like(position)
-                factor = by_v if u is None else by_v - u[..., f.input]
+                given = torch.zeros_like(position) if u is None else torch.zeros_like(position) + u[..., f.input]
+                by_v = _power(given, f.power) if f.power else torch.zeros_like(position)
+                factor = by_v * y[..., g] if f.power else -given
             columns.append((position * factor, by_q * factor, position * by_v))
         value, by_q, by_v = (torch.stack(x, -1) for x in zip(*columns, strict=True))
         return value, by_q, by_v

@@ -73,10 +73,18 @@ def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
 
 
 def by_position(angles: tuple[bool, ...], inputs: Iterable[int]) -> tuple[str, ...]:
-    """Forces u cos q and u sin q of these inputs, counted from 1, and all angles, on the angle and on every length."""
+    """Forces of these inputs, counted from 1, that depend on the motion.
+
+    u cos q and u sin q of every angle, on the angle and on every length; u q and u q² of every length, on that length;
+    and u v and u² v of every speed, which brake.
+    """
     to = [(j, "" if i == j else f" on q{i}") for j, angle in enumerate(angles, 1) if angle
           for i, other in enumerate(angles, 1) if i == j or not other]  # fmt: skip
-    return tuple(f"u{k} {f}(q{j}){on}" for k in inputs for j, on in to for f in ("cos", "sin"))
+    turned = [f"{f}(q{j}){on}" for j, on in to for f in ("cos", "sin")]
+    moved = [f"q{j}{power}" for j, angle in enumerate(angles, 1) if not angle for power in ("", "^2")]
+    braked = [f"{power} v{j}" for j in range(1, len(angles) + 1) for power in ("", "^2")]
+    factors = [f" {factor}" for factor in (*turned, *moved)] + braked
+    return tuple(f"u{k}{factor}" for k in inputs for factor in factors)
 
 
 def _inputs_by_position(c: ModelConfig) -> tuple[str, ...]:

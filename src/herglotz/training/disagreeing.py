@@ -49,8 +49,8 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         scale = {b: scale_of(own) for b, own in enumerate(missed)}
         worst = max(rest, key=lambda b: scale[b])
         outlier = scale[worst] > TAIL * _scale(missed, [b for b in rest if b != worst], seen)
-        if not outlier and not out and not _agree(seen, _noise_of_each(seen)):
-            bad = next((b for b in dict.fromkeys((worst, _least_alike(seen))) if _would_agree(seen, b)), None)
+        if not outlier and not out:
+            bad = next((b for b in dict.fromkeys((worst, _least_alike(seen))) if _bends(seen, b)), None)
             worst, outlier = (worst, False) if bad is None else (bad, True)
         if outlier:
             now = sorted([*out, worst])
@@ -77,12 +77,13 @@ def outlying(seen: Look, model: ContactLagrangian, sigma: float) -> tuple[LeftOu
     """
     if len(seen.data) < 3:
         return ()
-    followed, noise = _followed(seen.data, seen.settings), _noise_of_each(seen)
+    followed = _followed(seen.data, seen.settings)
     worst = _worst(seen, _missed_by(seen, model, sigma, followed))
+    others = _but(seen, worst.recording)
+    noise = precision(seen.data.select(others))
     if worst.missed <= max(AT_THE_NOISE * noise, TAIL * EXACT_ENOUGH * relative_spread(seen.data)):
         return ()
-    others = followed.select([b for b in range(len(followed)) if b != worst.recording])
-    stages = SegmentStages(replace(seen.task(Stages()), data=others), own := deepcopy(model))
+    stages = SegmentStages(replace(seen.task(Stages()), data=followed.select(others)), own := deepcopy(model))
     if (found := stages.fit(stages.lengths[0], noise, None, None)) is None:
         return (worst,) if worst.stands_out else ()
     found.problem.parameters.set(found.theta)
@@ -109,11 +110,6 @@ def _agree(seen: Look, noise: float) -> bool:
     return sigma is not None and sigma <= max(AT_THE_NOISE * noise, EXACT_ENOUGH * relative_spread(seen.data))
 
 
-def _noise_of_each(seen: Look) -> float:
-    """The noise of most recordings: that of a bad one may be anything."""
-    return float(torch.tensor([precision(one) for one in seen.data]).median())
-
-
 def _least_alike(seen: Look) -> int:
     """The recording whose accelerations are farthest from the linear model that Student's t fits to those of all."""
     t, _, a, columns, _ = differences(seen.data)
@@ -123,13 +119,21 @@ def _least_alike(seen: Look) -> int:
     return max(range(len(seen.data)), key=lambda b: scale_of(missed[of == b]) if bool((of == b).any()) else 0.0)
 
 
-def _would_agree(seen: Look, left_out: int) -> bool:
-    """Whether the model of the whole dictionary follows all recordings but one to their noise."""
-    others = [b for b in range(len(seen.data)) if b != left_out]
-    kept = seen.kept.select(others).to(torch.float64, "cpu")
+def _bends(seen: Look, recording: int) -> bool:
+    """Whether the model misses the data by more than the noise of the other recordings, and whether the whole
+    dictionary follows these to it.
+    """
+    others = seen.kept.select(_but(seen, recording)).to(torch.float64, "cpu")
+    if _agree(seen, precision(others)):
+        return False
     settings = replace(seen.settings, dtype="float64", device="cpu")
-    full = Search(kept, estimate_baseline(kept), settings).part.full
+    full = Search(others, estimate_baseline(others), settings).part.full
     return full is not None and full.at_the_noise
+
+
+def _but(seen: Look, recording: int) -> list[int]:
+    """All recordings but one."""
+    return [b for b in range(len(seen.data)) if b != recording]
 
 
 def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] | None:

@@ -47,7 +47,7 @@ def drag_in_words(f: DragFeature, i: int, names: Sequence[str], given: str = "")
     if f.dry:
         return f"{position[0]} {given}"
     if f.input is not None:
-        return f"{given} {position[0]}"
+        return f"{raised(given, f.power)} {speed}" if f.power else f"{given} {position[0]}"
     return " ".join([*position, *size, *([raised(speed, f.c)] if f.c else [])])
 
 

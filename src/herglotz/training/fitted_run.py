@@ -1,4 +1,7 @@
-"""`FittedRun`: the part of a `Run` that equation, summary, motion and prediction use, which `Run` imports."""
+"""`FittedRun`: the part of a `Run` that equation, summary, motion and prediction use, which `Run` imports.
+
+`as_recorded` reads another recording as that of a run was read.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,12 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.anything import as_trajectories
 from herglotz.data.holds import Arrival
+from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
+from herglotz.telling import tell
 from herglotz.training.config import FitConfig
 
 
@@ -45,3 +51,21 @@ class FittedRun(Protocol):
     @property
     def stepper(self) -> Stepper: ...  # noqa: D102
     def last_fitted(self, trajectory: int = 0) -> tuple[State, float]: ...  # noqa: D102
+
+
+def as_recorded(run: FittedRun, data: Any, **reading: Any) -> Trajectories:
+    """Another recording, or a file of recordings, read as the data of the run were: columns, units, angles and sensors.
+
+    `reading` are options of `as_trajectories`, which come before those of the run. Trajectories are positions already,
+    and take no zeros and scales of the run. Raise InputError if each recording of the run has a scale of its own.
+    """
+    sensors = {} if isinstance(data, Trajectories) else run.reading
+    for name in {"sensor_zeros", "sensor_scales"} & sensors.keys() - reading.keys():
+        told, what = sensors[name], name.replace("_", " ")
+        remedy = f"--{name.replace('_', '-')} ({name}= in Python)"
+        several = f"each recording of the run has {what} of its own; give those of this one: {remedy}"
+        refuse({several: len(told) not in (0, run.data.dof)})
+        if told:
+            tell(f"{what} are those of the run, {', '.join(f'{x:.6g}' for x in told)}; for others {remedy}")
+        reading[name] = told
+    return as_trajectories(data, like=run.data, **reading)

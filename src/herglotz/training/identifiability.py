@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from herglotz.errors import refuse
 from herglotz.training.equation_numbers import Joint
 from herglotz.training.trades import Trade, combinations
 from herglotz.training.uncertainty import Laplace
@@ -39,9 +40,15 @@ def information_of(posterior: Laplace, rows: Tensor) -> Tensor:
 
 
 def joint_of(posterior: Laplace, least: float) -> Joint:
-    """The joint posterior of all numbers, on the CPU, if positions are precise only to `least`, in units of q."""
+    """The joint posterior of all numbers, on the CPU, if positions are precise only to `least`, in units of q.
+
+    Raise InputError if a change of some number by its rounding error in float64 moves the motion by more than the
+    misfit: the motion is too unstable for the first-order posterior.
+    """
     P, sigma = len(posterior.theta), posterior.sigma
     rounding = max(1.0, least / (sigma * posterior.inflation)) ** 2
     alone = posterior.information.diagonal()[:P].clamp_min(1e-300).rsqrt() * max(1.0, least / sigma)
+    lost = alone < torch.finfo(torch.float64).eps * posterior.theta.abs().to(alone)
+    refuse({"rounding errors of the model's numbers change its motion by more than the misfit": bool(lost.any())})
     every = posterior.covariance[:P, :P] * rounding, alone, information_of(posterior, torch.arange(P))
     return Joint(*(x.cpu() for x in every))

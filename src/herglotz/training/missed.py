@@ -1,10 +1,11 @@
 """`reason_of`: why a model does not fit, as far as the residual shows, in words.
 
 Free runs of 20 recorded steps, whose starts are fitted, leave a residual. The curvature of parabolas through nine
-samples of the residual is the acceleration that the model lacks, known to the noise of the data. Five reasons are
+samples of the residual is the acceleration that the model lacks, known to the noise of the data. Six reasons are
 looked for:
 
-* positions on a circle, which one angle gives, or a distance from its centre that changes;
+* positions on a circle, which one angle gives, or a distance from its centre that changes; counts of an encoder;
+* inputs that were recorded more often than the motion, and changed within its steps;
 * an acceleration of something else, a crane's trolley, that was left aside;
 * an input that was recorded more slowly than the motion and filled in: its steps act at times between rows;
 * kicks, as of blows and end stops: a twentieth of the samples has more than half of the sum of squares, in several
@@ -23,6 +24,8 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.column_roles import is_of_others
+from herglotz.data.degrees import COUNTS
+from herglotz.data.gaps import MEANS
 from herglotz.data.polar import LENGTH, with_hints
 from herglotz.data.rates import filled_inputs
 from herglotz.data.roughness import SAMPLES, precisions
@@ -54,8 +57,13 @@ def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
     if hints := with_hints(replace(data, notes=())).notes:
         return hints[0].removeprefix("warning: ")
-    if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note]:
+    if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note or COUNTS in note]:
         return changes[0][0].upper() + changes[0][1:]
+    if any(MEANS in note for note in data.notes):
+        return (
+            f"Inputs were recorded more often than the motion: {MEANS}, and what they change within a step is lost. "
+            "Try positions that are recorded as often"
+        )
     if others := [x for x, role, unit in data.columns if role == "left aside" and is_of_others(unit, data.units)]:
         verb, they = ("was", "it is") if len(others) == 1 else ("were", "they are")
         names = ",".join([*(x for x, role, _ in data.columns if role == "input"), *others])

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.data.anything import as_trajectories, split_options
+from herglotz.data.anything import split_options
 from herglotz.data.holds import Arrival
 from herglotz.data.trajectories import GAP, Trajectories
 from herglotz.errors import InputError, refuse
@@ -23,6 +23,7 @@ from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.equation_notes import notes_of
+from herglotz.training.fitted_run import as_recorded
 from herglotz.training.motion import Motion, free_motion
 from herglotz.training.plan import Plan
 from herglotz.training.predict import Prediction, predict
@@ -246,7 +247,7 @@ class Run:
         """
         reading, others = split_options(settings)
         others.setdefault("same_zeros", "sensor_zeros" in reading)
-        return predict(self, as_trajectories(data, like=self.data, **reading), **others)
+        return predict(self, as_recorded(self, data, **reading), **others)
 
     def plot(self, name: str = "trajectory") -> Any:
         """A matplotlib `Figure`; `savefig` writes it.
@@ -329,7 +330,7 @@ class Run:
         InputError
             If the recording cannot be read, or has other coordinates.
         """
-        other = None if against is None else as_trajectories(against, like=self.data)
+        other = None if against is None else as_recorded(self, against)
         return _module("report").write_report(self, folder, other, name=str(folder))
 
     def summary(self) -> str:

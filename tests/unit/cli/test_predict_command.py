@@ -27,7 +27,7 @@ def test_json_has_the_promised_numbers(tiny_run, other_csv, capsys):
     # fails if a number is missing, or text is printed beside the JSON
     assert main(["predict", str(tiny_run), str(other_csv), "--json"]) == 0
     numbers = json.loads(capsys.readouterr().out)
-    assert {"rms", "rms_per_coordinate", "failed_steps", "warmup"} <= set(numbers)
+    assert {"rms", "rms_per_coordinate", "rms_from_best_start", "failed_steps", "warmup"} <= set(numbers)
     assert numbers["warmup"] == 20
     assert numbers["failed_steps"] == 0.0
     assert set(numbers["rms_per_coordinate"]) == {"theta"}
@@ -40,6 +40,7 @@ def test_files_and_words(tiny_run, other_csv, tmp_path, capsys):
     assert main(["predict", str(tiny_run), str(other_csv), "--out", str(out), "--warmup", "10"]) == 0
     text = capsys.readouterr().out
     assert "RMS theta" in text
+    assert "from best start" in text
     assert "rad" in text
     assert out.read_text().startswith("trajectory,t[s],theta[rad],theta_dot[rad/s]\n")
     assert (tmp_path / "motion.png").read_bytes()[:4] == b"\x89PNG"

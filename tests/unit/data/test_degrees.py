@@ -56,6 +56,17 @@ def test_what_may_be_radians_is_not_converted(kind):  # fails if turns in rad, j
     assert not is_in_degrees(Trajectories.of(T, RADIANS[kind]), torch.from_numpy(RADIANS[kind]))
 
 
+def test_counts_without_a_unit_are_a_question(tmp_path, capsys):
+    # fails if counts of an encoder are positions on a line without a word, or the answer brings the question again
+    path = written(tmp_path, "t,encoder_counts", RADIANS["counts"])
+    assert load(path).units == ("1",)
+    told = "warning: a.csv: whole numbers without a unit, encoder_counts may be counts of an encoder: if a turn"
+    assert told in capsys.readouterr().err
+    found = load(path, angles="encoder_counts", sensor_scales=(2 * math.pi / 4096,))
+    torch.testing.assert_close(found.q[:, 0], torch.from_numpy(TURNING), atol=1e-3, rtol=0)
+    assert "warning" not in capsys.readouterr().err
+
+
 def test_degrees_without_a_unit(tmp_path, capsys):
     # fails if they are converted in silence, reported in rad alone, or the user cannot say that they are none
     path = written(tmp_path, "t,pendulum_angle,x", DEGREES["a swing"], 100 * SWING)

@@ -8,6 +8,7 @@ import pytest
 from herglotz.cli import main
 from herglotz.data import as_trajectories, load, read_csv
 from herglotz.errors import InputError
+from herglotz.training.missed import reason_of_data
 
 T = np.arange(40) * 0.1  # of the positions
 X = np.sin(3 * T)
@@ -62,6 +63,15 @@ def test_inputs_at_their_own_times(tmp_path, capsys, told, comment, straight):
     assert f"  16 rows are left out, without a value: the first is row {3 if comment else 2}, column 'x'" in err
     assert ("warning: a.csv: u has no value in some rows: the last one is held, for up to 0.26 s" in err) != straight
     assert ("u has no value in some rows; straight lines go there" in err) == straight
+
+
+def test_positions_that_are_slower_than_an_input(tmp_path):
+    # fails if it is not said that the input within a step is lost, at reading and beside the verdict of a misfit
+    for every, said in ((5, True), (0, False)):
+        rows = ((k / 100, k / 7 if every == 0 or k % every == 0 else np.nan, k % 3) for k in range(101))
+        data = load(written(tmp_path, rows), show=False)
+        assert any(note.endswith("; most steps have the mean of their inputs") for note in data.notes) is said
+        assert reason_of_data(data).startswith("Inputs were recorded more often than the motion: most steps") is said
 
 
 def test_a_slow_input_beside_every_position(tmp_path):

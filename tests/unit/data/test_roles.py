@@ -127,6 +127,7 @@ def test_a_goal_beside_what_acts_is_said(tmp_path, capsys, header, said):
 
 GUESSES = {
     "road[mm]": "is taken for an input, but by its name alone; else give --coordinates x,road or --drop road",
+    "exciter[mm]": "is taken for an input, but by its name alone",
     "pivot_acceleration[m/s^2]": "is taken for an input, but by its name alone",
     "support[m]": "is taken for an input, but by its name alone",
     "pivot_y[m]": "is taken for a coordinate, but it may be moved from outside; else give --inputs pivot_y or",

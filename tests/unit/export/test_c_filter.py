@@ -46,7 +46,9 @@ class Fitted(SimpleNamespace):
 def run_of(model, data, sigma) -> Any:
     """A run with this noise of readings."""
     config = SimpleNamespace(frequencies=())
-    return Fitted(model=model, metrics={"sigma": sigma}, data=data, h=H, arrival=data.arrival, config=config)
+    return Fitted(
+        model=model, metrics={"sigma": sigma}, data=data, h=H, arrival=data.arrival, config=config, reading={}
+    )
 
 
 def flat(noise):

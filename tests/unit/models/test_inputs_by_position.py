@@ -40,12 +40,13 @@ def end(model, steps, u, time=2.0):
 
 
 LAWS = {
-    "an accelerated pivot": ((True,), ("u1 cos(q1)",), [-0.8], lambda q, u: -0.8 * u * q.cos()),
-    "a shaken pivot": ((True,), ("u1 sin(q1)",), [-0.8], lambda q, u: -0.8 * u * q.sin()),
-    "a spring of an input": ((False,), ("u1 q1^2",), [0.3], lambda q, u: 0.3 * u * q**2),
+    "an accelerated pivot": ((True,), ("u1 cos(q1)",), [-0.8], lambda q, _, u: -0.8 * u * q.cos()),
+    "a brake by eddy currents": ((False,), ("u1^2 v1",), [0.1], lambda _, v, u: -0.1 * u**2 * v),
+    "a shaken pivot": ((True,), ("u1 sin(q1)",), [-0.8], lambda q, _, u: -0.8 * u * q.sin()),
+    "a spring of an input": ((False,), ("u1 q1^2",), [0.3], lambda q, _, u: 0.3 * u * q**2),
     "a thruster": (
         (False, True), ("u1 sin(q2) on q1", "u1 cos(q2)"), [0.7, 0.2],
-        lambda q, u: torch.stack([0.7 * u * q[1].sin(), 0.2 * u * q[1].cos()]),
+        lambda q, _, u: torch.stack([0.7 * u * q[1].sin(), 0.2 * u * q[1].cos()]),
     ),
 }  # fmt: skip
 
@@ -59,7 +60,7 @@ def test_the_motion_is_that_of_the_law_to_order_two(law):
     def rate(x):
         q, v = x[:n], x[n:]
         own = torch.where(spring, 2 * q.sin() + 0.1 * q.cos(), 2 * q + 0.1)
-        return torch.cat([v, force(q, U) - own - 0.5 * v])  # p = v: the masses are 1
+        return torch.cat([v, force(q, v, U) - own - 0.5 * v])  # p = v: the masses are 1
 
     x = torch.linspace(0.9, 0.5, n).double()
     x = torch.cat([x, 0.4 * x])
@@ -99,7 +100,8 @@ def test_the_zero_of_a_sensor_is_that_of_the_inputs_map_alone():
         ({"drag": ("u0 cos(q1)",), "inputs": 1}, "inputs are numbered from 1"),
         ({"drag": ("u1 cos(q1) on q2",), "inputs": 1}, "the coordinates are numbered 1 … 1"),
         ({"drag": ("u1 q1",), "inputs": 1}, "a power of an angle is not periodic"),
-        ({"drag": ("u1 v1",), "inputs": 1}, "or 'u1 cos"),
+        ({"drag": ("u1 v1 q1",), "inputs": 1}, "'u1 cos"),
+        ({"drag": ("u1^0 v1",), "inputs": 1}, "powers are whole numbers from 1"),
     ],
 )
 def test_a_force_that_there_is_not_is_refused(settings, said):

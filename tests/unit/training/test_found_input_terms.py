@@ -1,5 +1,6 @@
 """The search for inputs that act by their square, their size or their rate."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -113,6 +114,24 @@ def test_an_accelerated_pivot_is_found():
     assert (run.predict(recorded(on_a_crane(later), later, -0.3, True, noise=0)).rms or 1) < 1e-3
 
 
+def test_a_force_factor_that_falls_with_the_stroke_is_found():
+    # fails if inputs act through angles alone: the coil of a loudspeaker had a mass that changes with its position
+    coil = lambda s, q, v: -20 * q - v + 3 * sway(s) * (1 - 4 * q * q)  # noqa: E731
+    run = hz.fit(recorded(coil, sway, 0.02, False, samples=150), train_fraction=1, progress=False)
+    assert run.metrics["plan"]["drag"] == ("u1 q1^2",)
+    assert run.model.get_parameter("drag.coefficient").item() == pytest.approx(-12, abs=0.1)
+    assert run.metrics["verdict"].startswith("fits to the noise")
+
+
+def test_a_brake_by_eddy_currents_is_found():
+    # fails if no input multiplies a speed, or the printed force drives: a law with a false spring had a fiftieth of it
+    brake = lambda s, q, v: -20 * q - (0.2 + 1.5 * sway(s) ** 2) * v  # noqa: E731
+    run = hz.fit(recorded(brake, sway, 1.0, False, samples=100), train_fraction=1, progress=False)
+    assert run.metrics["plan"]["drag"] == ("u1^2 v1",)
+    assert run.model.get_parameter("drag.coefficient").item() == pytest.approx(1.5, abs=0.02)
+    assert re.search(r" − 1\.\d+\(\d+\) u² q′", str(run.equation()))
+
+
 def test_a_rate_does_not_stand_for_a_hold():
     # fails if u′ stays beside u cos q, in the place of lines between the samples: half a step of it
     slow = lambda s: np.sin(1.1 * s) + 0.6 * np.sin(1.9 * s + 1)  # noqa: E731
@@ -133,10 +152,11 @@ def test_the_only_gain_of_a_model_has_no_number():  # fails if its place is read
 def test_forces_of_inputs_are_offered_on_the_angle_and_on_lengths():
     # fails if a thruster's force on a length is no offer, or the numbers of an arm grow with the square of its joints
     assert by_position((False, True), [2]) == (
-        "u2 cos(q2) on q1", "u2 sin(q2) on q1", "u2 cos(q2)", "u2 sin(q2)",
+        "u2 cos(q2) on q1", "u2 sin(q2) on q1", "u2 cos(q2)", "u2 sin(q2)", "u2 q1", "u2 q1^2",
+        "u2 v1", "u2^2 v1", "u2 v2", "u2^2 v2",
     )  # fmt: skip
-    assert len(by_position((True, True), [1, 2])) == 8
-    assert by_position((False,), [1]) == ()
+    assert len(by_position((True, True), [1, 2])) == 16
+    assert by_position((False,), [1]) == ("u1 q1", "u1 q1^2", "u1 v1", "u1^2 v1")
 
 
 def test_one_kernel_serves_all_forces_of_an_input():
@@ -144,7 +164,7 @@ def test_one_kernel_serves_all_forces_of_an_input():
     plain = ModelConfig(level="forced", alike=True, stiffness=(0.0,), potential_width=0, inputs=2)
     wholes = [dictionary(replace(plain, drag=drag)) for drag in ((), ("u2 sin(q1)",), ("u2 cos(q1)", "load 1"))]
     drags = [whole.drag for whole in wholes if whole is not None]
-    assert drags[1] == drags[2] == (*drags[0], "u2 cos(q1)", "u2 sin(q1)")
+    assert drags[1] == drags[2] == (*drags[0], "u2 cos(q1)", "u2 sin(q1)", "u2 v1", "u2^2 v1")
 
 
 def test_foresight_knows_a_model_with_a_force_of_the_position():

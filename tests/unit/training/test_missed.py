@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
+from herglotz.data.degrees import with_angles_in_degrees
 from herglotz.data.polar import in_polar, pairs_of
 from herglotz.data.rates import filled_inputs
 from herglotz.training import FitConfig, fit, verdict
@@ -162,6 +163,8 @@ def test_what_was_warned_of_when_the_table_was_read_is_the_reason():
     arm = torch.stack([Q.sin(), -Q.cos()], 1) * (1 + 0.2 * torch.sin(0.7 * T))[:, None]
     swing = in_polar(Trajectories.of(T, arm, names=("x", "y"), units=("m", "m")), pairs_of("x,y"))
     assert "if a length changes: --polar x,y,X,Y,r" in reason_of_data(swing)
+    counts = with_angles_in_degrees(Trajectories.of(T, (900 * Q).round(), names=("wheel",)), None, None, None)
+    assert reason_of_data(counts).startswith("Whole numbers without a unit, wheel may be counts of an encoder: if")
 
 
 def test_neighbours_that_are_far_tell_nothing():

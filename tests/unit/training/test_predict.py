@@ -14,6 +14,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
+from herglotz.training.best_start import missed_from_best_start
 from herglotz.training.predict import predict
 from herglotz.training.recorded_range import MARGIN
 from herglotz.training.smoother import process_noise
@@ -60,6 +61,35 @@ def run_of(model, sigma=1e-8) -> Run:
     n = data.samples
     states = State(data.q, data.q, data.q[:, 0])
     return Run(model, FitConfig(), {"sigma": sigma}, data, (n // 2,) * 2, states, H, {}, [])
+
+
+def test_what_the_start_adds_to_an_error_is_told():
+    # fails if the error that six noisy samples make in a start is taken for one of the model, or
+    # an error of the model for one of the start
+    noisy = recording(model_of("linear"), count=2, noise=0.01)
+    own, other = run_of(model_of("linear"), sigma=0.01), run_of(model_of("linear", stiffness=(1.5,)), sigma=0.01)
+    found = own.predict(noisy, warmup=6)
+    (best,), (wrong,) = (missed_from_best_start(run, found.data) or (0.0,) for run in (own, other))
+    assert 0.008 < best < 0.011
+    assert (found.rms or 0) > 1.4 * best
+    assert wrong > 3 * best
+
+
+def test_another_recording_has_the_sensors_of_the_run(tmp_path, capsys):
+    # fails if counts of an encoder, whose scale the fit was told, are predicted as so many rad, or positions are scaled
+    model = model_of("linear")
+    run, other, path = run_of(model), recording(model, count=1), tmp_path / "counts.csv"
+    told = replace(run, reading={"sensor_scales": [0.001], "sensor_zeros": [250.0]})
+    rows = (f"{t},{250 + 1000 * q}" for t, q in zip(other.t.tolist(), other.q[:, 0].tolist(), strict=True))
+    path.write_text("\n".join(["t,q", *rows]) + "\n")
+    assert (told.predict(path).rms or 1) < 1e-9
+    assert "sensor scales are those of the run, 0.001; for others --sensor-scales" in capsys.readouterr().err
+    assert (told.predict(other).rms or 1) < 1e-9
+    assert (told.predict(path, sensor_scales=[0.002]).rms or 0) > 0.01
+    # fails if the scale of another recording is taken
+    several = replace(run, reading={"sensor_scales": [0.001, 0.002]})
+    with pytest.raises(InputError, match=r"sensor scales of its own; give those of this one: --sensor-scales"):
+        several.predict(path)
 
 
 @pytest.mark.parametrize("level", ["conservative", "linear", "affine", "full", "forced"])

@@ -13,6 +13,7 @@ from printed_check import compared
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import Arrival
+from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace
@@ -207,13 +208,14 @@ def test_an_input_without_effect_is_said_to_be_one():
 
 
 def test_delay_and_lag_stand_below_the_equation(monkeypatch):
-    # fails if an input of the equation is taken for the one that was recorded
+    # fails if an input of the equation is taken for the one that was recorded, or deviations seem to hold those of T
     run = run_of(*MODELS["joints"], count=2, steps=20)
     monkeypatch.setattr(Run, "arrival", Arrival("zero", 0.02, 0.05))
     monkeypatch.setattr(Run, "decided", run.config)
     run.metrics["plan"] = {"zeros": (0.01, 0.02)}
     notes = " ".join(notes_of(run))
     assert "acting 0.02 s later, through a lag T = 0.05 s" in notes
+    assert "being what acts, taken as exact in the deviations above" in notes
     assert "less the zero of its sensor (x 0.01; theta 0.02)" in notes
 
 
@@ -264,6 +266,16 @@ def test_a_combination_that_is_not_determined_is_said_beside_the_equation(closed
     free = text_of(run_of(*MODELS["waves"]))
     assert "next to no effect" not in free
     assert "tell apart" not in free
+
+
+def test_a_motion_that_rounding_errors_change_has_no_deviations():
+    # fails if numbers of a motion that passes an upper equilibrium have 24 digits, and each "next to no effect"
+    posterior: Any = SimpleNamespace(
+        theta=torch.tensor([6.3], dtype=torch.float64), sigma=1e-3, inflation=1.0,
+        information=torch.tensor([[1e32]], dtype=torch.float64),
+    )  # fmt: skip
+    with pytest.raises(InputError, match="rounding errors of the model's numbers"):
+        joint_of(posterior, 0.0)
 
 
 def test_digits_follow_the_joint_information(closed_loop):
