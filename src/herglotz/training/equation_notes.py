@@ -68,7 +68,7 @@ def _inputs(run: FittedRun) -> str:
     delay, lag = run.arrival.late
     late = [f"acting {delay:.6g}{unit} later"] if delay else []
     late += [f"through a lag T = {lag:.6g}{unit}, T f′ = {names} − f, f being what acts"] if lag else []
-<<<<<<< HEAD
+    late += ["taken as exact in the deviations above"] if late else []
     acts = ", ".join([f"{names}: {BETWEEN.get(hold or 'zero', hold)}", *late])
     return f"{acts}; {idle}" if idle else acts
 
@@ -79,10 +79,6 @@ def acting_inputs(model: ContactLagrangian) -> list[int]:
     by_map = model.friction.input_map.detach().abs().sum(0).tolist()
     forces = " ".join(input_forces(model.config.drag))
     return [k for k, gain in enumerate(by_map) if gain or re.search(rf"\bu{k + 1}\b", forces)]
-=======
-    late += ["taken as exact in the deviations above"] if late else []
-    return ", ".join([f"{names}: {BETWEEN.get(hold or 'zero', hold)}", *late])
->>>>>>> w3
 
 
 def _sensors(run: FittedRun) -> str:
