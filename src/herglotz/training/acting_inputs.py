@@ -102,14 +102,11 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
 def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
     """A model with these terms of the inputs among its offers.
 
-    The terms join a trial that is near the data, or else the simplest model over ever longer segments. So do forces of
-    the position where the trial is no better with them: it may have several terms in the place of one.
+    The terms join a trial that is near the data, or else the simplest model over ever longer segments.
     """
     other = search.driven_by(terms)
     if trial.near and (same := other.again(beside(trial, len(columns_of(terms))))) is not None:
-        found = other.settled(other.finer(same), swapped=True)
-        if found.replaces(trial) or not input_forces(terms):
-            return found
+        return other.settled(other.finer(same), swapped=True)
     fitter = other.fitter(Variant(search.order))
     return other.climbed(fitter, fitter.simple, {})
 
