@@ -115,14 +115,7 @@ class Search:
         if best is None:
             return None
         part(FEWER_TERMS)
-        every = [offer.name for offer in best.fitter.offers]
-        down = best.fitter.fit(every, best.values, best.length, best, 2 * ITERATIONS)
-        ends.append(down and self.settled(self.finer(best.fitter.grow(down)), swapped=True))
-        best = self.better(best, ends[-1])
-        if best is not None and best is not ends[-1]:
-            ends.append(best := self.settled(best, swapped=True))
-        found = best and without_injecting_friction(self, self.finalist(best, ends))
-        return found and with_sticking(self, found)
+        return with_sticking(self, without_injecting_friction(self, self.finalist(best, ends)))
 
     def of_part(self, found: Trial | None, differ: tuple[Tensor, Tensor] | None) -> Zeroed:
         """The model found in `part`, fitted to all data and settled there.
