@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from herglotz.progress import MORE_TERMS, inside, part
-from herglotz.training.friction_search import without_injecting_friction
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.search import Search
@@ -28,8 +27,7 @@ def with_functions(search: Search, best: Trial) -> Trial:
     found = _anew(search) if found is None else found
     if found is None or (best.near and not found.taken & set(found.fitter.functions)):
         return best
-    better = search.finalist(search.better(best, found) or best, (best, found))
-    return without_injecting_friction(search, better)
+    return search.better(best, found) or best
 
 
 def _fitter(search: Search, variant: Variant) -> Fitter | None:
