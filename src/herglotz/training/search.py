@@ -83,22 +83,17 @@ class Search:
 
     @cached_property
     def first(self) -> Trial | None:
-        """The better of two models grown from the simplest: offers join over short segments, or over the longest only.
-
-        If inputs are feedback of the state, offers that join over short segments make up for one another.
-        """
+        """The model grown from the simplest: offers join over short segments and ever longer ones."""
         part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
-        best, plain = self.climbed(fitter, fitter.simple, {}), self.grown(fitter, fitter.simple)
-        if plain is not None and (best is None or plain.length >= best.length):
-            best = self.better(best, self.settled(plain))
-        return best
+        return self.climbed(fitter, fitter.simple, {})
 
     @cached_property
     def full(self) -> Trial | None:
         """The model of the whole dictionary over the longest segments that the model follows."""
         fitter = self.fitter(Variant(self.order))
-        return self.grown(fitter, [offer.name for offer in fitter.offers])
+        trial = fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
+        return trial and self.finer(fitter.grow(self.finer(trial)))
 
     @inside()
     def run(self) -> Trial | None:
@@ -194,11 +189,6 @@ class Search:
                 return self.settled(needed(likeliest(trial, 2 * self.iterations), 2 * self.iterations))
             trial = longer
         return None
-
-    def grown(self, fitter: Fitter, taken: Iterable[str]) -> Trial | None:
-        """A model with these offers, over the longest segments that the model follows."""
-        trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        return trial and self.finer(fitter.grow(self.finer(trial)))
 
     def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
         """The better of two models by the score."""
