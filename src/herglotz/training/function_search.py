@@ -60,15 +60,15 @@ def _joined(search: Search, best: Trial) -> Trial | None:
 def _anew(search: Search) -> Trial | None:
     """A model fitted from the shortest segments on, with functions that join one by one or all at once.
 
-    All functions at once are tried unless terms alone follow whole trajectories or the first model is at the noise:
-    first without functions of the mass, then with them. A model that ends without functions is fitted by named terms.
+    All functions but those of the mass at once are tried unless terms alone follow whole trajectories or the first
+    model is at the noise. A model that ends without functions is fitted by named terms.
     """
     if (fitter := _fitter(search, Variant(search.order))) is None:
         return None
-    every, found = frozenset({*fitter.simple, *fitter.functions}), search.climbed(fitter, fitter.simple, {})
-    for taken in dict.fromkeys((frozenset(x for x in every if not x.startswith("mass")), every)):
-        if found is None or not (found.whole and (found.at_the_noise or not found.taken & set(fitter.functions))):
-            found = search.better(found, search.climbed(fitter, taken, {}, joining=False))
+    found = search.climbed(fitter, fitter.simple, {})
+    if found is None or not (found.whole and (found.at_the_noise or not found.taken & set(fitter.functions))):
+        taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
+        found = search.better(found, search.climbed(fitter, taken, {}, joining=False))
     if found is None or found.taken & set(fitter.functions):
         return found
     return of_terms(found, search.fitter(replace(found.fitter.variant, functions=())), 2 * ITERATIONS)
