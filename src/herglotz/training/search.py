@@ -102,6 +102,7 @@ class Search:
         part(MORE_TERMS)
         ends = [best]
         fitter = self.fitter(Variant(self.order))
+        # Without: cases/furuta_big of `benchmarks/judge.py` ends twice as far off, and is said to be at the noise.
         ends.append((start := self.linear_start(fitter)) and self.climbed(fitter, *start))
         if not (best and best.at_the_noise) and (full := self.full) and (best is None or full.length >= best.length):
             ends.append(self.settled(full, swapped=True))
@@ -145,6 +146,7 @@ class Search:
         Unless `best` is at the noise: a force is then missing. Terms may make up for the force within blocks, which
         samples on both sides determine, and yet fail in a free run.
         """
+        # Without: law 2 noisy of `benchmarks/judge.py` is missed by 139 times the noise, with: by 2.0.
         if best.at_the_noise or not best.whole:
             return best
         fitter = best.fitter
@@ -214,6 +216,7 @@ class Search:
         injects energy.
         """
         moves, at = Moves(trial), trial.taken
+        # Without exchanges: law 2 noisy of `benchmarks/judge.py` is missed by 6.8 times the noise, with: by 2.0.
         kinds = [moves.joining, *([moves.leaving] if whole else []), *([moves.exchanges] if swapped else [])]
         for taken in (taken for kind in kinds for taken in kind(at)[: self.fits]):
             if taken in seen:

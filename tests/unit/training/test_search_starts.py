@@ -171,9 +171,6 @@ class Asked:
     def with_functions(self, best):
         return SimpleNamespace(names=["f1"], rms=0.1, whole=True, at=self.name) if self.answer("functions") else best
 
-    def finalist(self, best, ends):
-        return ends[0] if self.told.get("behind") else best
-
     def better_hold(self, best, holds, *, by_residuals=False):  # noqa: ARG002
         wanted = self.answer(f"hold of {best.names[0]}", "")
         return wanted if wanted in holds else ""
@@ -280,11 +277,6 @@ def test_zeros_are_asked_once_more_of_the_model_that_is_found(asked):
     zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
     assert ("whole", "zeros again") in asked(zeros=zeros)[1]
     assert ("whole", "zeros again") not in asked()[1]
-
-
-def test_terms_of_inputs_that_run_free_no_better_are_not_taken(asked):
-    # fails if blocks of the recordings, which free runs go on from, decide alone
-    assert asked(terms=("u^2",), behind=True)[0].input_terms == ()
 
 
 def test_the_hold_of_samples_far_apart_is_asked_of_all_samples(asked):
