@@ -8,7 +8,7 @@ from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.search import Search
-from herglotz.training.strengths import likeliest, of_terms
+from herglotz.training.strengths import likeliest
 from herglotz.training.trials import ITERATIONS, Fitter, Trial
 from herglotz.training.variants import Variant
 
@@ -25,7 +25,7 @@ def with_functions(search: Search, best: Trial) -> Trial:
     part(MORE_TERMS)
     found = _joined(search, best) if best.near else None
     found = _anew(search) if found is None else found
-    if found is None or (best.near and not found.taken & set(found.fitter.functions)):
+    if found is None or not found.taken & set(found.fitter.functions):
         return best
     return search.better(best, found) or best
 
@@ -62,7 +62,7 @@ def _anew(search: Search) -> Trial | None:
     """A model fitted from the shortest segments on, with functions that join one by one or all at once.
 
     All functions but those of the mass at once are tried unless terms alone follow whole trajectories or the first
-    model is at the noise. A model that ends without functions is fitted by named terms.
+    model is at the noise.
     """
     if (fitter := _fitter(search, Variant(search.order))) is None:
         return None
@@ -70,6 +70,4 @@ def _anew(search: Search) -> Trial | None:
     if found is None or not (found.whole and (found.at_the_noise or not found.taken & set(fitter.functions))):
         taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
         found = search.better(found, search.climbed(fitter, taken, {}, joining=False))
-    if found is None or found.taken & set(fitter.functions):
-        return found
-    return of_terms(found, search.fitter(replace(found.fitter.variant, functions=())), 2 * ITERATIONS)
+    return found
