@@ -90,12 +90,7 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
         return ()
     if any(map(saturation, taken_terms(found, every))):
         every = _sharpened(search, found, every)
-    # Without the terms that left, terms that made up for these may leave, too.
-    while 0 < len(taken := taken_terms(found, every)) < len(every):
-        fewer = _with(search, taken, trial)
-        if fewer is None or found.replaces(fewer):
-            break
-        found, every = fewer, taken
+    taken = taken_terms(found, every)
     return taken if found.gain(trial, sum(map(bool, map(saturation, taken)))) > 0 else ()
 
 

@@ -22,11 +22,9 @@ def with_dissipation(search: Search, best: Trial) -> Trial:
     asked = fitter.fit(best.taken | {lowest}, best.values, best.length, best, 2 * ITERATIONS)
     if best.whole and (asked is None or not asked.replaces(best)):
         return best
-    better, ends = best, [best]
     for taken in (fitter.simple, fitter.simple | {lowest}):
         if (other := search.climbed(fitter, taken, {})) is not None:
-            better = search.better(better, other) or best
-            ends.append(other)
+            best = search.better(best, other) or best
             if other.at_the_noise:
                 break
-    return search.finalist(better, ends)
+    return best

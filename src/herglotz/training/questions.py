@@ -81,7 +81,7 @@ class Questions:
         recorded = self.wanted, self.read
         read = self.read.driven_by(terms)
         found = _searched(read)
-        if found is None or not found.replaces(self.best) or read.finalist(found, (self.best, found)) is not found:
+        if found is None or not found.replaces(self.best):
             return
         self._drive(terms, self.wanted, read, found)
         tried = []
@@ -105,20 +105,8 @@ class Questions:
         self.read, self.best = read, found
 
     def functions(self) -> None:
-        """Find a better model with learned functions, then ask for the hold and the zeros once more.
-
-        What seemed a difference between recordings, or errors of another hold, may have been a missing function.
-        """
-        if self.best is None or (found := with_functions(self.read, self.best)) is self.best:
-            return
-        self.best = found
-        later = "" if self.wanted.part.step_ratio > 1 else self.read.better_hold(found, self.holds)
-        wanted = self.wanted.of(replace(self.wanted.data, hold=later)) if later else self.wanted
-        if (again := wanted.part.again(found)) is None:
-            return
-        self.wanted, self.hold = wanted, later or self.hold
-        self.read, best, self.differ = wanted.part.with_zeros(again)
-        self.best = best and self.read.settled(best, swapped=True)
+        """Find a better model with learned functions."""
+        self.best = self.best and with_functions(self.read, self.best)
 
     def all_data(self) -> None:
         """Fit the model of a part to all data, and ask these for zeros, more terms and, if not yet asked, the hold."""

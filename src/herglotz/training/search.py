@@ -83,22 +83,17 @@ class Search:
 
     @cached_property
     def first(self) -> Trial | None:
-        """The better of two models grown from the simplest: offers join over short segments, or over the longest only.
-
-        If inputs are feedback of the state, offers that join over short segments make up for one another.
-        """
+        """The model grown from the simplest: offers join over short segments and ever longer ones."""
         part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
-        best, plain = self.climbed(fitter, fitter.simple, {}), self.grown(fitter, fitter.simple)
-        if plain is not None and (best is None or plain.length >= best.length):
-            best = self.better(best, self.settled(plain))
-        return best
+        return self.climbed(fitter, fitter.simple, {})
 
     @cached_property
     def full(self) -> Trial | None:
         """The model of the whole dictionary over the longest segments that the model follows."""
         fitter = self.fitter(Variant(self.order))
-        return self.grown(fitter, [offer.name for offer in fitter.offers])
+        trial = fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
+        return trial and self.finer(fitter.grow(self.finer(trial)))
 
     @inside()
     def run(self) -> Trial | None:
@@ -107,6 +102,7 @@ class Search:
         part(MORE_TERMS)
         ends = [best]
         fitter = self.fitter(Variant(self.order))
+        # Without: cases/furuta_big of `benchmarks/judge.py` ends twice as far off, and is said to be at the noise.
         ends.append((start := self.linear_start(fitter)) and self.climbed(fitter, *start))
         if not (best and best.at_the_noise) and (full := self.full) and (best is None or full.length >= best.length):
             ends.append(self.settled(full, swapped=True))
@@ -115,14 +111,9 @@ class Search:
         if best is None:
             return None
         part(FEWER_TERMS)
-        every = [offer.name for offer in best.fitter.offers]
-        down = best.fitter.fit(every, best.values, best.length, best, 2 * ITERATIONS)
-        ends.append(down and self.settled(self.finer(best.fitter.grow(down)), swapped=True))
-        best = self.better(best, ends[-1])
-        if best is not None and best is not ends[-1]:
-            ends.append(best := self.settled(best, swapped=True))
-        found = best and without_injecting_friction(self, self.finalist(best, ends))
-        return found and with_sticking(self, found)
+        # Without exchanges in the end: cases/tracker_xy of `benchmarks/judge.py` has unseen starts that diverge.
+        ends.append(best := self.settled(best, swapped=True))
+        return with_sticking(self, without_injecting_friction(self, self.finalist(best, ends)))
 
     def of_part(self, found: Trial | None, differ: tuple[Tensor, Tensor] | None) -> Zeroed:
         """The model found in `part`, fitted to all data and settled there.
@@ -157,6 +148,7 @@ class Search:
         Unless `best` is at the noise: a force is then missing. Terms may make up for the force within blocks, which
         samples on both sides determine, and yet fail in a free run.
         """
+        # Without: law 2 noisy of `benchmarks/judge.py` is missed by 139 times the noise, with: by 2.0.
         if best.at_the_noise or not best.whole:
             return best
         fitter = best.fitter
@@ -202,11 +194,6 @@ class Search:
             trial = longer
         return None
 
-    def grown(self, fitter: Fitter, taken: Iterable[str]) -> Trial | None:
-        """A model with these offers, over the longest segments that the model follows."""
-        trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        return trial and self.finer(fitter.grow(self.finer(trial)))
-
     def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
         """The better of two models by the score."""
         if up is None or down is None:
@@ -231,6 +218,7 @@ class Search:
         injects energy.
         """
         moves, at = Moves(trial), trial.taken
+        # Without exchanges: law 2 noisy of `benchmarks/judge.py` is missed by 6.8 times the noise, with: by 2.0.
         kinds = [moves.joining, *([moves.leaving] if whole else []), *([moves.exchanges] if swapped else [])]
         for taken in (taken for kind in kinds for taken in kind(at)[: self.fits]):
             if taken in seen:

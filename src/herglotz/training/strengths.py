@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from herglotz.training.trials import Fitter, Trial
+from herglotz.training.trials import Trial
 
 
 def likeliest(trial: Trial, most: int) -> Trial:
@@ -27,15 +27,9 @@ def needed(trial: Trial, most: int) -> Trial:
 
     `Moves.leaving` removes bands too, but by the linearised motion alone.
     """
+    # Without: law 1 noisy of `benchmarks/judge.py` is missed by 61 times the noise, with: by 6.1.
     for name in sorted(trial.likeliest_scales, key=trial.likeliest_scales.__getitem__):
         other = trial.fitter.fit(trial.taken - {name}, trial.values, trial.length, trial, most)
         if other is not None and not trial.replaces(other):
             trial = likeliest(other, most)
     return trial
-
-
-def of_terms(trial: Trial, plain: Fitter, most: int) -> Trial | None:
-    """A trial without functions, fitted anew by `plain`, the fitter whose offers are named terms alone."""
-    # Powers of the simplest model are no offers beside functions, because every model has the powers there.
-    powers = plain.simple - trial.fitter.simple
-    return plain.fit(trial.taken | powers, plain.values_of(trial), trial.length, trial, most)

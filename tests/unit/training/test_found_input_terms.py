@@ -208,9 +208,6 @@ class Asked:
     def settled(self, _, swapped):
         return self.trial(self.left if swapped else ())
 
-    def finalist(self, best, _):
-        return best
-
     def better(self, _, other):
         return other
 

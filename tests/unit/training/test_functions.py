@@ -373,7 +373,6 @@ def test_no_functions_where_named_terms_are_at_the_noise(monkeypatch):
     assert found.near
     same = SimpleNamespace(taken=found.taken, fitter=SimpleNamespace(functions={"V(q1) 1": []}))
     monkeypatch.setattr("herglotz.training.function_search._joined", lambda *_: same)
-    monkeypatch.setattr(search, "finalist", lambda *_: same)
     monkeypatch.setattr(search, "better", lambda *_: same)
     assert with_functions(search, found) is found
 

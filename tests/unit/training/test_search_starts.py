@@ -171,9 +171,6 @@ class Asked:
     def with_functions(self, best):
         return SimpleNamespace(names=["f1"], rms=0.1, whole=True, at=self.name) if self.answer("functions") else best
 
-    def finalist(self, best, ends):
-        return ends[0] if self.told.get("behind") else best
-
     def better_hold(self, best, holds, *, by_residuals=False):  # noqa: ARG002
         wanted = self.answer(f"hold of {best.names[0]}", "")
         return wanted if wanted in holds else ""
@@ -260,15 +257,9 @@ def test_no_zeros_are_asked_of_the_dictionary_where_terms_are_at_the_noise(asked
     assert seen[:3] == [("whole", "run"), ("whole", "zeros"), ("whole", "hold of cos(q1)")]
 
 
-def test_the_hold_is_asked_of_functions_where_a_poorer_model_does_not_see_it(asked):
-    # fails if a hold that the first model does not ask for is given up; if another one is asked for twice; if terms
-    # are searched with the wrong hold
-    found, seen = asked(**{"functions": True, "hold of f1": "first"})
-    assert found.hold == "first"
-    assert [question for _, question in seen if "hold" in question] == ["hold of full", "hold of f1"]
-    assert seen[-1] == ("whole'", "zeros")
-    found, seen = asked(**{"functions": True, "hold of full": "smooth"})
-    assert found.hold == "smooth"
+def test_the_hold_that_the_whole_dictionary_asks_for_is_that_of_the_search(asked):
+    # fails if that hold is lost where functions join, or terms are searched with the wrong hold
+    assert asked(**{"functions": True, "hold of full": "smooth"})[0].hold == "smooth"
     found, seen = asked(**{"hold of full": "smooth"})
     assert found.hold == "smooth"
     assert [name for name, question in seen if question == "run"] == ["whole'"]
@@ -288,11 +279,6 @@ def test_zeros_are_asked_once_more_of_the_model_that_is_found(asked):
     assert ("whole", "zeros again") not in asked()[1]
 
 
-def test_terms_of_inputs_that_run_free_no_better_are_not_taken(asked):
-    # fails if blocks of the recordings, which free runs go on from, decide alone
-    assert asked(terms=("u^2",), behind=True)[0].input_terms == ()
-
-
 def test_the_hold_of_samples_far_apart_is_asked_of_all_samples(asked):
     # fails if means over several samples decide between holds of one, or the hold of all is not asked for then
     found, seen = asked(**{"long": True, "longer": 4.0, "hold of cos(q1)": "first"})
@@ -310,12 +296,6 @@ def test_terms_of_inputs_are_those_of_all_data(asked):
         ("part", "terms"), ("part", "driven by u^2"), ("part'", "run"), ("whole", "driven by u^2"),
         ("part'", "hold of cos(q1)"), ("part'", "line"), ("part'", "functions"),
     ]  # fmt: skip
-
-
-def test_a_hold_that_functions_ask_for_keeps_the_terms_of_inputs(asked):
-    # fails if the recording is taken anew with that hold, without the columns that the model is driven by
-    found, _ = asked(**{"terms": ("u^2",), "functions": True, "hold of f1": "first"})
-    assert (found.input_terms, found.hold) == (("u^2",), "first")
 
 
 @pytest.mark.parametrize(

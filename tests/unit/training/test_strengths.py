@@ -5,8 +5,7 @@ from typing import Any
 
 import torch
 
-from herglotz.training.strengths import likeliest, needed, of_terms
-from herglotz.training.trials import Fitter
+from herglotz.training.strengths import likeliest, needed
 
 
 class Fits:
@@ -59,18 +58,3 @@ def test_bands_that_are_not_worth_their_price_leave_the_weakest_first():
     found = needed(trial(fits, "abcx", 4.0), 7)
     assert found.taken == {"c", "x"}
     assert [gone for gone, _ in fits.asked if gone] == [{"b"}, {"c"}, {"a"}]
-
-
-def test_a_model_of_terms_alone_begins_at_the_numbers_of_its_own_terms():
-    # fails if the number of a wave is taken for that of the term which stands in its place where no waves are
-    with_waves = SimpleNamespace(keys={"c[0]": "q1^2", "c[1]": "sin(q1)", "c[2]": "q1^4"}, simple=frozenset())
-    found: Any = SimpleNamespace(
-        fitter=with_waves, taken=frozenset({"q1^4"}), values={"c[0]": 1.0, "c[2]": 3.0}, length=5
-    )
-    asked: list[Any] = []
-    plain: Any = SimpleNamespace(keys={"c[0]": "q1^2", "c[1]": "q1^4"}, simple=frozenset({"q1^2"}))
-    plain.values_of, plain.fit = lambda trial: Fitter.values_of(plain, trial), lambda *given: asked.append(given)
-    of_terms(found, plain, 7)
-    ((taken, values, length, before, most),) = asked
-    assert (taken, values, length, most) == ({"q1^2", "q1^4"}, {"c[0]": 1.0, "c[1]": 3.0}, 5, 7)
-    assert before is found
