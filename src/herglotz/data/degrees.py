@@ -38,13 +38,8 @@ def with_angles_in_degrees(
     units = zip(data.names, data.units, strict=True)
     found = [name for name, unit in units if unit == "1" and known.get(name) == TAKEN_FOR_DEGREES]
     radians = data.names if angles is True else as_names(angles or ())
-    notes = []
+    notes = _notes_of_counts(data, known) if angles is None else []
     for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
-        if unit == "1" and angles is None and name not in known and are_counts(q):
-            notes.append(
-                f"warning: whole numbers without a unit, {name} may be {COUNTS}: if a turn is N of them, give "
-                f"--sensor-scales with the number 2π/N, and --angles {name}"
-            )
         in_radians = unit == "rad" or name in radians
         angular = in_radians or (unit == "1" and angles is None and is_angular(name))
         if not angular or name in {*known, *data.degrees} or float(q.abs().max()) <= TURN["rad"]:
@@ -69,6 +64,16 @@ def is_in_degrees(data: Trajectories, q: Tensor) -> bool:
 def are_counts(q: Tensor) -> bool:
     """Whether a coordinate, (N,), may be counts of an encoder: whole numbers beyond 360."""
     return float(q.abs().max()) > TURN["deg"] and bool((q == q.round()).all())
+
+
+def _notes_of_counts(data: Trajectories, known: Collection[str]) -> list[str]:
+    """A warning for each coordinate without a unit that may be counts and is not `known`, which says what to give."""
+    return [
+        f"warning: whole numbers without a unit, {name} may be {COUNTS}: if a turn is N of them, give --sensor-scales "
+        f"with the number 2π/N, and --angles {name}"
+        for name, unit, q in zip(data.names, data.units, data.q.T, strict=True)
+        if unit == "1" and name not in known and are_counts(q)
+    ]
 
 
 def _unsteady(data: Trajectories, q: Tensor, turn: float) -> float:
