@@ -123,13 +123,8 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     of_speed, dry = "of_speed" in found, "dry" in found
     speed = found["v"] or found["pair"]
     place = found["angle"] or found["q"]
-    on, *of = map(
-        int,
-        re.findall(
-            r"\d+",
-            speed or found["dry"] or found["load"] or found["even"] or found["driven"] or found["braked"] or place,
-        ),
-    )
+    own = speed or found["dry"] or found["load"] or found["even"] or found["driven"] or found["braked"] or place
+    on, *of = map(int, re.findall(r"\d+", own))
     at, given = int(place or on), int(found["input"]) - 1 if found["input"] else None
     a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
     power = int(found["power"] or 1) if found["braked"] else 0
@@ -141,19 +136,9 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
         f"drag '{text}': inputs are numbered from 1": given == -1,
     })  # fmt: skip
     feature = DragFeature(
-        on - 1,
-        at - 1,
-        a,
-        b,
-        c,
-        second,
-        dry=dry,
-        wave=found["wave"],
-        rate=rate,
-        of_speed=of_speed,
-        input=given,
+        on - 1, at - 1, a, b, c, second, dry=dry, wave=found["wave"], rate=rate, of_speed=of_speed, input=given,
         power=power,
-    )
+    )  # fmt: skip
     _check_periods(text, feature, angles[at - 1])
     _check_powers(text, feature, of_a_speed=bool(speed))
     return feature

@@ -21,7 +21,7 @@ from herglotz.data.smoothing import smoothed
 from herglotz.least_squares import least_squares
 from herglotz.models.drag import input_forces
 from herglotz.training.acceleration_terms import acceleration_terms, for_each
-from herglotz.training.dictionary import by_position
+from herglotz.training.dictionary import by_motion
 from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.trials import Trial, Variant
 
@@ -46,7 +46,7 @@ class Driven(Protocol):
 
 def offered_terms(data: Trajectories) -> tuple[str, ...]:
     """Squares, sizes and rates of the inputs, both saturations of each at the level that accelerations ask for, and
-    their forces that depend on the position.
+    their forces that depend on the motion.
     """
     plain = all_input_terms(data)
     if not plain or data.u is None:
@@ -60,11 +60,11 @@ def offered_terms(data: Trajectories) -> tuple[str, ...]:
         for kind, shape in SATURATIONS.items() if levels else ():
             left = [_left(found.columns, shape(u / level), a) for level in levels]
             terms.append(f"{kind}({name}/{levels[left.index(min(left))]:.4g})")
-    return (*plain, *terms, *by_position(data.angles, range(1, len(data.input_labels) + 1)))
+    return (*plain, *terms, *by_motion(data.angles, range(1, len(data.input_labels) + 1)))
 
 
 def columns_of(terms: Iterable[str]) -> tuple[str, ...]:
-    """Those of these terms that are further columns of u, and no forces that depend on the position."""
+    """Those of these terms that are further columns of u, and no forces that depend on the motion."""
     terms = tuple(terms)
     return tuple(term for term in terms if term not in input_forces(terms))
 

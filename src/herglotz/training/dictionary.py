@@ -72,7 +72,7 @@ def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
     return tuple(drag)
 
 
-def by_position(angles: tuple[bool, ...], inputs: Iterable[int]) -> tuple[str, ...]:
+def by_motion(angles: tuple[bool, ...], inputs: Iterable[int]) -> tuple[str, ...]:
     """Forces of these inputs, counted from 1, that depend on the motion.
 
     u cos q and u sin q of every angle, on the angle and on every length; u q and u q² of every length, on that length;
@@ -90,7 +90,7 @@ def by_position(angles: tuple[bool, ...], inputs: Iterable[int]) -> tuple[str, .
 def _inputs_by_position(c: ModelConfig) -> tuple[str, ...]:
     """All these forces of the inputs that a model has some of."""
     forces = (parse_drag(text, c.angles).input for text in c.drag)
-    return by_position(c.angles, sorted({k + 1 for k in forces if k is not None}))
+    return by_motion(c.angles, sorted({k + 1 for k in forces if k is not None}))
 
 
 def keys_of(numbers: list[str], config: ModelConfig) -> list[str]:

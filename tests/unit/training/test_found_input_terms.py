@@ -18,7 +18,7 @@ from herglotz.training import questions
 from herglotz.training.acting_inputs import beside, offered_terms, taken_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.dictionary import by_position, dictionary
+from herglotz.training.dictionary import by_motion, dictionary
 from herglotz.training.foresight import _with_absent_terms
 from herglotz.training.look import look
 from herglotz.training.offers import INPUTS, ZEROS
@@ -151,12 +151,12 @@ def test_the_only_gain_of_a_model_has_no_number():  # fails if its place is read
 
 def test_forces_of_inputs_are_offered_on_the_angle_and_on_lengths():
     # fails if a thruster's force on a length is no offer, or the numbers of an arm grow with the square of its joints
-    assert by_position((False, True), [2]) == (
+    assert by_motion((False, True), [2]) == (
         "u2 cos(q2) on q1", "u2 sin(q2) on q1", "u2 cos(q2)", "u2 sin(q2)", "u2 q1", "u2 q1^2",
         "u2 v1", "u2^2 v1", "u2 v2", "u2^2 v2",
     )  # fmt: skip
-    assert len(by_position((True, True), [1, 2])) == 16
-    assert by_position((False,), [1]) == ("u1 q1", "u1 q1^2", "u1 v1", "u1^2 v1")
+    assert len(by_motion((True, True), [1, 2])) == 16
+    assert by_motion((False,), [1]) == ("u1 q1", "u1 q1^2", "u1 v1", "u1^2 v1")
 
 
 def test_one_kernel_serves_all_forces_of_an_input():
