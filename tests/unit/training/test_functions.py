@@ -284,6 +284,16 @@ def test_prior_deviations_fall_as_those_of_a_matern_process_in_so_many_dimension
         assert ratio == pytest.approx((own[-1].rates[-1] / own[0].rates[0]) ** power), name
 
 
+def test_damping_of_the_only_coordinate_changes_within_a_seventh_of_its_range():
+    # fails if a mass stands for damping that changes over half a turn, because the damping has long waves alone; or if
+    # the damping of each of two coordinates has as many, which makes more numbers than a kernel takes
+    data = plane()
+    one = replace(data, q=data.q[:, :1], names=("q1",), units=data.units[:1], angles=(False,), observed=None)
+    for of, pairs in ((one, 7), (data, 3)):
+        own = [own for own in bands(of, estimate_baseline(of)) if own.name.startswith("damping(q1)")]
+        assert sum(len(band.texts) for band in own) == 2 * pairs
+
+
 def test_friction_by_speed_is_periodic_beyond_what_was_recorded():
     # fails if the interval is not that of the largest speed, or of a difference that of one of its speeds
     data = plane()

@@ -318,7 +318,7 @@ def test_a_coordinate_by_another_name_keeps_its_degrees():
 
 
 def test_a_free_run_beyond_the_recorded_range_is_noted():
-    # fails if the warm-up counts, another trajectory or time is named, or the range has no say at all
+    # fails if another trajectory or time is named, or the range has no say at all
     model = model_of("conservative")
     run, data = run_of(model), recording(model)
     x = predict(run, data).states
@@ -337,6 +337,17 @@ def test_a_free_run_beyond_the_recorded_range_is_noted():
     motion = replace(run, box=ends).rollout(80, q0=start[0], p0=start[1])
     assert motion.beyond[0].since == pytest.approx(H)
     assert "leaves the range" in repr(motion)
+
+
+def test_a_warm_up_beyond_the_recorded_range_is_noted():
+    # fails if nothing is said of a start state that was read where the model extrapolates
+    model = model_of("conservative")
+    run, data = run_of(model), recording(model)
+    first = predict(run, data).states.q[:, 0].reshape(2, -1)[:, :20]
+    b = int(first.amax(1).argmax())
+    ends = {"q_low": [-2.5], "q_high": [float(first.max()) - 0.2], "p_low": [-9.0], "p_high": [9.0]}
+    (left,) = predict(replace(run, box=ends), data.select([b])).beyond
+    assert left.since < 19 * H
 
 
 def test_process_noise_does_not_depend_on_the_step():
