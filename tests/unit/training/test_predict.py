@@ -350,6 +350,15 @@ def test_a_warm_up_beyond_the_recorded_range_is_noted():
     assert left.since < 19 * H
 
 
+def test_a_model_that_follows_only_parts_has_no_best_start(monkeypatch):
+    # fails if errors of segments, each with a start of its own, are said to be those of a run from one start
+    model = model_of("conservative")
+    run, data, grid = run_of(model), recording(model), SimpleNamespace(segments=5)
+    found = SimpleNamespace(problem=SimpleNamespace(grid=grid))
+    monkeypatch.setattr("herglotz.training.best_start.fit_states", lambda *_: found)
+    assert missed_from_best_start(run, data) is None
+
+
 def test_process_noise_does_not_depend_on_the_step():
     # fails if the noise of every step adds up: over 145 samples a period free runs began 1.6 times the noise off
     model = ContactLagrangian(ModelConfig(level="linear", rate=0.1, scale=(1.0,), speed=(1.0,), potential_width=0))
