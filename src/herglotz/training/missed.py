@@ -102,8 +102,8 @@ def reason_of(
             f"What is missed comes in kicks, the hardest at {when}. Try what strikes as an input (--inputs), or "
             "recordings that are cut there"
         )
-    # Measured where a force is missing: of 76 recordings with a memory 52 are told, 35 of them by neighbours alone; of
-    # 55 without one 8 are, as many as by neighbours alone.
+    # Measured where a force is missing: of 75 recordings with a memory 52 are told, 34 of them by neighbours alone; of
+    # 50 without one 8 are, 7 of them by neighbours alone.
     if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle):
         by_state, by_past = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
         if not (by_state > OTHER * (1 - hidden) and by_past < HALF * by_state):
