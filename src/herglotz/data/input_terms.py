@@ -17,6 +17,7 @@ from torch import Tensor
 
 from herglotz.data.column_table import INPUT_TERM
 from herglotz.data.csv_columns import is_number
+from herglotz.data.smoothing import slopes
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 
@@ -77,8 +78,7 @@ def _column(data: Trajectories, u: Tensor, form: str) -> Tensor:
         return SATURATIONS[found[0]](u / found[1])
     if form != "{}'":
         return u.square() if form == "{}^2" else u.abs()
-    parts = zip(u.split(data.lengths), data.t.split(data.lengths), strict=True)
-    return torch.cat([torch.gradient(one, spacing=(t,))[0] for one, t in parts])
+    return slopes(data, u)
 
 
 def _unit(unit: str, form: str, time_unit: str) -> str:

@@ -47,6 +47,12 @@ class LocalPolynomials:
         return (powers[..., None] * self.coefficients).sum(1)
 
 
+def slopes(data: Trajectories, x: Tensor) -> Tensor:
+    """ẋ at every sample, (N, …), by parabolas through x (N, …) and its neighbours in the same recording."""
+    parts = zip(x.split(data.lengths), data.t.split(data.lengths), strict=True)
+    return torch.cat([torch.gradient(own, spacing=(t.contiguous(),), dim=0)[0] for own, t in parts])
+
+
 def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     """The local polynomials of the best width and degree; None if a trajectory has fewer than seven samples."""
     tried = []

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precisions
+from herglotz.data.smoothing import slopes
 from herglotz.data.units import size
 from herglotz.least_squares import least_squares
 from herglotz.models import ContactLagrangian
@@ -92,11 +93,8 @@ def leaves_without_inputs(model: ContactLagrangian, data: Trajectories, states: 
 def unexplained(data: Trajectories, states: Tensor) -> float:
     """The part of the inputs that is no linear function of q and q̇, RMS over the spread of each input."""
     assert data.u is not None
-    q, parts = states[:, : data.dof], []
-    for first, length in zip(data.offsets, data.lengths, strict=True):
-        own = slice(first, first + length)
-        parts.append(torch.gradient(q[own], spacing=(data.t[own].contiguous(),), dim=0)[0])
-    x, u = torch.cat([q, torch.cat(parts)], 1), data.u.to(q)
+    q = states[:, : data.dof]
+    x, u = torch.cat([q, slopes(data, q)], 1), data.u.to(q)
     x, u = x - x.mean(0), u - u.mean(0)
     x, u = (y / y.square().mean(0).sqrt().clamp_min(1e-300) for y in (x, u))
     return float((u - x @ least_squares(x.T @ x, x.T @ u)).square().mean().sqrt())

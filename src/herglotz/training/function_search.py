@@ -51,7 +51,7 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     found = same and search.settled(search.finer(same), swapped=True)
     if found is None or found.at_the_noise:
         return found
-    # Without: open 5417/6 of `benchmarks/judge.py` has no fit, with: one that free runs miss.
+    # The row open 5417/6 of `benchmarks/judge.py` needs this fit: without it no model is found, with it a poor one.
     every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
     if every is None or not float((best.score.losses - every.score.losses).sum()) > 0:
         return found

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.smoothing import slopes
 
 # Widths ℓ of the kernel, in standard deviations of x, and ridges: those that predict best are taken.
 WIDTHS, RIDGES = (0.5, 1.0, 2.0, 4.0), (1e-3, 1e-2, 1e-1, 1.0)
@@ -45,10 +46,7 @@ def left_by_the_past(
 
 def signals(data: Trajectories) -> Tensor:
     """The signals of the past at every sample, (N, m); each recording begins without a past."""
-    speeds = torch.cat([
-        torch.gradient(data.q[first : first + length], spacing=(data.t[first : first + length].contiguous(),), dim=0)[0]
-        for first, length in zip(data.offsets, data.lengths, strict=True)
-    ])  # fmt: skip
+    speeds = slopes(data, data.q)
     spread = data.q.std(0, correction=0)
     period = 2 * math.pi * float((spread / speeds.std(0, correction=0).clamp_min(1e-300)).max())
     into = torch.cat([speeds, speeds.square(), data.q.square()], 1)
