@@ -10,6 +10,7 @@ hold gives the value, for the whole recorded step or for each of the equal parts
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -70,18 +71,33 @@ def interpolated_input(
     time = t[row] + part * (t[after] - t[row])
     count = min(SAMPLES[hold], min(lengths))
     start = torch.minimum(torch.maximum(row - (count // 2 - 1), first), last - count + 1)
-    near = start[..., None] + torch.arange(count, device=u.device)  # (..., count)
-    x = t[near] - time[..., None]
-    return (lagrange(x)[..., None] * u[near]).sum(-2)
+    windows, own = torch.unique_consecutive(start, return_inverse=True)
+    near = windows + torch.arange(count, device=u.device)[:, None]  # (count, W)
+    weighted = u[near] / torch.stack(_denominators(list(t[near])))[..., None]
+    value = torch.zeros_like(u[row])
+    for numerator, of_node in zip(_numerators([x[own] - time for x in t[near]]), weighted, strict=True):
+        value += numerator[..., None] * of_node[own]
+    return value
 
 
 def lagrange(x: Tensor) -> Tensor:
     """Weights of values at the nodes x in the polynomial through them at 0, Π_{j ≠ i} x_j / (x_j − x_i); (..., k)."""
-    # Node by node: all pairs of nodes at once take ten times as long, and the memory of a square.
-    weights = []
-    for i, own in enumerate(nodes := x.unbind(-1)):
-        weight = torch.ones_like(own)
-        for other in nodes[:i] + nodes[i + 1 :]:
-            weight = weight * (other / (other - own))
-        weights.append(weight)
-    return torch.stack(weights, -1)
+    nodes = list(x.unbind(-1))
+    return torch.stack([a / b for a, b in zip(_numerators(nodes), _denominators(nodes), strict=True)], -1)
+
+
+def _numerators(nodes: Sequence[Tensor]) -> list[Tensor]:
+    """Π_{j ≠ i} x_j for each node i: the product of the nodes before, times the product of the nodes after."""
+    before, after = [torch.ones_like(nodes[0])], [torch.ones_like(nodes[0])]
+    for k in range(len(nodes) - 1):
+        before.append(before[-1] * nodes[k])
+        after.append(after[-1] * nodes[-1 - k])
+    return [a * b for a, b in zip(before, reversed(after), strict=True)]
+
+
+def _denominators(nodes: Sequence[Tensor]) -> list[Tensor]:
+    """Π_{j ≠ i} (x_j − x_i) for each node i."""
+    return [
+        math.prod((other - own for other in (*nodes[:i], *nodes[i + 1 :])), start=torch.ones_like(own))
+        for i, own in enumerate(nodes)
+    ]

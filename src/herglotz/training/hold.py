@@ -18,7 +18,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.actuator import InputPieces, acting
-from herglotz.data.holds import HOLDS, Arrival
+from herglotz.data.holds import HOLDS, SAMPLES, Arrival
 from herglotz.data.smoothing import smoothed
 from herglotz.data.splits import liveliest_rows
 from herglotz.data.windows import Triples
@@ -35,6 +35,8 @@ BLOCKS, MIN_STANDARD_ERRORS = 10, 3.0
 MAX_SAMPLES = 3000
 # Delays and lags that are tried, in typical steps.
 TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+# Typical steps before the compared samples whose inputs still act: forty times the longest lag forgets to 1e-17.
+REMEMBERED = int(41 * TRIED[-1])
 # Least delay and lag together, in typical steps: errors of the linear model itself look like up to 0.27 of a step.
 MIN_LATENESS = 0.3
 # Shortest step of the search, in typical steps.
@@ -112,11 +114,12 @@ class Ways:
 
     def __init__(self, data: Trajectories):
         data = data.to(torch.float64, "cpu")
-        rows, _ = liveliest_rows(data.q, data.lengths, MAX_SAMPLES)
-        self.all, self.rows, self.problem = data, rows, Accelerations(data.liveliest(MAX_SAMPLES))
-        self.step, recorded = data.typical_step, data.u
+        rows, lengths = liveliest_rows(data.q, data.lengths, MAX_SAMPLES)
+        self.step, self.problem = data.typical_step, Accelerations(data.rows(rows, lengths))
+        self.all, self.rows = _with_past(data, rows, lengths)
+        recorded = self.all.u
         assert recorded is not None
-        self.pieces = cache(lambda hold: InputPieces.of(hold, data.t, recorded, data.lengths))
+        self.pieces = cache(lambda hold: InputPieces.of(hold, self.all.t, recorded, self.all.lengths))
 
     def of(self, arrival: Arrival) -> Way:
         """An arrival with its errors."""
@@ -154,6 +157,18 @@ class Ways:
         delay, lag = (x + by * size * self.step for x, by in zip(arrival.late, move, strict=True))
         allowed = min(delay, lag) >= 0 and max(delay, lag) <= TRIED[-1] * self.step
         return arrival._replace(delay=delay, lag=lag) if allowed else None
+
+
+def _with_past(data: Trajectories, rows: Tensor, lengths: Sequence[int]) -> tuple[Trajectories, Tensor]:
+    """The samples whose inputs act in these runs of rows, and where the rows are among the samples."""
+    kept = []
+    for run in rows.split(list(lengths)):
+        own = int(data.trajectory[run[0]])
+        begin, end = data.offsets[own], data.offsets[own] + data.lengths[own]
+        last = min(end, int(run[-1]) + 1 + SAMPLES["smooth"])
+        kept.append(torch.arange(max(begin, int(run[0]) - REMEMBERED), last))
+    every = torch.cat(kept)
+    return data.rows(every, tuple(map(len, kept))), torch.searchsorted(every, rows)
 
 
 class Accelerations:

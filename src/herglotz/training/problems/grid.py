@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -112,38 +111,34 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     only the earlier segment observes it.
     """
     recorded, device = data.t.double().cpu().diff(), data.t.device
-    # Model steps of every recorded step, with a tolerance for rounded time stamps.
+    # Model steps of every recorded step, with a tolerance for rounded time stamps; none between two trajectories.
     counts = (recorded / max_step - 1e-6).ceil().clamp_min(1).long()
-    # For every segment (h, row, part) of its model steps, and its observed nodes.
-    lines: list[tuple[Tensor, Tensor, Tensor]] = []
-    seen: list[Tensor] = []
+    counts[torch.tensor(data.offsets[1:], dtype=torch.long) - 1] = 0
+    # Samples at which each segment starts and ends.
     starts: list[int] = []
-    joined: list[bool] = []
+    ends: list[int] = []
     for first, count in zip(data.offsets, data.lengths, strict=True):
         pieces = max(1, round((count - 1) / length))
         bounds = [first + round(i * (count - 1) / pieces) for i in range(pieces + 1)]
-        for i, (a, b) in enumerate(pairwise(bounds)):
-            joined.append(i > 0)
-            starts.append(a)
-            node = torch.cat([counts.new_zeros(1), counts[a:b].cumsum(0)])
-            row = torch.arange(a, b).repeat_interleave(counts[a:b])
-            before = torch.arange(len(row)) - node[row - a]
-            lines.append((recorded[row] / counts[row], row, (before.double() + 0.5) / counts[row]))
-            seen.append(node[i > 0 :])
-    end = torch.tensor([len(row) for _, row, _ in lines])
+        starts += bounds[:-1]
+        ends += bounds[1:]
+    a, b = torch.tensor(starts), torch.tensor(ends)
+    # Model steps before each sample.
+    before = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    end = before[b] - before[a]
     K = int(end.max())
     # The last model step of a segment is its padding.
-    padding = torch.arange(K).minimum(end[:, None] - 1)
-    h, row, part = (
-        torch.stack([x[at] for x, at in zip(each, padding, strict=True)]) for each in zip(*lines, strict=True)
-    )
+    step = before[a][:, None] + torch.arange(K).minimum(end[:, None] - 1)
+    row = torch.arange(len(counts)).repeat_interleave(counts)[step]
+    sample = torch.arange(data.samples)
+    segment = torch.searchsorted(b, sample)
     return SegmentGrid(
-        h=h.to(data.t),
-        node=torch.cat([s * (K + 1) + node for s, node in enumerate(seen)]).to(device),
-        start_sample=torch.tensor(starts, device=device),
-        joined=torch.tensor(joined, device=device),
+        h=(recorded[row] / counts[row]).to(data.t),
+        node=(segment * (K + 1) + before[sample] - before[a[segment]]).to(device),
+        start_sample=a.to(device),
+        joined=~torch.isin(a, torch.tensor(data.offsets)).to(device),
         end=end.to(device),
         row=row.to(device),
-        part=part.to(data.t),
+        part=(((step - before[row]).double() + 0.5) / counts[row]).to(data.t),
         length=length,
     )

@@ -117,6 +117,11 @@ class StatesOnly:
         """All unknowns of the problem."""
         return torch.cat([self.theta, states])
 
+    @property
+    def at_once(self) -> bool:
+        """As the problem."""
+        return getattr(self.problem, "at_once", False)
+
     def cost(self, x: Tensor) -> Tensor:
         """The cost of the problem with these states."""
         return self.problem.cost(self.full(x))

@@ -155,6 +155,11 @@ class ShootingProblem(StatesProblem):
         """Inverse of `pack`."""
         return x[: self.P], x[self.P :].reshape(-1, self.d)
 
+    @property
+    def at_once(self) -> bool:
+        """See `solvers.levenberg_marquardt.SumOfSquares`: a kernel makes path and derivatives in one sweep."""
+        return self.compiled is not None
+
     def solve(self, x: Tensor) -> Path | None:
         """The trajectories of all segments at x; None if a step has no solution."""
         if self._at is not None and torch.equal(self._at, x):
@@ -207,12 +212,21 @@ class ShootingProblem(StatesProblem):
         fit, joints = self._missed_by(path.x), self._joints(path.x, self._weights(x[: self.P]))
         return self.loss(fit, joints) + self._anchor(x).square().sum() / 2 + self.prior_cost(x[: self.P])
 
-    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Arrowhead, Tensor]:
-        """(cost, JᵀJ, Jᵀr); keeps the path for the next solve. With `held`, θ is frozen and only states are unknown."""
-        theta, _ = self.unpack(x)
-        path, sums = self.solve(x), Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
-        if path is not None and self.compiled is not None:
-            path = path if self.compiled.run(theta, path.x[:, 0], self._observed(), sums) is not None else None
+    def normal_equations(
+        self, x: Tensor, *, held: bool = False, rows: Tensor | None = None
+    ) -> tuple[Tensor, Arrowhead, Tensor]:
+        """(cost, JᵀJ, Jᵀr); keeps the path for the next solve. With `held`, θ is frozen and only states are unknown.
+
+        The rows of J of the samples, by the parameters and the start of the segment, are written to `rows`
+        (N, n, P + d).
+        """
+        theta, states = self.unpack(x)
+        sums = Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
+        if self.compiled is None:
+            path = self.solve(x)
+        else:
+            nodes = self.compiled.run(theta, self.with_s(states), self._observed(), sums, rows)
+            path = None if nodes is None else Path(nodes, None)
         if not everywhere(path is not None) or path is None:
             matrix = Arrowhead(sums.corner, sums.border, sums.blocks, torch.zeros_like(sums.blocks), self._eliminate)
             return x.new_full((), torch.inf), matrix, x.new_zeros(len(x) - self.P * held)
@@ -222,8 +236,10 @@ class ShootingProblem(StatesProblem):
         fit, joints = self._missed_by(path.x), self._joints(path.x, weights)
         if self.compiled is None:
             root = self.root_weights(fit)
-            by = root * self.weight / self.deviations
-            sums.add_samples(self.grid, self._slopes_of(theta, path, held=held), by, root * fit)
+            by, slopes_of_nodes = root * self.weight / self.deviations, self._slopes_of(theta, path, held=held)
+            sums.add_samples(self.grid, slopes_of_nodes, by, root * fit)
+            if rows is not None:
+                rows.copy_(by[..., None] * slopes_of_nodes.flatten(0, 1)[self.grid.node][:, : self.n])
         to = self.grid.joined.nonzero()[:, 0]
         root = self.root_weights(joints[to])
         own = None if slopes is None else (root * joints[to])[:, self.n : 2 * self.n, None] * slopes
@@ -275,7 +291,9 @@ class ShootingProblem(StatesProblem):
         return x[:, 0, : self.d]
 
     def guess_from_states(self, states: Tensor) -> None:
-        """Start the next solve from states (N, 2n+1) at the samples, interpolated by cubics."""
+        """Start the next solve from states (N, 2n+1) at the samples, interpolated by cubics; a kernel needs no guess."""
+        if self.compiled is not None:
+            return
         x = between_samples(self.grid, self.data, states)
         self.path = Path(x, x[..., None])
 

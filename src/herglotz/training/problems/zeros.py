@@ -44,17 +44,23 @@ class WithZeros:
         self.problem, self.which, self.held = problem, own[data.trajectory], held
         self.count, self.grow = (int(own.max()) + 1) * problem.n, torch.ones_like(data.t) if grow is None else grow
 
+    @property
+    def at_once(self) -> bool:
+        """As the problem."""
+        return self.problem.at_once
+
     def cost(self, x: Tensor) -> Tensor:
         """½|r|² with q + z − y as the residuals of the data."""
         return self.problem.cost(self._set(x))
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(cost, JᵀJ, Jᵀr) of all unknowns."""
-        cost, A, b = self.problem.normal_equations(self._set(x))
+        rows = x.new_zeros(*self.problem.data.q.shape, self.problem.P + self.problem.d)
+        cost, A, b = self.problem.normal_equations(self._set(x), rows=rows)
         if not bool(torch.isfinite(cost)):
             return cost, x.new_zeros(len(x), len(x)), torch.zeros_like(x)
         A = dense(A)
-        columns, diagonal, slope = by_zeros(self.problem, self.which, self.grow)
+        columns, diagonal, slope = by_zeros(self.problem, rows, self.which, self.grow)
         C = columns.flatten(1)
         A = torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)])
         b = torch.cat([b, slope.flatten()])
@@ -70,19 +76,22 @@ class WithZeros:
         return x[: -self.count]
 
 
-def by_zeros(problem: ShootingProblem, which: Tensor, grow: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def by_zeros(
+    problem: ShootingProblem,
+    rows: Tensor,  # (N, n, P + d)
+    which: Tensor,  # (N,)
+    grow: Tensor,  # (N,)
+) -> tuple[Tensor, Tensor, Tensor]:
     """The parts of (JᵀJ, Jᵀr) that belong to zeros z of sensors: columns (unknowns, Z, n), diagonal, gradient (Z, n).
 
-    They hold where the normal equations of all other unknowns were made last. Sample k has the zero `which[k]`, −1 for
-    none, times `grow[k]`; both are (N,).
+    They hold where the normal equations of all other unknowns were made last, with these `rows` of J. Sample k has the
+    zero `which[k]`, −1 for none, times `grow[k]`.
     """
     assert problem.path is not None
-    assert problem._at is not None
     count = int(which.max()) + 1
     fit = problem._missed_by(problem.path.x)
     by = problem.weight * problem.root_weights(fit) / problem.deviations  # (N, n) ∂r/∂z
-    slopes = problem.slopes_at_samples(problem._at[: problem.P], problem.path)
-    rows = slopes * (by.square() * grow[:, None])[..., None]  # (N, n, P + d)
+    rows = rows * (by * grow[:, None])[..., None]
     segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
     # Samples of a segment have the same zero.
     S, of = problem.grid.segments, torch.full((problem.grid.segments,), -1, device=which.device)

@@ -15,6 +15,8 @@ from herglotz.training.distributed import everywhere, of_first
 
 # A smaller relative change of the cost is the rounding of a long sum.
 ROUNDING = 1e-11
+# Factor of the damping after the first rejected step; the factor doubles with each further one.
+GROWTH = 2.0
 # Below this damping λ a step is a Newton step. The search ends if it predicts less than this share of the tolerance.
 NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
 
@@ -36,7 +38,10 @@ class ByProducts(Protocol):
 
 
 class SumOfSquares(Protocol):
-    """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, possibly in chunks."""
+    """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, possibly in chunks.
+
+    A problem with an attribute `at_once` that is true computes the normal equations in little more time than the cost.
+    """
 
     def cost(self, x: Tensor) -> Tensor:
         """½|r|², a scalar; inf or NaN if x is not admissible."""
@@ -93,7 +98,7 @@ class _Search:
     damping: float
     scale: Tensor
     history: list[float]
-    growth: float = 2.0
+    growth: float = GROWTH
     quiet: int = 0
     iteration: int = 0
 
@@ -148,25 +153,28 @@ def levenberg_marquardt(
         at.iteration += 1
         beat()
         step = _damped_step(A, b, at.damping * _floored(at.scale))
-        new, predicted = math.inf, 0.0
+        new, predicted, equations = math.inf, 0.0, None
         if step is not None:
             predicted = float(-(b @ step) - 0.5 * step @ (A @ step))
             if at.ends(predicted, max(rtol * at.best, atol)):
                 at.quiet = patience
                 break
-            new = float(of_first(problem.cost(at.x + step))[0])
+            # Most steps are accepted, unless the step before was not.
+            if getattr(problem, "at_once", False) and at.growth == GROWTH:
+                equations = problem.normal_equations(at.x + step)
+            new = float(of_first(problem.cost(at.x + step) if equations is None else equations[0])[0])
         # Rounding errors differ between machines; the search must not depend on their sign.
         settled = abs(at.best - new) <= rounding * at.best
         if step is not None and not settled and new < at.best and predicted > 0:
             gain = (at.best - new) / predicted
             at.quiet = at.quiet + 1 if at.best - new <= max(rtol * at.best, atol) else 0
             at.x = at.x + step
-            cost, A, b = _of_first(problem.normal_equations(at.x))
+            cost, A, b = _of_first(problem.normal_equations(at.x) if equations is None else equations)
             at.best = float(cost)
             at.history.append(at.best)
             at.scale = torch.maximum(at.scale, A.diagonal())
             at.damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
-            at.damping, at.growth = max(at.damping, 1e-14), 2.0
+            at.damping, at.growth = max(at.damping, 1e-14), GROWTH
         else:
             at.quiet += settled
             at.damping, at.growth = at.damping * at.growth, at.growth * 2
