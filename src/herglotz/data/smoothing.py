@@ -7,6 +7,7 @@ windows. A fit starts from these velocities and accelerations, and does not end 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -55,9 +56,23 @@ def slopes(data: Trajectories, x: Tensor) -> Tensor:
 
 def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     """The local polynomials of the best width and degree; None if a trajectory has fewer than seven samples."""
-    tried = []
+    if (best := _best_window(data.t, data.q, data.lengths)) is None:
+        return None
+    width, degree = best
+    rows = _windows(data, width)
+    half, x = _times(data, rows)
+    coefficients = pseudo_inverses(x, degree) @ data.q[rows].double()
+    middle = rows[:, width // 2] == torch.arange(data.samples)
+    return LocalPolynomials(width, coefficients, half, middle, rows)
+
+
+# A search asks again for the same positions with other inputs. A tensor is the same only if the object is.
+@lru_cache(maxsize=2)
+def _best_window(t: Tensor, q: Tensor, lengths: tuple[int, ...]) -> tuple[int, int] | None:
+    """The best width and degree; None if a trajectory has fewer than seven samples."""
+    data, tried = Trajectories.of(t, q, lengths), []
     for width in WIDTHS:
-        if width > max(7, min(data.lengths) // 2) or width > min(data.lengths):
+        if width > max(7, min(lengths) // 2) or width > min(lengths):
             break
         for degree in DEGREES:
             if width >= degree + 3:
@@ -67,12 +82,7 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     noise = min(left for _, _, left, _ in tried)
     fair = [x for x in tried if x[2] <= MAX_RESIDUAL_RATIO * noise]
     # A residual beyond the noise keeps its sign over a window, and enters the acceleration whole; noise averages out.
-    width, degree, _, _ = min(fair, key=lambda x: (noise + x[0] * (x[2] - noise)) * x[3])
-    rows = _windows(data, width)
-    half, x = _times(data, rows)
-    coefficients = pseudo_inverses(x, degree) @ data.q[rows].double()
-    middle = rows[:, width // 2] == torch.arange(data.samples)
-    return LocalPolynomials(width, coefficients, half, middle, rows)
+    return min(fair, key=lambda x: (noise + x[0] * (x[2] - noise)) * x[3])[:2]
 
 
 def smoothed(data: Trajectories, local: LocalPolynomials | None = None) -> Trajectories:

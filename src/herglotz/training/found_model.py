@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from herglotz.errors import InputError
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
@@ -48,7 +49,12 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
         fourth = replace(of, order=4, substeps=1)
         own = started(base, data, values, fourth)
         grid = segment_grid(data, trial.length, own.model_step)
-        problem = ShootingProblem(build_model(own, fourth, "none"), data, grid, sigma=trial.problem.sigma)
+        try:
+            model = build_model(own, fourth, "none")
+        except InputError:
+            # Some terms have no rule of order 4, among them products of three velocities.
+            return of, started(base, data, values, of)
+        problem = ShootingProblem(model, data, grid, sigma=trial.problem.sigma)
         if moved(trial, problem, problem.parameters.get()) <= FINER * max(trial.rms, fitter.floor / ALIKE):
             return fourth, own
     return of, started(base, data, values, of)

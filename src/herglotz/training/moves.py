@@ -54,18 +54,21 @@ class Moves:
         """Scores of models with these sets of offers; each set is computed once."""
         sets = list(sets)
         new = [offers for offers in dict.fromkeys(sets) if offers not in self.known]
-        curvatures = BLOCKS * max((len(self.fitter.numbers(offers)) for offers in new), default=0) ** 2
-        size = max(1, MAX_VALUES_AT_ONCE // max(curvatures, self.fitter.data.q.numel()))
-        for k in range(0, len(new), size):
-            chunk = new[k : k + size]
-            self.known.update(zip(chunk, self.computed(chunk), strict=True))
+        self.known.update(zip(new, self._in_parts(new), strict=True))
         return [self.known[offers] for offers in sets]
 
-    def computed(self, sets: Sequence[Offers]) -> list[Score]:
-        """Scores of models with these sets of offers, computed anew by the linearised motion."""
+    def _in_parts(self, sets: Sequence[Offers], *, white: bool = False) -> list[Score]:
+        """The scores, of so many sets at once as `MAX_VALUES_AT_ONCE` allows."""
+        curvatures = BLOCKS * max((len(self.fitter.numbers(offers)) for offers in sets), default=0) ** 2
+        size = max(1, MAX_VALUES_AT_ONCE // max(curvatures, self.fitter.data.q.numel()))
+        parts = [sets[k : k + size] for k in range(0, len(sets), size)]
+        return [score for part in parts for score in self.computed(part, white=white)]
+
+    def computed(self, sets: Sequence[Offers], *, white: bool = False) -> list[Score]:
+        """Scores of models with these sets of offers by the linearised motion; `white` as in `score.scores`."""
         (model, places), count = self._linear, self.trial.problem.data.q.numel()
         numbers = [[places[name] for name in self.fitter.numbers(offers)] for offers in sets]
-        return scores(model, numbers, [len(offers) for offers in sets], count, self.fitter.floor)
+        return scores(model, numbers, [len(offers) for offers in sets], count, self.fitter.floor, white=white)
 
     def start(self, offers: Offers) -> tuple[dict[str, float], Tensor | None]:
         """The values of all numbers and the start states (S, d) from which a fit with these offers begins.
@@ -97,6 +100,9 @@ class Moves:
     def _better(self, at: Offers, sets: list[Offers]) -> list[Offers]:
         """The sets that replace `at`, the best first."""
         (now,) = self.scores([at])
+        # Correlation times take as long as all the rest, and cannot make up for the standard error of the losses.
+        rough = zip(sets, self._in_parts(sets, white=True), strict=True)
+        sets = [offers for offers, score in rough if score.clearly_better(now)]
         found = [(score.gain(now, self.offered), other) for other, score in zip(sets, self.scores(sets), strict=True)]
         return [other for gain, other in sorted(found, key=lambda x: -x[0]) if gain > 0]
 

@@ -35,10 +35,11 @@ class Questions:
         self.wanted, self.holds = wanted, (*holds, *([wanted.data.hold] if holds else []))
         self.hold, self.input_terms = "", ()
         self.read: Search = wanted.part
-        self.best: Trial | None = wanted.part.first
+        self.best: Trial | None = None
         self.differ: tuple[Tensor, Tensor] | None = None
         asked = False
-        if self.best is None or not self.best.at_the_noise:
+        # A model that misses segments by more than the noise need not be grown to whole trajectories for that answer.
+        if wanted.part.misses_segments or (simple := wanted.part.first) is None or not simple.at_the_noise:
             # The whole dictionary lacks no term for which zeros or another hold could make up.
             self.best = wanted.part.full
             asked = self.best is not None and self.best.whole

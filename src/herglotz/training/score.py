@@ -75,6 +75,11 @@ class Score:
         dearer = self.price(self, offered) - self.price(simple, offered)
         return float(by_block.sum()) - max(dearer + error / self.correlation_time**0.5, error)
 
+    def clearly_better(self, simple: Score) -> bool:
+        """True if the losses differ by more than their standard error, without which no τ lets a model replace one."""
+        by_block = simple.losses - self.losses
+        return float(by_block.sum()) > float(by_block.std()) * len(by_block) ** 0.5
+
     def price(self, model: Score, offered: int) -> float:
         """Price of a model's parameters and choices at the τ of this score; `offered` is C, the number of offers."""
         chosen = math.log(math.comb(offered, model.choices))
@@ -87,15 +92,21 @@ class Score:
 
 
 def scores(
-    model: HeldOut, sets: Sequence[Sequence[int]], choices: Sequence[int], count: int, floor: float
+    model: HeldOut,
+    sets: Sequence[Sequence[int]],
+    choices: Sequence[int],
+    count: int,
+    floor: float,
+    *,
+    white: bool = False,
 ) -> list[Score]:
     """Scores, to first order, of C models that keep these sets of a fit's parameters (indices).
 
     `choices` are the numbers of offers that the sets come from, `count` is N. Residuals below `floor`, in units of q
-    over the balance, are rounding and count as `floor`.
+    over the balance, are rounding and count as `floor`. With `white` residuals, τ is 1 and is not computed.
     """
     block = torch.where(model.complete, model.block, -1)
-    of_misfits = _of_misfits(model.residuals(sets), block, floor)
+    of_misfits = _of_misfits(model.residuals(sets), block, floor, white=white)
     rest = zip(of_misfits, model.told(sets).sum(1).tolist(), choices, strict=True)
     return [Score(losses, count, numbers, chosen, error, time) for (losses, error, time), numbers, chosen in rest]
 
@@ -121,7 +132,7 @@ def free_run_score(problem: ShootingProblem, path: Path, numbers: float, floor: 
     return Score(losses, int(unseen.sum()) * problem.n, numbers, 0, rms, time)
 
 
-def _of_misfits(r: Tensor, block: Tensor, floor: float) -> list[tuple[Tensor, float, float]]:
+def _of_misfits(r: Tensor, block: Tensor, floor: float, *, white: bool = False) -> list[tuple[Tensor, float, float]]:
     """Log-losses (B,), RMS and τ of each of C sets of residuals r (C, N, n) over the balance.
 
     `block` (N,) is the block of each sample; samples in block −1 do not count. |r| below `floor` counts as `floor`.
@@ -133,8 +144,8 @@ def _of_misfits(r: Tensor, block: Tensor, floor: float) -> list[tuple[Tensor, fl
     loss = scale.log() + (FREEDOM + 1) / 2 * torch.log1p(x.square() / FREEDOM)
     loss = loss.nan_to_num(nan=LOSS_IF_NOT_FINITE, posinf=LOSS_IF_NOT_FINITE).sum(2)
     losses = torch.zeros(len(r), int(block.max()) + 1, dtype=r.dtype, device=r.device).index_add_(1, block, loss)
-    rms, time = r.square().mean((1, 2)).sqrt().tolist(), correlation_time(r / scale).tolist()
-    return list(zip(losses, rms, time, strict=True))
+    time = [1.0] * len(r) if white else correlation_time(r / scale).tolist()
+    return list(zip(losses, r.square().mean((1, 2)).sqrt().tolist(), time, strict=True))
 
 
 def correlation_time(x: Tensor) -> Tensor:

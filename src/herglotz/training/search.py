@@ -7,7 +7,7 @@ compared by the inequality of `score`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -82,11 +82,29 @@ class Search:
         return self.fitters[variant]
 
     @cached_property
-    def first(self) -> Trial | None:
-        """The model grown from the simplest: offers join over short segments and ever longer ones."""
+    def begun(self) -> Trial | None:
+        """The model grown from the simplest as far as it is at the noise: offers join over ever longer segments.
+
+        Of data without noise the misfit is that of the rule, which says nothing yet.
+        """
         part(FIRST_TERMS)
         fitter = self.fitter(Variant(self.order))
-        return self.climbed(fitter, fitter.simple, {})
+        if (trial := fitter.fit(fitter.simple, {}, fitter.lengths[0], None, 2 * ITERATIONS)) is None:
+            return None
+        trial = self.joined(trial)
+        while (trial.segments_at_the_noise or fitter.exact) and (longer := trial.fitter.longer(trial)) is not None:
+            trial = self.joined(longer)
+        return trial
+
+    @property
+    def misses_segments(self) -> bool:
+        """True if the model that offers have joined misses segments of noisy data by more than the noise."""
+        return self.begun is not None and not (self.begun.segments_at_the_noise or self.begun.fitter.exact)
+
+    @cached_property
+    def first(self) -> Trial | None:
+        """The model grown from the simplest: offers join over short segments and ever longer ones."""
+        return self.begun and self._grown(self.begun, self.joined)
 
     @cached_property
     def full(self) -> Trial | None:
@@ -184,15 +202,22 @@ class Search:
 
         The shorter the segments, the more linear is the motion, and the better are joining offers predicted.
         """
-        trial = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
-        while trial is not None:
-            trial = self.finer(trial)
-            while joining and not trial.whole and (more := self.moved(trial)) is not None:
-                trial = self.finer(more)
-            if (longer := trial.fitter.longer(trial)) is None:
-                return self.settled(needed(likeliest(trial, 2 * self.iterations), 2 * self.iterations))
-            trial = longer
-        return None
+        fitted = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
+        at_each = self.joined if joining else self.finer
+        return fitted and self._grown(at_each(fitted), at_each)
+
+    def _grown(self, trial: Trial, at_each: Callable[[Trial], Trial]) -> Trial:
+        """The model over ever longer segments, changed `at_each` length, then settled."""
+        while (longer := trial.fitter.longer(trial)) is not None:
+            trial = at_each(longer)
+        return self.settled(needed(likeliest(trial, 2 * self.iterations), 2 * self.iterations))
+
+    def joined(self, trial: Trial) -> Trial:
+        """The model after offers have joined over segments of the same length; none join over whole trajectories."""
+        trial = self.finer(trial)
+        while not trial.whole and (more := self.moved(trial)) is not None:
+            trial = self.finer(more)
+        return trial
 
     def better(self, up: Trial | None, down: Trial | None) -> Trial | None:
         """The better of two models by the score."""

@@ -109,7 +109,12 @@ class Trial:
     @property
     def at_the_noise(self) -> bool:
         """True if the misfit of whole trajectories is about the noise of the data."""
-        return self.whole and self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
+        return self.whole and self.segments_at_the_noise
+
+    @property
+    def segments_at_the_noise(self) -> bool:
+        """True if the misfit of the segments is about the noise of the data."""
+        return self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
 
     @cached_property
     def _held_out(self) -> HeldOut:
@@ -219,6 +224,11 @@ class Fitter:
         known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
         self.known = self.smooth, self.precision, self.spread = known
         self.compared: list[Compared] = []
+
+    @property
+    def exact(self) -> bool:
+        """True if the data have no noise beyond what counts as rounding."""
+        return self.precision < self.floor
 
     def _weights(self, numbers: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
         """Prior weights 1/variance by number: all, and those of waves and of powers that waves can imitate."""

@@ -123,6 +123,7 @@ class Asked:
         self.fitters, self.step_ratio = {}, told.get("longer", 1.0)
         self.part = self if name != "whole" or not told.get("long") else self.of(data, "part")
         self.first, self.full = self.model("simple", 0.3, noise=bool(told.get("easy"))), None
+        self.misses_segments = bool(told.get("early"))
         if not told.get("hard"):  # else the whole dictionary follows nothing
             self.full = self.model("full", 0.2)
 
@@ -253,6 +254,7 @@ def test_terms_are_asked_where_the_whole_dictionary_follows_nothing(asked):
 
 def test_no_zeros_are_asked_of_the_dictionary_where_terms_are_at_the_noise(asked):
     # fails if the whole dictionary is fitted to data that the simplest terms explain
+    assert asked(easy=True, early=True)[1][0] == ("whole", "zeros")
     _, seen = asked(easy=True)
     assert seen[:3] == [("whole", "run"), ("whole", "zeros"), ("whole", "hold of cos(q1)")]
 

@@ -291,7 +291,7 @@ class ShootingProblem(StatesProblem):
         return x[:, 0, : self.d]
 
     def guess_from_states(self, states: Tensor) -> None:
-        """Start the next solve from states (N, 2n+1) at the samples, interpolated by cubics; a kernel needs no guess."""
+        """Start the next solve from states (N, 2n+1) at the samples, by cubics; a kernel needs none."""
         if self.compiled is not None:
             return
         x = between_samples(self.grid, self.data, states)
