@@ -9,9 +9,10 @@ Three errors are compared with the precision of the data, which is estimated fro
 
 A model is rejected if a free run loses the motion, unless the uncertainty of the start state explains the loss: chaotic
 motion leaves every model in the long run. A free run that fails or diverges always rejects the model. So does a large
-uncertainty of the model itself (`foresight`): many models fit a recording that is too short. Errors of several
-coordinates are divided by the spread of each. If a recording is too short to show its noise, the misfit of the training
-data replaces the noise.
+uncertainty of the model itself (`foresight`): many models fit a recording that is too short. So does a misfit above the
+noise if the data themselves show a cause that the user can remove (`misread`). Errors of several coordinates are
+divided by the spread of each. If a recording is too short to show its noise, the misfit of the training data replaces
+the noise.
 """
 
 from __future__ import annotations
@@ -101,12 +102,11 @@ def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: 
 
 
 def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:
-    """The reason of a misfit in words: a recording that stands out, or what the residuals show; "" if they show none.
+    """The reason of a misfit in words that the residuals show; "" if they show none.
 
     If steps are so short that noise hides the curvature, every second, fourth, … sample is tried.
     """
-    train, steps = seen.train, 1
-    reason = "".join(one.reason for one in seen.outlying) or reason_of_data(train.liveliest(MOST)) or None
+    train, steps, reason = seen.train, 1, None
     while reason is None:
         data, base = train.liveliest(MOST), task.base.stepped(steps)
         found = with_own_starts(replace(task, base=base), fitted, data, None)
@@ -159,6 +159,11 @@ class Errors:
         if not math.isfinite(self.noise):
             return LOST[0][0] * self.spread
         return min(max(share * self.spread, times * self.limit) for share, times in LOST)
+
+    @property
+    def missed(self) -> bool:
+        """Whether the error of the training data exceeds the noise."""
+        return not self.windows <= AT_THE_NOISE * self.limit
 
     @property
     def worst(self) -> float:
@@ -248,7 +253,18 @@ def judged(
     numbers["precision"] = precision(kept)
     kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
     shown = partial(_shown_reason, task, fitted, seen)
-    return {"verdict": in_words(errors, ahead, metrics, shown, bound(kept))} | kept_numbers
+    return {"verdict": in_words(errors, ahead, metrics, shown, misread(kept, seen, errors.missed))} | kept_numbers
+
+
+def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
+    """What is wrong with the recording or with its reading, in words with a remedy; "" if nothing is seen to be wrong.
+
+    Two positions with one degree of freedom (`bound`) are wrong whatever the errors. If the training data are `missed`
+    by more than the noise, so is a recording that stands out, and what `reason_of_data` finds.
+    """
+    if (words := bound(kept)) or not missed:
+        return words
+    return "".join(one.reason for one in seen.outlying) or reason_of_data(seen.train.liveliest(MOST))
 
 
 def bound(data: Trajectories) -> str:
@@ -270,16 +286,16 @@ def in_words(
     ahead: Foresight | None,
     metrics: dict[str, Any],
     shown: Callable[..., str] = lambda *_: "",
-    bound: str = "",
+    misread: str = "",
 ) -> str:
     """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
 
     `shown` gives the reason of a model that misses the training data, or of one that does not, with a remedy
-    (`herglotz.training.missed`, `herglotz.training.feedback`); `bound` names two positions with one degree of freedom.
+    (`herglotz.training.missed`, `herglotz.training.feedback`); `misread` says what is wrong with the recording.
     """
-    free, missed = errors.free or 0.0, not errors.windows <= AT_THE_NOISE * errors.limit
-    if bound:
-        return f"{FAILS}: {errors}. {bound}"
+    free, missed = errors.free or 0.0, errors.missed
+    if misread:
+        return f"{FAILS}: {errors}. {misread}"
     follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"
@@ -314,7 +330,7 @@ def _worse(errors: Errors) -> str:
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[..., str]) -> str:
     """The verdict on a model that the data do not determine, with the recording that would help."""
-    over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.windows > AT_THE_NOISE * errors.limit
+    over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.missed
     if not ahead.reached:
         return f"the model's own motion breaks off {over}; {errors}. {_remedy(metrics, missed, shown)}"
     what, share = f"a force too small to be seen ({ahead.name})", ahead.hidden

@@ -11,12 +11,14 @@ import torch
 
 from herglotz.cli.common import exit_code
 from herglotz.data import Trajectories, simulate
+from herglotz.data.degrees import COUNTS
 from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.splits import trained_whole
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, objectives, verdict
 from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
+from herglotz.training.look import LeftOut
 from herglotz.training.verdict import Errors, in_words
 
 evaluate_module = importlib.import_module("herglotz.training.evaluate")
@@ -153,7 +155,7 @@ def test_what_one_circle_does_not_tell(stretched, said):
     q = q + 1e-3 * torch.randn(300, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     text = verdict.bound(replace(Trajectories.of(t, q), names=("x", "y"), units=("m", "m")))
     assert ("Try --polar x,y " in text) is said
-    judged = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), KNOWN, GOOD, bound=text)
+    judged = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), KNOWN, GOOD, misread=text)
     assert judged.startswith("does not fit: " if said else "fits to the noise: ")
 
 
@@ -172,6 +174,26 @@ def test_a_model_worse_than_the_noise_says_what_is_seen_of_the_reason():
         ". What is missed comes in kicks"
     )
     assert "kicks" not in in_words(replace(missed, windows=0.01), KNOWN, GOOD, lambda missed: "kicks" if missed else "")
+
+
+def test_a_misread_recording_is_no_fit_above_the_noise():
+    # fails if counts of an encoder, whose scale the user knows, "fit, worse than the noise by a factor of 120", exit 0;
+    # or if a model at the noise is rejected because the data could be read in another way
+    random = torch.Generator().manual_seed(0)
+    q = (1000 * torch.randn(60, 1, generator=random, dtype=torch.float64)).round()
+    note = f"warning: wheel may be {COUNTS}"
+    data = replace(Trajectories.of(torch.arange(60).double(), q), names=("wheel",), notes=(note,))
+    seen: Any = SimpleNamespace(train=data, outlying=())
+    errors = Errors(34.0, 34.0, 34.0, noise=0.29, spread=1000.0)
+    said = verdict.misread(data, seen, errors.missed)
+    assert in_words(errors, KNOWN, GOOD, misread=said).startswith("does not fit: ")
+    assert in_words(errors, KNOWN, GOOD, misread=said).endswith(". Wheel may be counts of an encoder")
+    good = replace(errors, windows=0.3, unseen=0.3, free=0.3)
+    assert verdict.misread(data, seen, good.missed) == ""
+    # fails if a recording that stands out is not named first
+    other = LeftOut(recording=2, missed=9.0, others=1.0)
+    seen.outlying = (other,)
+    assert verdict.misread(data, seen, True) == other.reason
 
 
 def test_a_free_run_that_leaves_the_world_is_a_failed_one(monkeypatch):
