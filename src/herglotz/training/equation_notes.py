@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import NamedTuple
 
 from torch import Tensor
@@ -11,11 +10,11 @@ from torch import Tensor
 from herglotz.data.trajectories import GAP
 from herglotz.data.units import common_unit, size
 from herglotz.errors import InputError
-from herglotz.models import ContactLagrangian, refuse_own
-from herglotz.models.drag import input_forces
+from herglotz.models import refuse_own
 from herglotz.training.baseline import JITTER
 from herglotz.training.equation_terms import is_formula, newtonian
 from herglotz.training.equation_words import plain
+from herglotz.training.feedback import acting_inputs
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import free_runs
 from herglotz.training.problems.grid import segment_grid, step_inputs
@@ -71,14 +70,6 @@ def _inputs(run: FittedRun) -> str:
     late += ["taken as exact in the deviations above"] if late else []
     acts = ", ".join([f"{names}: {BETWEEN.get(hold or 'zero', hold)}", *late])
     return f"{acts}; {idle}" if idle else acts
-
-
-def acting_inputs(model: ContactLagrangian) -> list[int]:
-    """Indices of the inputs that a force of the model depends on: by the map from inputs to forces, or by its drag."""
-    assert model.friction is not None
-    by_map = model.friction.input_map.detach().abs().sum(0).tolist()
-    forces = " ".join(input_forces(model.config.drag))
-    return [k for k, gain in enumerate(by_map) if gain or re.search(rf"\bu{k + 1}\b", forces)]
 
 
 def _sensors(run: FittedRun) -> str:

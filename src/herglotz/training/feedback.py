@@ -7,11 +7,14 @@ Two facts are measured on the training part:
   the mean of the inputs in their place the model leaves the recorded range by its spread. A free run then tells no
   longer whether its start or its forces are wrong.
 * The inputs follow from the state: a linear function of positions and velocities leaves less than half of their spread.
-  The map of the inputs and the other forces then make up for each other.
+  The map of the inputs and the other forces then make up for each other. Where the inputs are recorded with noise,
+  the noise alone is no function of the state, and moves nothing: a fit finds inputs without effect, and the law of the
+  machine with its controller.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import torch
@@ -23,6 +26,7 @@ from herglotz.data.smoothing import slopes
 from herglotz.data.units import size
 from herglotz.least_squares import least_squares
 from herglotz.models import ContactLagrangian
+from herglotz.models.drag import input_forces
 from herglotz.training.free_run import continued
 from herglotz.training.problems.grid import segment_grid, step_inputs
 from herglotz.training.problems.shooting import ShootingProblem
@@ -30,6 +34,8 @@ from herglotz.training.solvers.lifted_newton import linear_recurrence, linear_st
 
 # Share of the spread that separates what follows from what does not.
 HALF = 0.5
+# Inputs that do not follow from the state.
+SIGNALS = ("a small random signal on the inputs", "set points that jump")
 
 
 def reason_of_inputs(
@@ -56,12 +62,48 @@ def reason_of_inputs(
             "than that"
         )
     if (left := unexplained(data, states)) < HALF:
-        ways = filter(None, ("a small random signal on the inputs", "set points that jump", longer))
-        return (
-            f"The inputs follow from positions and velocities, all but {100 * left:.2g} % of their spread, as those of "
-            f"a controller do: what they do and other forces make up for each other. Try {', or '.join(ways)}"
-        )
+        ways = filter(None, (*SIGNALS, longer))
+        return f"{_following(left)}: what they do and other forces make up for each other. Try {', or '.join(ways)}"
     return ""
+
+
+def reason_of_idle_inputs(
+    model: ContactLagrangian,
+    data: Trajectories,
+    states: Tensor,  # (N, 2n+1) of the fit at the samples
+) -> str:
+    """That no input acts in the model, and all follow from the state, with a remedy; "" if that is not so."""
+    # A model of the user's own has no map from inputs to forces that could be asked.
+    if data.u is None or model.friction is None or acting_inputs(model) or not bool(torch.isfinite(states).all()):
+        return ""
+    if (left := unexplained(data, states)) >= HALF:
+        return ""
+    law = "its equation is that of the machine with the controller"
+    return f"{_following(left)}, and the model has no effect of theirs: {law}. Try {', or '.join(SIGNALS)}"
+
+
+def caveat_of_inputs(data: Trajectories, states: Tensor) -> str:
+    """What the effect of inputs that follow from the state rests on, in a sentence; "" for other inputs."""
+    if data.u is None or not bool(torch.isfinite(states).all()) or (left := unexplained(data, states)) >= HALF:
+        return ""
+    return (
+        f"{_following(left)}: the motion under that controller is met, and what the inputs do by themselves rests on "
+        "the rest of their spread and on how they are held between samples"
+    )
+
+
+def acting_inputs(model: ContactLagrangian) -> list[int]:
+    """Indices of the inputs that a force of the model depends on: by the map from inputs to forces, or by its drag."""
+    assert model.friction is not None
+    by_map = model.friction.input_map.detach().abs().sum(0).tolist()
+    forces = " ".join(input_forces(model.config.drag))
+    return [k for k, gain in enumerate(by_map) if gain or re.search(rf"\bu{k + 1}\b", forces)]
+
+
+def _following(left: float) -> str:
+    """That all but this share of the inputs' spread follows from the state, in words."""
+    share = f"all but {100 * left:.2g} % of their spread"
+    return f"The inputs follow from positions and velocities, {share}, as those of a controller do"
 
 
 def growth_of_noise(model: ContactLagrangian, data: Trajectories, states: Tensor, max_step: float) -> Tensor:

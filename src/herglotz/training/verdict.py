@@ -33,7 +33,7 @@ from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, coarse, precision, pr
 from herglotz.data.splits import enough
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
-from herglotz.training.feedback import HALF, reason_of_inputs
+from herglotz.training.feedback import HALF, caveat_of_inputs, reason_of_idle_inputs, reason_of_inputs
 from herglotz.training.flow import motion
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.look import Look
@@ -253,7 +253,9 @@ def judged(
     numbers["precision"] = precision(kept)
     kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
     shown = partial(_shown_reason, task, fitted, seen)
-    return {"verdict": in_words(errors, ahead, metrics, shown, misread(kept, seen, errors.missed))} | kept_numbers
+    words = misread(kept, seen, errors.missed) or reason_of_idle_inputs(fitted.model, task.data, states)
+    caveat = caveat_of_inputs(task.data, states)
+    return {"verdict": in_words(errors, ahead, metrics, shown, words, caveat)} | kept_numbers
 
 
 def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
@@ -287,11 +289,13 @@ def in_words(
     metrics: dict[str, Any],
     shown: Callable[..., str] = lambda *_: "",
     misread: str = "",
+    caveat: str = "",
 ) -> str:
     """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
 
     `shown` gives the reason of a model that misses the training data, or of one that does not, with a remedy
-    (`herglotz.training.missed`, `herglotz.training.feedback`); `misread` says what is wrong with the recording.
+    (`herglotz.training.missed`, `herglotz.training.feedback`); `misread` says what is wrong with the recording,
+    and `caveat` what a model that fits rests on.
     """
     free, missed = errors.free or 0.0, errors.missed
     if misread:
@@ -308,9 +312,8 @@ def in_words(
         return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    if errors.worst <= AT_THE_NOISE * errors.limit:
-        return f"{FITS}: {errors}"
-    return ". ".join(filter(None, (_worse(errors), shown(True) if missed else "")))
+    said = f"{FITS}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors)
+    return ". ".join(filter(None, (said, shown(True) if missed else caveat)))
 
 
 def _unseen_motion(errors: Errors) -> str:

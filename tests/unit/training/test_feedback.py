@@ -7,12 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from herglotz.cli.common import exit_code
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
+from herglotz.training import fit
 from herglotz.training.feedback import growth_of_noise, leaves_without_inputs, reason_of_inputs, unexplained
 from herglotz.training.foresight import Foresight
 from herglotz.training.verdict import Errors, in_words
+from runge_kutta import step
 
 H, K, NOISE = 0.02, 300, 1e-3
 
@@ -82,6 +85,42 @@ def test_inputs_that_follow():  # fails if a motion is not the state's, or a sig
     assert said.endswith("Try a small random signal on the inputs, or set points that jump, or a longer one")
     signal = torch.randn(K, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert unexplained(replace(data, u=signal), states) > 0.9
+
+
+def regulated(noise_of_u, signal=0.0):
+    """θ″ = −18 sin θ − 0.9 θ′ + 5 u, four recordings under u = −5 θ − 0.3 θ′ + a signal, all with white noise."""
+    random, q, u = torch.Generator().manual_seed(3), [], []
+    for start in (0.8, -0.5, 0.6, -0.9):
+        x = torch.tensor([start, 0.0], dtype=torch.float64)
+        for _ in range(K):
+            more = signal * torch.randn((), generator=random, dtype=x.dtype)
+            given = -5 * x[0] - 0.3 * x[1] + more
+            q, u = [*q, x[0]], [*u, given]
+            x = step(lambda x, u=given: torch.stack([x[1], -18 * x[0].sin() - 0.9 * x[1] + 5 * u]), x, H)
+    q, u = torch.stack(q)[:, None], torch.stack(u)[:, None]
+    q = q + NOISE * torch.randn(q.shape, generator=random, dtype=q.dtype)
+    u = u + noise_of_u * torch.randn(u.shape, generator=random, dtype=q.dtype)
+    t = H * torch.arange(K, dtype=torch.float64).repeat(4)
+    return replace(Trajectories.of(t, q, (K,) * 4, u=u, hold="zero", angles=(True,)), names=("theta",))
+
+
+def test_a_law_of_machine_and_controller_is_no_fit():
+    # fails if a force that was recorded with noise has no effect and is believed: "fits to the noise", exit code 0
+    run = fit(regulated(noise_of_u=0.05), progress=False)
+    said = run.metrics["verdict"]
+    assert said.startswith("does not fit: "), said
+    assert "and the model has no effect of theirs: its equation is that of the machine with the controller" in said
+    assert exit_code(run) == 3
+
+
+@pytest.mark.parametrize(("signal", "told"), [(0.0, True), (3.0, False)])
+def test_a_fit_says_what_the_effect_of_following_inputs_rests_on(signal, told):
+    # fails if a fit keeps to itself that its inputs follow, or says so of inputs of their own
+    run = fit(regulated(0.0, signal), progress=False)
+    said = run.metrics["verdict"]
+    assert said.startswith("fits to the noise: "), said
+    assert ("what the inputs do by themselves rests on the rest of their spread" in said) is told
+    assert exit_code(run) == 0
 
 
 def test_the_verdict_says_what_the_inputs_leave():
