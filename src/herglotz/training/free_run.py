@@ -70,7 +70,7 @@ def near_data(
     found = motion(model, start, grid.h, u)
     if found is not None:
         return found
-    problem = ShootingProblem(model, data, grid, sigma=1.0)
+    problem = ShootingProblem(model, data, grid, sigma=1.0, compiled=False)
     with torch.no_grad():
         problem.guess_from_states(states_of_pairs(model, data))
         assert problem.path is not None

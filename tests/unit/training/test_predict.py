@@ -15,7 +15,10 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
 from herglotz.training.best_start import missed_from_best_start
+from herglotz.training.free_run import near_data
+from herglotz.training.kernel import kernel_of
 from herglotz.training.predict import predict
+from herglotz.training.problems.grid import segment_grid
 from herglotz.training.recorded_range import MARGIN
 from herglotz.training.smoother import process_noise
 
@@ -363,3 +366,19 @@ def test_process_noise_does_not_depend_on_the_step():
     # fails if the noise of every step adds up: over 145 samples a period free runs began 1.6 times the noise off
     model = ContactLagrangian(ModelConfig(level="linear", rate=0.1, scale=(1.0,), speed=(1.0,), potential_width=0))
     assert process_noise(model, 0.1) == pytest.approx(2 * process_noise(model, 0.025))
+
+
+def test_a_run_that_a_kernel_loses_is_solved_from_the_data(monkeypatch):
+    # fails if a problem that a kernel steps is asked for a path, which it has not: an internal error of predict
+    model = model_of("linear")
+    data = recording(model)
+    grid = segment_grid(data, data.samples, H)
+    start = torch.zeros(len(grid.start_sample), 3, dtype=torch.float64)
+    start[:, 0] = data.q[grid.start_sample, 0]
+    stepped = near_data(model, data, grid, start, None)
+    assert kernel_of(model) is not None
+    monkeypatch.setattr("herglotz.training.free_run.motion", lambda *_: None)
+    solved = near_data(model, data, grid, start, None)
+    assert stepped is not None
+    assert solved is not None
+    torch.testing.assert_close(solved, stepped)
