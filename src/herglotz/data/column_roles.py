@@ -142,6 +142,12 @@ def is_effort(words: frozenset[str], unit: str) -> bool:
     return kind_of(unit) in ("effort", "electric") or bool(words & WORDS["effort"])
 
 
+def is_set_point(name: str, unit: str) -> bool:
+    """Whether an input is the set point of a controller, and not a force, voltage or current that is commanded."""
+    words = words_of(name)
+    return is_goal(words) and not is_effort(words, unit)
+
+
 def is_timed(words: frozenset[str]) -> bool:
     """Whether a word of a name, longer than a letter, is that of a time: `elapsed_time`."""
     return any(len(word) > 1 and ROLES["time"].fullmatch(word) for word in words)

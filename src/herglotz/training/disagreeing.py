@@ -27,12 +27,13 @@ from herglotz.data.splits import cuts_of, held_out_whole, leading
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import differences, estimate_baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.errors_of_runs import EXACT_ENOUGH
 from herglotz.training.look import LeftOut, Look, look, read_like
 from herglotz.training.problems.robust import FREEDOM, TAIL, robust_fit, scale_of
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import SegmentStages
-from herglotz.training.verdict import EXACT_ENOUGH, STATE_ITERATIONS
+from herglotz.training.verdict import STATE_ITERATIONS
 
 
 def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) -> tuple[Look, tuple[LeftOut, ...]]:

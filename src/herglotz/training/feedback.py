@@ -1,6 +1,7 @@
 """Motion that a controller holds: what a free run of its model, and its numbers, cannot tell.
 
-Two facts are measured on the training part:
+Names of inputs tell the set points of a controller, which act through the controller alone. Two facts are measured on
+the training part:
 
 * The motion is unstable and its inputs hold it. An error of a start of the size of the noise, carried on by the
   linearised steps along the recorded motion with the inputs as recorded, grows to the spread of the motion; and with
@@ -15,12 +16,15 @@ Two facts are measured on the training part:
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.column_roles import is_set_point
+from herglotz.data.csv_columns import WANTED_VALUE
 from herglotz.data.roughness import precisions
 from herglotz.data.smoothing import slopes
 from herglotz.data.units import size
@@ -73,8 +77,8 @@ def reason_of_idle_inputs(
     states: Tensor,  # (N, 2n+1) of the fit at the samples
 ) -> str:
     """That no input acts in the model, and all follow from the state, with a remedy; "" if that is not so."""
-    # A model of the user's own has no map from inputs to forces that could be asked.
-    if data.u is None or model.friction is None or acting_inputs(model) or not bool(torch.isfinite(states).all()):
+    known = data.u is not None and model.friction is not None and bool(torch.isfinite(states).all())
+    if not known or acting_inputs(model):
         return ""
     if (left := unexplained(data, states)) >= HALF:
         return ""
@@ -82,8 +86,23 @@ def reason_of_idle_inputs(
     return f"{_following(left)}, and the model has no effect of theirs: {law}. Try {', or '.join(SIGNALS)}"
 
 
-def caveat_of_inputs(data: Trajectories, states: Tensor) -> str:
-    """What the effect of inputs that follow from the state rests on, in a sentence; "" for other inputs."""
+def reason_of_set_points(model: ContactLagrangian, data: Trajectories) -> str:
+    """That a set point acts in the model, although a force was recorded, with a remedy; "" if that is not so."""
+    names = acting_set_points(model, data)
+    if not names or not any(WANTED_VALUE in note for note in data.notes):
+        return ""
+    place = "in the equation, in the place of the machine's"
+    remedy = f"--drop {shlex.quote(','.join(names))}, which leaves the forces that were recorded"
+    return f"{_through(names)} {place}. Try {remedy}"
+
+
+def caveat_of_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor) -> str:
+    """What the effect of set points, or of inputs that follow from the state, rests on, in a sentence; "" for others.
+
+    Set points follow from nothing; the motion follows them.
+    """
+    if names := acting_set_points(model, data):
+        return f"{_through(names)} a part of the equation"
     if data.u is None or not bool(torch.isfinite(states).all()) or (left := unexplained(data, states)) >= HALF:
         return ""
     return (
@@ -92,9 +111,25 @@ def caveat_of_inputs(data: Trajectories, states: Tensor) -> str:
     )
 
 
+def acting_set_points(model: ContactLagrangian, data: Trajectories) -> list[str]:
+    """Names of set points of a controller on which a force of the model depends."""
+    labels = list(data.input_labels)
+    return [labels[k][0] for k in acting_inputs(model) if is_set_point(*labels[k])]
+
+
+def _through(names: list[str]) -> str:
+    """That set points of these names act in the model, as the start of a sentence."""
+    act, points = ("acts", "a set point acts") if len(names) == 1 else ("act", "set points act")
+    return f"{', '.join(names)} {act} in the model, and {points} through a controller alone: its law is"
+
+
 def acting_inputs(model: ContactLagrangian) -> list[int]:
-    """Indices of the inputs that a force of the model depends on: by the map from inputs to forces, or by its drag."""
-    assert model.friction is not None
+    """Indices of the inputs that a force of the model depends on: by the map from inputs to forces, or by its drag.
+
+    None of a model without inputs, and none of a model of the user's own, which has no map that could be asked.
+    """
+    if model.friction is None or not model.inputs:
+        return []
     by_map = model.friction.input_map.detach().abs().sum(0).tolist()
     forces = " ".join(input_forces(model.config.drag))
     return [k for k, gain in enumerate(by_map) if gain or re.search(rf"\bu{k + 1}\b", forces)]

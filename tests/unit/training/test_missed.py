@@ -15,10 +15,11 @@ from herglotz.data.polar import in_polar, pairs_of
 from herglotz.data.rates import filled_inputs
 from herglotz.training import FitConfig, fit, verdict
 from herglotz.training.baseline import estimate_baseline
+from herglotz.training.errors_of_runs import Errors
 from herglotz.training.missed import FEW, reason_of, reason_of_data
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
-from herglotz.training.verdict import Errors, in_words
+from herglotz.training.verdict import in_words
 
 N, H, NOISE = 800, 0.1, 1e-3
 T = H * torch.arange(N, dtype=torch.float64)

@@ -16,10 +16,11 @@ from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.splits import trained_whole
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, objectives, verdict
+from herglotz.training.errors_of_runs import Errors
 from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
 from herglotz.training.look import LeftOut
-from herglotz.training.verdict import Errors, in_words
+from herglotz.training.verdict import in_words
 
 evaluate_module = importlib.import_module("herglotz.training.evaluate")
 GOOD = {"follows_data": True, "objective": "trajectory"}
