@@ -1,12 +1,13 @@
 """Recordings that the model of the others does not follow: something else was recorded, and they are left out whole.
 
-Of every recording the part that a fit uses is followed over short segments from starts of its own, with the numbers of
-the model fixed. A recording disagrees if the scale of its misfit is an outlier (`TAIL`) of the misfit of the others, so
-that more than half of its samples are. A bad recording may have bent the model so far that none stands out. Where the
-model is not at the noise, the recording that it misses most, or else the one whose accelerations are least like the
-others', is left out if the whole dictionary would follow the others to their noise. The model is then found anew. What
-is left out stays so if the others agree, whose model is at their noise, and if it is an outlier of that model. Most
-recordings have to agree.
+Of every recording the part that a fit uses is followed from a start of its own, with the numbers of the model fixed:
+as a whole by a model that a search has found, else over short segments. Twenty steps hide a damping that is a fifth
+larger, or a scale that is wrong by 3 %. A recording disagrees if the scale of its misfit is an outlier (`TAIL`) of the
+misfit of the others, so that more than half of its samples are. A bad recording may have bent the model so far that
+none stands out. Where the model is not at the noise, the recording that it misses most, or else the one whose
+accelerations are least like the others', is left out if the whole dictionary would follow the others to their noise.
+The model is then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is
+an outlier of that model. Most recordings have to agree.
 
 Where nothing is left out, as where no terms are searched (more than three coordinates, a given plan, own terms), an
 outlier of the finished model is named (`outlying`).
@@ -146,13 +147,16 @@ def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] 
     if len(data) < 3 or seen.found is None or seen.found.sigma is None or (out and seen.zeros):
         return None
     read = _followed(read_like(data, seen), seen.settings)
-    return _missed_by(seen, seen.task(Stages()).build("none"), seen.found.sigma, read)
+    # A model that a search has found follows whole recordings.
+    return _missed_by(seen, seen.task(Stages()).build("none"), seen.found.sigma, read, whole=True)
 
 
-def _missed_by(seen: Look, model: ContactLagrangian, sigma: float, read: Trajectories) -> list[Tensor]:
-    """The same of a model and of recordings as the look has read its own."""
-    together = _misfit(seen, model, sigma, read)
-    each = [_misfit(seen, model, sigma, one) for one in read] if together is None else together.split(read.lengths)
+def _missed_by(
+    seen: Look, model: ContactLagrangian, sigma: float, read: Trajectories, *, whole: bool = False
+) -> list[Tensor]:
+    """The same of a model and of recordings as the look has read its own, by short segments or as a `whole`."""
+    found = _misfit(seen, model, sigma, read, whole)
+    each = [_misfit(seen, model, sigma, one, whole) for one in read] if found is None else found.split(read.lengths)
     known = read.complete.split(read.lengths)
     return [
         read.q.new_full((1,), torch.inf) if own is None else (own / read.balance)[there].flatten().abs()
@@ -168,9 +172,9 @@ def _followed(data: Trajectories, settings: FitConfig) -> Trajectories:
     return data.keep(leading(data.lengths, kept).to(data.q.device))
 
 
-def _misfit(seen: Look, model: ContactLagrangian, sigma: float, data: Trajectories) -> Tensor | None:
+def _misfit(seen: Look, model: ContactLagrangian, sigma: float, data: Trajectories, whole: bool) -> Tensor | None:
     """Misfit of segments that start anew, (N, n) in units of q; None if a step fails."""
     config = replace(seen.settings, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(seen.task(Stages()), data=data, config=config), model, frozen=True)
-    found = stages.fit(stages.lengths[0], sigma, FREEDOM, None)
+    found = stages.fit(stages.lengths[-1 if whole else 0], sigma, FREEDOM, None)
     return None if found is None else found.problem.misfit(found.path) * data.balance
