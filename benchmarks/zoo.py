@@ -2,9 +2,9 @@
 
 Each system is drawn from (SEED, index): potential, friction, inputs, step, noise and number of recordings. `herglotz
 fit` runs with its default flags in a process of its own, and is judged by free runs over the unseen third of its
-recordings and over three recordings from unseen starts, in multiples of the noise. Beside it: SINDy, and the true
-equation with its numbers fitted. Rows are kept in FOLDER (runs/zoo), with the table beside them, and are not measured
-again at the same commit.
+recordings and over three recordings from unseen starts, in multiples of the noise. Beside it: the true equation with
+its numbers fitted. Rows are kept in FOLDER (runs/zoo), with the table beside them, and are not measured again at the
+same commit.
 
 `--open` draws systems that no dictionary of terms holds, and `--laws` takes six fixed ones, each exact and with 0.5 %
 of noise: 20 samples of warm-up, 200 predicted steps. Beside them four learned peers, each given the processor time that
@@ -35,7 +35,6 @@ from benchmarks.zoo_systems.learned import LEARNED, fit_learned
 from benchmarks.zoo_systems.open_laws import LAWS, fixed_law
 from benchmarks.zoo_systems.open_systems import open_draw
 from benchmarks.zoo_systems.ours import fit_ours
-from benchmarks.zoo_systems.peers import fit_sindy
 from benchmarks.zoo_systems.prediction import EquationModel, MechanismModel, own_predictions, trained
 from benchmarks.zoo_systems.report import (
     METHODS,
@@ -63,7 +62,7 @@ def measure(of: ZooSystem, folder: Path, limit: float, peers: Sequence[str] = tu
     mine = number(ours["score"])
     row["outcome"] = outcome(mine, number(ours["relative"]), bool(ours["said"]))
     if of.attainable is None:
-        others = {"known": lambda of: MechanismModel(of.fitted), "sindy": fit_sindy}
+        others = {"known": lambda of: MechanismModel(of.fitted)}
     else:
         row["attainable"] = of.attainable
         others = {name: partial(fit_learned, name=name, budget=max(LEAST, ours["cpu_s"])) for name in peers}

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks.zoo_systems.mechanisms import Array, Mechanism, Values, exact_motion
-from benchmarks.zoo_systems.peers import fit_known
 from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions
 from benchmarks.zoo_systems.report import score
 from benchmarks.zoo_systems.systems import Recording, ZooSystem
+from benchmarks.zoo_systems.true_equation import fit_known
 
 KINDS = {
     "spring": 0.30, "pendulum": 0.18, "axis": 0.12, "chain": 0.12, "pendulums": 0.08, "double_pendulum": 0.08,

@@ -52,7 +52,7 @@ def _worst(found: Predictions, unit: Array) -> float:
 
 Row = dict[str, Any]
 METHODS = {
-    "ours": "ours", "sindy": "SINDy", "neural_ode": "neural ODE", "forced_net": "discrete forced Lagrangian net",
+    "ours": "ours", "neural_ode": "neural ODE", "forced_net": "discrete forced Lagrangian net",
     "delan": "DeLaN with friction", "gaussian": "Gaussian-process Lagrangian", "known": "known",
 }  # fmt: skip
 # What counts as good in the table of methods: RMS over the noise, and over the size of an exact motion.
