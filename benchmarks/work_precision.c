@@ -1,7 +1,6 @@
 /* What a learned stepper is compared with, in C: RK4, DOP853 and leapfrog on y' = f(y), with f of the
    true equations or a neural network. Compiled by work_precision_rivals.py with -DSYSTEM=... -DDOF=... -Dreal=...;
-   `dop853_step.h` is generated there from the coefficients in scipy. y is (q, v), of the rigid body (angles, angular
-   velocity in the body). */
+   `dop853_step.h` is generated there from the coefficients in scipy. y is (q, v). */
 #include <math.h>
 #include <string.h>
 #include <tgmath.h>
@@ -9,7 +8,6 @@
 #define N DOF
 #define D (2 * N)
 
-static real input;      /* the torque of a driven scene, held */
 static long evaluations; /* of f, or of the force */
 
 #if FAST_SINE
@@ -27,37 +25,13 @@ static inline void sine_cosine(real q, real *s, real *c) {
 }
 #endif
 
-#if SYSTEM == 0 || SYSTEM == 6 /* pendulum, and the driven one */
+#if SYSTEM == 0 /* pendulum */
 #define GAMMA (real)0.2
 #define SEPARABLE 1
 static inline void pull(const real *q, real *a) {
   real c;
   sine_cosine(q[0], a, &c);
-  a[0] = (SYSTEM == 6 ? input : 0) - a[0];
-}
-#elif SYSTEM == 2 /* oscillator */
-#define GAMMA (real)0.2
-#define SEPARABLE 1
-static inline void pull(const real *q, real *a) { a[0] = -q[0]; }
-#elif SYSTEM == 4 /* Kepler */
-#define GAMMA (real)0.05
-#define SEPARABLE 1
-static inline void pull(const real *q, real *a) {
-  const real r2 = q[0] * q[0] + q[1] * q[1], k = -1 / (r2 * sqrt(r2));
-  a[0] = k * q[0];
-  a[1] = k * q[1];
-}
-#elif SYSTEM == 5 /* chain */
-#define GAMMA (real)0.1
-#define SEPARABLE 1
-static inline void pull(const real *q, real *a) {
-  real before = q[0] + (real)0.5 * q[0] * q[0] * q[0];
-  int i;
-  for (i = 0; i < N; i++) {
-    const real d = (i + 1 < N ? q[i + 1] : 0) - q[i], next = d + (real)0.5 * d * d * d;
-    a[i] = next - before;
-    before = next;
-  }
+  a[0] = -a[0];
 }
 #endif
 
@@ -85,25 +59,7 @@ static inline void slope(const real *y, real *f) {
   f[2] = ((real)M11 * f0 - m * f1) * det - (real)RATE * y[2];
   f[3] = ((real)M00 * f1 - m * f0) * det - (real)RATE * y[3];
 }
-#elif SYSTEM == 3 /* parachute */
-static inline void slope(const real *y, real *f) {
-  f[0] = y[1];
-  f[1] = (real)0.01 * y[1] * y[1] - 10;
-}
-#elif SYSTEM == 7 /* rigid body: J = (3, 2, 1) */
-static inline void slope(const real *y, real *f) {
-  real sr, cr, sp, cp, across;
-  sine_cosine(y[0], &sr, &cr);
-  sine_cosine(y[1], &sp, &cp);
-  across = (sr * y[4] + cr * y[5]) / cp;
-  f[0] = y[3] + sp * across;
-  f[1] = cr * y[4] - sr * y[5];
-  f[2] = across;
-  f[3] = y[4] * y[5] / 3 - (real)0.1 * y[3];
-  f[4] = -y[3] * y[5] - (real)0.1 * y[4];
-  f[5] = y[3] * y[4] - (real)0.1 * y[5];
-}
-#elif SYSTEM == 9 /* a network: (sin q, cos q, v) or (q, v) -> tanh -> ... -> a */
+#elif SYSTEM == 2 /* a network: (sin q, cos q, v) -> tanh -> ... -> a */
 #define WIDTHS (LAYERS == 2 ? WIDTH : 1)
 static real W0[IN][WIDTH], b0[WIDTH], W1[WIDTHS][WIDTH], b1[WIDTH], W2[N][WIDTH];
 
@@ -134,8 +90,7 @@ static inline void slope(const real *y, real *f) {
   real x[IN], u[WIDTH], v[WIDTH], *last = u;
   int i, j;
   for (i = 0; i < N; i++) {
-    if (ANGLES) sine_cosine(y[i], x + i, x + N + i);
-    else x[i] = y[i];
+    sine_cosine(y[i], x + i, x + N + i);
     x[IN - N + i] = f[i] = y[N + i];
   }
   for (j = 0; j < WIDTH; j++) u[j] = b0[j];
@@ -164,12 +119,7 @@ static inline void slope(const real *y, real *f) {
 }
 #endif
 
-#if N > 4 && defined __GNUC__ /* 26 copies of a large right-hand side take minutes to compile and gain nothing */
-__attribute__((noinline)) static
-#else
-static inline
-#endif
-void rhs(const real *y, real *f) {
+static inline void rhs(const real *y, real *f) {
   slope(y, f);
   evaluations++;
 }
@@ -242,10 +192,9 @@ static real dop853(real *y, real T, real tol, real h) {
 
 /* `samples` motions of `segments` segments of length dt each; out is (samples, segments, 2N). method 0: RK4, 1: DOP853,
    2: leapfrog, 3: DOP853 with equal steps and no error estimate. x is the tolerance of DOP853, else the number of steps
-   in a segment. `inputs` holds
-   the torque of each segment, or is null. Each motion waits for the one before, as in a loop of control: `wait` is 0.
+   in a segment. Each motion waits for the one before, as in a loop of control: `wait` is 0.
    Returns the evaluations of f. */
-long motions(long samples, long segments, double dt, int method, double x, double wait, const double *inputs,
+long motions(long samples, long segments, double dt, int method, double x, double wait,
     const double *start, double *out) {
   real y[D], h;
   long b, k;
@@ -257,7 +206,6 @@ long motions(long samples, long segments, double dt, int method, double x, doubl
     for (d = 0; d < D; d++) y[d] = (real)start[b * D + d] + last;
     h = (real)(dt / 4);
     for (k = 0; k < segments; k++) {
-      if (inputs) input = (real)inputs[k];
       if (method == 0) rk4(y, (real)(dt / x), (long)x);
       else if (method == 1) h = dop853(y, (real)dt, (real)x, h);
       else if (method == 3) fixed8(y, (real)(dt / x), (long)x);

@@ -1,18 +1,16 @@
-"""Error against cost, for every way to step: `python benchmarks/work_precision.py [--scenes a,b]`.
+"""Error against cost of learned steppers in C: `python benchmarks/work_precision.py [--scenes a,b]`.
 
-Eight scenes, all in C: learned steppers (their own step, larger steps re-trained, several widths and depths, float64
-and float32; large steps of a few learned kicks; with terms more and less), RK4, DOP853 (adaptive and with equal steps)
-and leapfrog on the true equations, and RK4 and DOP853 on neural ODEs trained on the same data. Needs scipy.
+Of eight scenes the fitted model, and the same data with terms more and less: error and cost of a step of each.
+Written after each scene, beside those of earlier runs: work_precision.json and .md. `--page` only puts the table into
+docs/work_precision.md, where it stands between `<!-- terms -->` and `<!-- /terms -->`; nothing there is typed in.
 
 Error: largest |q − exact| at 4 times up to T, of motions from unseen starts (median, and 95 % of them), in units of q.
-Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn), the same in
-steps of C leapfrog, evaluations and flops beside it. Written after each scene, beside those of earlier runs:
-work_precision.json and .md. `--page` only puts the table of terms into docs/work_precision.md, where it stands between
-`<!-- terms -->` and `<!-- /terms -->`; nothing there is typed in.
+Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn).
 
 `--headline` measures two scenes over several training seeds instead, into headline.json and .md: learned kicks on the
-damped pendulum and a learned equation on the double pendulum, beside neural ODEs trained on the same motions and what
-is best on the true equations. A seed draws the training motions and the first weights of every network. Of each
+damped pendulum and a learned equation on the double pendulum, in float64 and float32; beside them neural ODEs trained
+on the same motions (stepped by RK4 and DOP853), and RK4, DOP853 (adaptive and with equal steps) and leapfrog on the
+true equations. Needs scipy. A seed draws the training motions and the first weights of every network. Of each
 starting set the first half chooses a setting, the second half judges it; what it is compared with is the cheapest rival
 that is as accurate on the judging half itself, a choice no user can make.
 """
@@ -21,7 +19,6 @@ from __future__ import annotations
 
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -45,15 +42,6 @@ RIVALS = (
 )
 
 
-def front(points: list[dict]) -> list[dict]:
-    """Points that no other beats in both error and cost, cheapest first."""
-    kept: list[dict] = []
-    for p in sorted((p for p in points if p.get("median") is not None), key=lambda p: p["us_per_time"]):
-        if not kept or p["median"] < kept[-1]["median"]:
-            kept.append(p)
-    return kept
-
-
 # What a fit with another set of terms lacks or has besides, where its label does not say it.
 CHANGED = {"level conservative": "no damping", "level linear": "one rate, no drag",
            "level affine": "drag besides, with its network"}  # fmt: skip
@@ -69,54 +57,26 @@ TERMS = {
 }
 
 
+def markdown(result: dict[str, Any]) -> str:
+    """The results file."""
+    measured = f"Commit {result['commit']}, {result['machine']['cores']} cores, one thread."
+    return "\n".join(["# What a term costs and brings", "", measured, "", *terms(result["scenes"])])
+
+
 def terms(scenes: dict[str, list[dict]]) -> list[str]:
-    """Each scene's own model at the step of its data, and what other terms cost and bring: all fitted alike."""
+    """Each scene's own model at the step of its data, the first point, and what other terms cost and bring."""
     rows = []
-    for name, points in scenes.items():
-        own = next((p for p in points if p["kind"] == "learned" and p["dtype"] == "float64"), None)
-        if own is not None:
-            rows.append([f"**{name}**", f"**{TERMS[name]}**", f"{own['us_per_time'] * own['h']:.2g}", _error(own), ""])
-        for p in points:
-            label = p["kind"][9:]
-            if not p["kind"].startswith("learned, ") or not p["setting"].startswith(label):
-                continue
-            times = ""
-            if own is not None:
-                worse = f"{p['median'] / own['median']:.2g}" if p["median"] and own["median"] else "–"
-                times = f"{p['us_per_time'] / own['us_per_time']:.2g}, {worse}"
+    for name, (own, *others) in scenes.items():
+        rows.append([f"**{name}**", f"**{TERMS[name]}**", f"{own['us_per_time'] * own['h']:.2g}", _error(own), ""])
+        for p in others:
+            label = p["kind"].removeprefix("learned, ")
+            worse = f"{p['median'] / own['median']:.2g}" if p["median"] and own["median"] else "–"
+            # A stored point that has no C was stepped by PyTorch.
             cost = f"{p['us_per_time'] * p['h']:.2g}{' (PyTorch)' if p['artefact'] == 'eager' else ''}"
+            times = f"{p['us_per_time'] / own['us_per_time']:.2g}, {worse}"
             rows.append(["", CHANGED.get(label, label), cost, _error(p), times])
     head = ("scene", "terms", "µs a step", "median error", "times the scene's own: cost, error")
-    return ["", "## Terms", "", *harness.table(head, rows)]
-
-
-def add_leapfrog_unit(result: dict[str, Any]) -> None:
-    """The unit of cost: a step of C leapfrog on the damped pendulum (or, without it, another scene) of the same run."""
-    for name in ("damped_pendulum", *result["scenes"]):
-        points = [p for p in result["scenes"].get(name, []) if p["kind"].startswith("leapfrog")]
-        if points:
-            result["leapfrog_step_us"] = min(p["us_per_time"] / p["evaluations_per_time"] for p in points)
-            result["leapfrog_of"] = name
-            return
-
-
-def markdown(result: dict[str, Any]) -> str:
-    """The fronts, the knobs, what the others cost and what terms bring, as tables."""
-    measured = f"Commit {result['commit']}, {result['machine']['cores']} cores, one thread."
-    lines = ["# Error against cost", "", measured, "Errors: the largest departure of a position from the truth at four "
-             "times up to T, median of unseen starts."]  # fmt: skip
-    if unit := result.get("leapfrog_step_us"):
-        lines += [f"One C leapfrog step of the {result['leapfrog_of'].replace('_', ' ')}: {1e3 * unit:.3g} ns."]
-    for name, points in result["scenes"].items():
-        head = ("setting", "µs per time", "±", "leapfrog steps", "evaluations", "flops", "median", "95 %")
-        rows = []
-        for p in front(points):
-            work = [unit and p["us_per_time"] / unit, p.get("evaluations_per_time"), p.get("flops_per_time")]
-            rows.append([f"{p['kind'].split(',')[0]}: {p['setting']}", f"{p['us_per_time']:.3g}", f"{p['spread']:.2g}",
-                         *("" if c is None else f"{c:.3g}" for c in work), f"{p['median']:.2g}",
-                         "" if p["q95"] is None else f"{p['q95']:.2g}"])  # fmt: skip
-        lines += ["", f"## {name}", "", *harness.table(head, rows)]
-    return "\n".join([*lines, *terms(result["scenes"])])
+    return harness.table(head, rows)
 
 
 def _error(p: dict) -> str:
@@ -211,24 +171,18 @@ def measure_headline(path: Path, names: list[str], seeds: int) -> None:
 
 
 def measure_scene(name: str, result: dict[str, Any], say: Callable[[str], None]) -> None:
-    """Every setting of a scene, into the result."""
-    began, setup, timed = time.process_time(), SETUPS[name], []
+    """The models of a scene, into the result."""
     say("fit")
-    case = prepare(setup)
-    for ways in (learned, equation, classical, neural):
-        say(ways.__name__)
-        timed += ways(case)
+    timed = learned(prepare(SETUPS[name]))
     say("timing")
     result["scenes"][name] = costs(timed)
-    notes = {"seconds": case.seconds, "one_step_rms": case.run.metrics["one_step_rms"]}
-    result["notes"][name] = {**notes, "T": setup.T, "h": setup.h, "total_seconds": time.process_time() - began}
 
 
 def page() -> str:
     """docs/work_precision.md with the table of terms as the stored results have it."""
     begin, end = "<!-- terms -->\n", "<!-- /terms -->\n"
     before, rest = PAGE.read_text().split(begin)
-    lines = terms(harness.load(harness.RESULTS / "work_precision.json", {})["scenes"])[3:]
+    lines = terms(harness.load(harness.RESULTS / "work_precision.json", {})["scenes"])
     return before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1]
 
 
@@ -247,13 +201,11 @@ def main(argv: list[str] | None = None) -> None:
     if arguments.headline:
         measure_headline(path, names, arguments.seeds)
         return
-    earlier = harness.load(path, {"scenes": {}, "notes": {}})
-    result = {**harness.conditions(), "scenes": earlier["scenes"], "notes": earlier["notes"]}
+    result = {**harness.conditions(), "scenes": harness.load(path, {"scenes": {}})["scenes"]}
     with tqdm(names, disable=None) as bar:
         for name in bar:
             measure_scene(name, result, lambda what, name=name: bar.set_postfix_str(f"{name}: {what}"))
             result["scenes"] = {name: result["scenes"][name] for name in SETUPS if name in result["scenes"]}
-            add_leapfrog_unit(result)
             harness.store(path, result, markdown(result))
 
 

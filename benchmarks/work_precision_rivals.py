@@ -24,45 +24,32 @@ from benchmarks.peers.rollouts import rk4
 from benchmarks.work_precision_ways import CHECKS, Case, Setup, Timed, judged
 from herglotz.codegen.c_compiler import FLAGS
 from herglotz.data import simulate
-from herglotz.scenes.rigid_body import FreeBody
 from herglotz.stepping import State
 from herglotz.training import levenberg_marquardt
 from herglotz.tune.cost import Timed as Timing
 
 TIMED, PER = 16, 4e-3  # motions and seconds of one timing, at least: far above the resolution of the clock
-SYSTEMS = {"damped_pendulum": 0, "double_pendulum": 1, "damped_oscillator": 2, "parachute": 3, "kepler": 4, "chain": 5,
-           "driven_pendulum": 6, "rigid_body": 7}  # fmt: skip
-NETWORK = 9  # of SYSTEM in work_precision.c
+# Numbers of SYSTEM in work_precision.c.
+SYSTEMS = {"damped_pendulum": 0, "double_pendulum": 1}
+NETWORK = 2
 # Numbers of work_precision.c.
 METHODS = {"RK4": 0, "DOP853": 1, "leapfrog": 2, "DOP853 fixed": 3}
-SEPARABLE = ("damped_pendulum", "damped_oscillator", "kepler", "chain", "driven_pendulum")
 REAL = {"float64": "double", "float32": "float"}
-
-# Floating-point operations of one right-hand side, counted in work_precision.c: + − × are 1, ÷ and √ 4, sin and cos 20.
-FLOPS = {"damped_pendulum": 23, "driven_pendulum": 24, "damped_oscillator": 3, "parachute": 3, "kepler": 20,
-         "double_pendulum": 116, "chain": 90, "rigid_body": 112}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A network a(q, v): (sin q, cos q, v) or (q, v) → tanh → (tanh →) a."""
+    """A network a(q, v): (sin q, cos q, v) → tanh → (tanh →) a."""
 
     values: Tensor  # (P,)
     dof: int
     width: int
     layers: int
-    angles: bool
 
     @property
     def inputs(self) -> int:
         """Numbers that enter the first layer."""
-        return (3 if self.angles else 2) * self.dof
-
-    @property
-    def flops(self) -> int:
-        """Of one evaluation: 2 a weight, 25 a tanh, 20 a sine or cosine."""
-        hidden = self.width * self.layers
-        return 2 * len(self.values) + 25 * hidden + (40 * self.dof if self.angles else 0)
+        return 3 * self.dof
 
 
 class Native:
@@ -77,13 +64,12 @@ class Native:
         fast: bool = True,
         constants: Mapping[str, float] | None = None,
     ):
-        self.dof, self.flops = dof, FLOPS[name] if weights is None else weights.flops  # of one evaluation
+        self.dof = dof
         system = SYSTEMS[name] if weights is None else NETWORK
         defines = {"SYSTEM": system, "DOF": dof, "real": REAL[dtype], "FAST_SINE": int(fast), **_constants()}
         defines |= {k: repr(v) for k, v in (constants or {}).items()}
         if weights is not None:
             defines |= {"IN": weights.inputs, "WIDTH": weights.width, "LAYERS": weights.layers}
-            defines["ANGLES"] = int(weights.angles)
         words = [f"-D{k}={v}" for k, v in defines.items()]
         self.library = compiled("work_precision.c", "dop853_step.h", dop853_source(), *FLAGS, *words, "-w")
         self.library.motions.restype = ctypes.c_long
@@ -102,7 +88,6 @@ class Motions:
     checks: int  # times
     method: str
     x: float  # steps between two times, or a tolerance
-    u: Tensor | None = None  # (checks, m) held inputs
 
     def made(self) -> tuple[Tensor, int]:
         """Positions (B, checks, n), and the evaluations of f."""
@@ -124,13 +109,12 @@ class Motions:
     def _call(self, most: int, out: Tensor | None) -> Callable[[], int]:
         """The call in C, its arguments made beforehand."""
         y = self.y[:most].double().contiguous()
-        u = None if self.u is None else self.u.double().contiguous()
         arguments = (
             ctypes.c_long(len(y)), ctypes.c_long(self.checks), ctypes.c_double(self.T / self.checks),
             ctypes.c_int(METHODS[self.method]), ctypes.c_double(self.x), ctypes.c_double(0.0),
-            *(ctypes.c_void_p(None if x is None else x.data_ptr()) for x in (u, y, out)),
+            *(ctypes.c_void_p(None if x is None else x.data_ptr()) for x in (y, out)),
         )  # fmt: skip
-        return lambda keep=(y, u, out): self.library.library.motions(*arguments)  # noqa: ARG005
+        return lambda keep=(y, out): self.library.library.motions(*arguments)  # noqa: ARG005
 
 
 def dop853_source() -> str:
@@ -188,13 +172,13 @@ PARTS = 4  # RK4 steps between two samples
 
 
 def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iterations: int, seed: int = 0) -> Weights:
-    """Weights of a = net(sin q, cos q, v), or net(q, v) where q is no angle, fitted to exact states h apart.
+    """Weights of a = net(sin q, cos q, v), fitted to exact states h apart.
 
-    It is given what the learned steppers are not: the exact velocities. An input u is added to a, known.
+    It is given what the learned steppers are not: the exact velocities.
     """
     system = setup.scene
-    n, angles = system.dof, all(system.angles)
-    blank = Weights(torch.empty(0), n, width, layers, angles)
+    n = system.dof
+    blank = Weights(torch.empty(0), n, width, layers)
     sizes = [(blank.inputs, width), (width,), *([(width, width), (width,)] if layers == 2 else []), (n, width)]
     generator = torch.Generator().manual_seed(seed)
     first = [torch.randn(s, generator=generator, dtype=torch.float64) / s[0] ** 0.5 for s in sizes]
@@ -205,20 +189,19 @@ def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iteration
     keep[torch.tensor(data.offsets) + torch.tensor(data.lengths) - 1] = False
     rows = keep.nonzero()[:, 0]
     rows = rows[torch.randperm(len(rows), generator=generator)[: min(PAIRS, ROWS // n)]]
-    u = torch.zeros(len(y), n, dtype=y.dtype) if data.u is None else data.u
-    pairs = (y[rows], y[rows + 1], u[rows])
+    pairs = (y[rows], y[rows + 1])
 
-    def rhs(w: list[Tensor], y: Tensor, u: Tensor) -> Tensor:
+    def rhs(w: list[Tensor], y: Tensor) -> Tensor:
         q, v = y[..., :n], y[..., n:]
-        x = torch.cat([q.sin(), q.cos(), v] if angles else [q, v], -1)
+        x = torch.cat([q.sin(), q.cos(), v], -1)
         x = torch.tanh(x @ w[0] + w[1])
         if layers == 2:
             x = torch.tanh(x @ w[2] + w[3])
-        return torch.cat([v, x @ w[-1].T + u], -1)
+        return torch.cat([v, x @ w[-1].T], -1)
 
-    def local(theta: Tensor, y: Tensor, y1: Tensor, u: Tensor) -> Tensor:
+    def local(theta: Tensor, y: Tensor, y1: Tensor) -> Tensor:
         w = [x.reshape(s) for x, s in zip(theta.split([math.prod(s) for s in sizes]), sizes, strict=True)]
-        return (rk4(lambda y: rhs(w, y, u), y, setup.h, PARTS) - y1) / setup.h
+        return (rk4(lambda y: rhs(w, y), y, setup.h, PARTS) - y1) / setup.h
 
     class Problem:
         sigma = 1e-8
@@ -228,25 +211,23 @@ def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iteration
 
         def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             r = local(x, *pairs).reshape(-1) / self.sigma
-            J = vmap(jacrev(local), (None, 0, 0, 0))(x, *pairs).reshape(-1, len(x)) / self.sigma
+            J = vmap(jacrev(local), (None, 0, 0))(x, *pairs).reshape(-1, len(x)) / self.sigma
             A, b = torch.eye(len(x), dtype=x.dtype) / 100, (x - theta) / 100
             return self.cost(x), A + J.T @ J, b + J.T @ r
 
     found = levenberg_marquardt(Problem(), theta, max_iterations=iterations, rtol=1e-4)
-    return Weights(found.x.detach(), n, width, layers, angles)
+    return Weights(found.x.detach(), n, width, layers)
 
 
 def classical(case: Case) -> list[Timed]:
     """RK4, DOP853 and leapfrog on the true equations."""
     setup, name = case.setup, case.setup.name
-    v = setup.scene.velocity(*case.start)
-    if name == "rigid_body":
-        v = FreeBody(1.0, 1.0, 1.0, 0.0).body_velocity(case.start.q, v)
-    y = torch.cat([case.start.q, v], -1)
+    y = torch.cat([case.start.q, setup.scene.velocity(*case.start)], -1)
     found = []
     for dtype in ("float64", "float32"):
         library = Native(name, dtype, dof=setup.scene.dof)
-        for method in METHODS if name in SEPARABLE else [m for m in METHODS if m != "leapfrog"]:
+        # Leapfrog is a method for separable Hamiltonians.
+        for method in METHODS if name == "damped_pendulum" else [m for m in METHODS if m != "leapfrog"]:
             for x in _settings(method, dtype):
                 label = _label(method, x, setup, dtype)
                 point = {"kind": f"{method}, true equations", "setting": label, "dtype": dtype}
@@ -271,17 +252,9 @@ def _label(method: str, x: float, setup: Setup, dtype: str) -> str:
 
 
 def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x: float) -> Timed:
-    """One setting; where an input is held, a segment is one step of the data, and x counts for a quarter of T."""
-    setup, u = case.setup, case.setup.inputs()
-    segments = CHECKS if u is None else len(u)
-    if u is not None and method != "DOP853":
-        x = max(1, round(x * CHECKS / segments))
-    asked = Motions(library, y, setup.T, segments, method, x, u)
-    q, count = asked.made()
-    each = count / len(y) / setup.T
-    more = {"evaluations_per_time": each, "flops_per_time": each * library.flops, "artefact": "C"}
-    errors = judged(q[:, segments // CHECKS - 1 :: segments // CHECKS], case.truth)
-    return Timed({**point, **errors, **more}, asked.timing(), setup.T)
+    """One setting."""
+    asked = Motions(library, y, case.setup.T, CHECKS, method, x)
+    return Timed({**point, **judged(asked.made()[0], case.truth)}, asked.timing(), case.setup.T)
 
 
 def neural(case: Case) -> list[Timed]:

@@ -1,14 +1,14 @@
-"""The ways to step that `work_precision.py` compares, without the rivals: scenes, fits, and how each way is timed.
+"""The learned steppers that `work_precision.py` measures: scenes, fits, and how each stepper is timed.
 
-A way is a `Timed`: a point of the plot with its errors, and what `herglotz.tune.cost` times. Learned steppers
-come in C, at the step of the data and at larger ones, with terms more and less.
+A stepper is a `Timed`: a point of the table with its errors, and what `herglotz.tune.cost` times. Learned steppers come
+in C: the scene's own model, the same data with terms more and less, and a few kicks for several steps of the data.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,10 +19,10 @@ from herglotz.data import simulate
 from herglotz.data.simulate import uniform
 from herglotz.export import compile_c
 from herglotz.scenes import scene
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import State
 from herglotz.training import FitConfig, Run, fit
 from herglotz.tune.cost import Timed as Timing, measure_costs, timed_stepping
-from herglotz.tune.distil import distil, pairs_of, widened
+from herglotz.tune.distil import pairs_of
 from herglotz.tune.kick_composition import can_kick, fit_kicks
 from herglotz.tune.kick_header import CompiledKicks
 from herglotz.tune.reference import JITTER, draw_starts, record
@@ -44,10 +44,9 @@ class Setup:
     fit: Mapping[str, Any] = field(default_factory=dict)
     trajectories: int = 30
     steps: int = 30
-    multiples: tuple[int, ...] = (2, 4)  # steps of distilled models, in h
     kick_steps: tuple[int, ...] = ()  # in h
-    neural: tuple[tuple[int, int], ...] = ((8, 1),)  # width and depth of the neural ODEs
-    neural_iterations: int = 60
+    neural: tuple[tuple[int, int], ...] = ()  # width and depth of the neural ODEs
+    neural_iterations: int = 0
     other: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -84,24 +83,24 @@ def _others(*names: str, **more: Mapping[str, Any]) -> dict[str, Mapping[str, An
 SETUPS = {
     s.name: s
     for s in (
-        Setup("damped_oscillator", 0.5, 12.0, {"potential_width": 0, "correction_width": 8}, kick_steps=(2, 6),
+        Setup("damped_oscillator", 0.5, 12.0, {"potential_width": 0, "correction_width": 8},
               other=_others("level conservative", "level affine", "potential network", "no correction")),
-        Setup("damped_pendulum", 0.5, 12.0, {"correction_width": 16, "iterations": 300}, 40, 40, (2, 3), (2, 3, 6),
+        Setup("damped_pendulum", 0.5, 12.0, {"correction_width": 16, "iterations": 300}, 40, 40, (2, 3, 6),
               ((4, 1), (8, 1), (8, 2), (16, 2)), 200,
               _others("level conservative", "level affine", "no correction")),
         Setup("double_pendulum", 0.05, 2.4, {"correction_width": 16, "mass_width": 8, "iterations": 120},
-              multiples=(2, 3), neural=((8, 1), (16, 2)), neural_iterations=120,
+              neural=((8, 1), (16, 2)), neural_iterations=120,
               other=_others("level conservative", "constant mass", "no correction", "structure told")),
         Setup("parachute", 0.1, 2.4, {"level": "affine"},
               other=_others("level conservative", "level linear", "no correction")),
         Setup("kepler", 0.1, 4.8, {"features": ("central",), "alike": True, "correction_width": 16},
               other=_others("level conservative", "potential network", "no correction",
                             potential_network={"features": (), "alike": False})),
-        Setup("chain", 0.2, 4.8, {"features": ("chain",), "alike": True, "correction_width": 0}, 12, 20, (2,),
-              neural_iterations=30, other=_others("level conservative", "linear springs")),
+        Setup("chain", 0.2, 4.8, {"features": ("chain",), "alike": True, "correction_width": 0}, 12, 20,
+              other=_others("level conservative", "linear springs")),
         Setup("driven_pendulum", 0.25, 12.0, {"level": "forced", "correction_width": 12},
               other=_others("no input", "no correction", "correction 6 × 2")),
-        Setup("rigid_body", 0.1, 4.8, {"correction_width": 12, "mass_width": 8}, 20, 24, neural=((12, 1),),
+        Setup("rigid_body", 0.1, 4.8, {"correction_width": 12, "mass_width": 8}, 20, 24,
               other=_others("constant mass", "level conservative", "no correction")),
     )
 }  # fmt: skip
@@ -228,30 +227,6 @@ def motions_of(case: Case) -> State:
     return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T).states
 
 
-def learned(case: Case) -> list[Timed]:
-    """Everything learned of one scene, its own model first."""
-    own = _forms(case, case.run.model, case.setup.h, "learned", "own model")
-    return [*own, *_distilled(case), *_other_terms(case), *kicks(case)]
-
-
-def _evaluations(model: Any, case: Case, h: float) -> tuple[float, float]:
-    """Evaluations of the model's terms, and flops, per unit of time, by the eager stepper's own count of iterations.
-
-    2 flops a weight, and each evaluation carries the gradient and the Hessian in n directions: 1 + n + n(n + 1)/2
-    numbers for one. An explicit step evaluates the potential's slope once.
-    """
-    state, u, count, steps = case.entry, inputs_of(case), 0, 6
-    with torch.no_grad():
-        for k in range(steps):
-            step = Stepper(model).step(state, h, None, None if u is None else u[k])
-            count, state = count + step.iterations + 1, step.state
-    n = model.dof
-    explicit = model.linear_in_q1
-    each = 1.0 if explicit else count / steps
-    weights = sum(p.numel() for p in model.parameters())
-    return each / h, each / h * 2 * weights * (1 + n if explicit else 1 + n + n * (n + 1) / 2)
-
-
 def _timed(case: Case, stepper: Any, h: float, kind: str, setting: str, dtype: str) -> Timed:
     """A stepper in C with its errors, to be timed."""
     number = getattr(torch, dtype)
@@ -261,50 +236,21 @@ def _timed(case: Case, stepper: Any, h: float, kind: str, setting: str, dtype: s
     return Timed({**point, **rolled(case, stepper, h, number)}, timing, h)
 
 
-def _forms(
-    case: Case, model: Any, h: float, kind: str, label: str, dtypes: Sequence[str] = ("float64", "float32")
-) -> list[Timed]:
-    """A model as compiled C, with its work counted."""
-    evaluations, flops = _evaluations(model, case, h)
-    found = []
-    for dtype in dtypes:
-        stepper = compile_c(model, h=h, dtype=dtype)
-        one = _timed(case, stepper, h, kind, f"{label}, h {h:.4g}, C {dtype}", dtype)
-        one.point.update(evaluations_per_time=evaluations, flops_per_time=flops)
-        found.append(one)
-    return found
-
-
-def _distilled(case: Case) -> list[Timed]:
-    """Larger steps: a correction of each width and depth, re-trained on motions of the fitted model."""
+def learned(case: Case) -> list[Timed]:
+    """The scene's own model, and the same data with a term less, or with one that the scene does not need."""
     setup = case.setup
-    if setup.inputs() is not None or not setup.multiples:
-        return []
-    states, found, began = motions_of(case), [], time.process_time()
-    sizes = ((8, 1), (8, 2), (16, 2)) if setup.name == "damped_pendulum" else ((8, 1), (12, 2))
-    for m in setup.multiples:
-        if round(setup.T / setup.h) % (m * CHECKS):
-            continue
-        before, after = pairs_of(states, m, 600, 0)
-        for width, depth in sizes:
-            start = widened(case.run.model, width, depth)
-            model, _ = distil(start, before, after, m * setup.h, iterations=50)
-            model.requires_grad_(False)
-            found += _forms(case, model, m * setup.h, "learned, distilled", f"{width} × {depth}")
-        found += _forms(case, case.run.model, m * setup.h, "learned, no re-training", "own model at a larger step")
-    case.seconds["distil"] = time.process_time() - began
-    return found
-
-
-def _other_terms(case: Case) -> list[Timed]:
-    """The same data with a term less, or with one that the scene does not need."""
-    found, setup = [], case.setup
-    first = starts_of(setup.scene, COUNT, 1000)
+    found, first = [_own(case, "learned", "own model")], starts_of(setup.scene, COUNT, 1000)
     for label, change in setup.other.items():
         run = fit(case.run.data, fit_config(setup, **change), progress=False)
         other = replace(case, run=run, entry=entered(setup, run, first, case.start))
-        found += _forms(other, run.model, setup.h, f"learned, {label}", label, ("float64",))
+        found.append(_own(other, f"learned, {label}", label))
     return found
+
+
+def _own(case: Case, kind: str, label: str) -> Timed:
+    """The fitted model as compiled C, at the step of the data."""
+    h = case.setup.h
+    return _timed(case, compile_c(case.run.model, h=h), h, kind, f"{label}, h {h:.4g}, C float64", "float64")
 
 
 def kicks(case: Case) -> list[Timed]:
@@ -323,8 +269,6 @@ def kicks(case: Case) -> list[Timed]:
             stepper = fit_kicks(case.run.model, before, after, h, kicks=count, iterations=150)
             for dtype in ("float64", "float32"):
                 label = f"{count} kicks, h {h:.4g}, C {dtype}"
-                one = _timed(case, CompiledKicks(stepper, dtype), h, "learned kicks", label, dtype)
-                one.point.update(evaluations_per_time=count / h, flops_per_time=count * 70 / h)
-                found.append(one)
+                found.append(_timed(case, CompiledKicks(stepper, dtype), h, "learned kicks", label, dtype))
     case.seconds["kicks"] = time.process_time() - began
     return found
