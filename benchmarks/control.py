@@ -3,8 +3,8 @@
 `nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
 as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `l4casadi`: the same by L4CasADi,
 where it is installed (`control_l4casadi.py` says how). `loop`: a real-time iteration in closed loop
-(`control_loop.py`). `jacobian`: a step with its Jacobian over a step, in C. One thread, processor time; what is
-compared is timed in turn within each repeat, and a ratio is one of a single repeat. Writes control.json and control.md.
+(`control_loop.py`). One thread, processor time; what is compared is timed in turn within each repeat, and a ratio is
+one of a single repeat. Writes control.json and control.md.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
@@ -40,8 +39,7 @@ from benchmarks.control_loop import (
 )  # fmt: skip
 from benchmarks.control_model import H, model, sx_steps
 from herglotz.codegen.c_compiler import compiler
-from herglotz.export import export_c, export_casadi
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.export import export_casadi
 
 NEAR = 0.1  # rad from upright
 FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
@@ -200,42 +198,7 @@ def loop(quick: bool, folder: Path) -> list[Row]:
     ]
 
 
-def pendulums(width: int) -> ContactLagrangian:
-    """Two coupled pendulums with a random network in the correction, or without any network."""
-    one = (1.0, 1.0)
-    config = ModelConfig(
-        (True, True), "linear", one, one, one, (0.0, 0.0), 0.05, potential_width=0, correction_width=width
-    )
-    made, draw = ContactLagrangian(config), torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=draw, dtype=torch.float64)
-    return made
-
-
-def jacobian(quick: bool, folder: Path) -> list[Row]:
-    """A step with its Jacobian over a step of a run, and over a single step, in one program."""
-    rows = []
-    for width, target in ((16, 2.5), (0, 4.0)):
-        header = export_c(pendulums(width), folder / f"model{width}.h", h=0.1, name="model")
-        source = folder / f"measure{width}.c"
-        source.write_text((harness.ROOT / "benchmarks" / "control.c").read_text(encoding="utf-8"))
-        library = ctypes.CDLL(str(built(source, f'-DMODEL="{header}"')))
-        ns = (ctypes.c_double * 3)()
-        taken = []
-        for _ in range(3 if quick else 200):
-            library.measure(ctypes.c_long(1000), ctypes.c_double(0.1), ns)
-            taken.append(list(ns))
-        run, single, both = (statistics.median(x) for x in zip(*taken, strict=True))
-        what = "a 16x2 network" if width else "no network"
-        ratio = statistics.median(c / a for a, _, c in taken)
-        row = {"what": f"step with Jacobian / step of a run, two coordinates, {what}", "value": ratio}
-        note = f"{both:.0f}, {run:.0f} ns; a single step {single:.0f} ns"
-        rows.append(row | {"target": f"<= {target:g}", "note": note})
-    return rows
-
-
-PARTS = {"nlp": nlp, "l4casadi": l4casadi, "loop": loop, "jacobian": jacobian}
+PARTS = {"nlp": nlp, "l4casadi": l4casadi, "loop": loop}
 
 
 def table(rows: list[Row]) -> str:
