@@ -8,9 +8,6 @@ import torch
 from torch.func import functional_call, jacrev, vmap
 
 from herglotz.errors import InputError
-from herglotz.export.lower.onnx import OUTPUTS, graph_of
-from herglotz.export.metadata import describe
-from herglotz.export.programs import programs_of, quiet
 from herglotz.mechanics import (
     Driven,
     Forced,
@@ -301,37 +298,6 @@ def test_float32(settings):
     assert all(value.dtype == torch.float32 for value in entries(P).values())
     exact = partials(random_model(settings), *points(settings.dof), order=2)
     torch.testing.assert_close(P.D1.double(), exact.D1, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.usefixtures("registered_once")
-def test_an_onnx_file_steps_like_the_stepper(settings):
-    # fails if a model has an operation that torch.onnx and our table lack, or a number in 32 bits
-    pytest.importorskip("onnxscript")
-    ort = pytest.importorskip("onnxruntime")
-    model, (q, _, s, h) = random_model(settings), points(settings.dof, batch=3)
-    u = torch.linspace(-1, 1, 6 * settings.inputs, dtype=torch.float64).reshape(2, 3, -1)
-    given = {
-        "q": q,
-        "p": 0.5 * torch.cos(q),
-        "s": s,
-        "h": torch.stack([h, h / 2]),
-        **({"u": u} if settings.inputs else {}),
-    }
-    with quiet():
-        programs = programs_of(model, describe(model, 0.1, None, (), 30, {}), ("rollout",), inlines=False)
-        content = graph_of(programs["rollout"], tuple(given), OUTPUTS[:-1], {})
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    found = session.run(None, {name: x.numpy() for name, x in given.items()})
-    assert not found[-1].any()  # the status
-    with torch.no_grad():
-        inputs = u.movedim(0, 1) if settings.inputs else None
-        out = Stepper(model, tol=1e-15).rollout(q, given["p"], s, h=given["h"].T, inputs=inputs)
-    for value, name in zip(found, "qps", strict=False):
-        torch.testing.assert_close(
-            torch.as_tensor(value).movedim(0, 1), getattr(out, name)[:, 1:], rtol=1e-12, atol=1e-12
-        )
 
 
 def test_state_dict_round_trip(settings):

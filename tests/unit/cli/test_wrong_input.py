@@ -12,17 +12,6 @@ from herglotz.cli import main
 from herglotz.training.run_folder import FORMAT
 
 GOOD = "t[s],theta[rad]\n" + "".join(f"{k / 10},{1 - k / 50}\n" for k in range(30))
-BAD_FILES = {
-    "missing column": ("theta[rad]\n1\n2\n3\n", "no time column"),
-    "no coordinate": ("t[s]\n1\n2\n3\n", "no coordinate column"),
-    "non-numeric cell": (GOOD.replace("0.5,0.9", "0.5,high"), "'high' is not a number"),
-    "infinite": (GOOD.replace("0.5,0.9", "0.5,inf"), "not finite"),
-    "NaN time": (GOOD.replace("0.5,0.9", "nan,0.9"), "not finite"),
-    "time not increasing": (GOOD.replace("0.6,", "0.4,"), "does not increase"),
-    "one sample": ("t[s],theta[rad]\n0,1\n", "at least 3 are needed"),
-    "empty": ("", "empty"),
-    "header only": ("t[s],theta[rad]\n", "no samples"),
-}
 
 
 def mistake(capsys, folder: Path, *arguments: object) -> str:
@@ -40,12 +29,11 @@ def mistake(capsys, folder: Path, *arguments: object) -> str:
     return err
 
 
-# Every command reads files by `load`: one bad file shows that `plot` does.
-@pytest.mark.parametrize(("name", "command"), [*((name, "fit") for name in BAD_FILES), ("empty", "plot")])
-def test_bad_data(tmp_path, capsys, name, command):  # fails if a bad file reaches the fit, or a folder is left behind
-    content, message = BAD_FILES[name]
-    (tmp_path / "bad.csv").write_text(content)
-    assert message in mistake(capsys, tmp_path, command, tmp_path / "bad.csv", "--out", tmp_path / "a" / "out")
+@pytest.mark.parametrize("command", ["fit", "plot"])
+def test_bad_data(tmp_path, capsys, command):  # fails if a bad file reaches the fit, or a folder is left behind
+    (tmp_path / "bad.csv").write_text(GOOD.replace("0.5,0.9", "0.5,high"))
+    said = mistake(capsys, tmp_path, command, tmp_path / "bad.csv", "--out", tmp_path / "a" / "out")
+    assert "'high' is not a number" in said
 
 
 @pytest.mark.parametrize(

@@ -67,11 +67,14 @@ int main(void) {
   y = x; y.p[0] = inf; printf("%d ", arm_step(&y, 0.1, 0));
   y = x; y.s = nan; printf("%d ", arm_step(&y, 0.1, 0));
   y = x; y.sigma = nan; printf("%d ", arm_step(&y, 0.1, 0));
-  y = x; y.p[0] = 1e308; printf("%d ", (arm_step(&y, 9.0, 0) & 15) != 0);
+  y = x; y.p[0] = 1e308; printf("%d ", (arm_step(&y, 9.0, 0) & 15) != 0); printf("%d ", y.p[0] == 1e308);
   y = x; y.p[0] = 1e308; printf("%d ", (arm_rollout(&y, 9.0, 4, 1, q, p, s) & 15) != 0);
-  printf("%d ", !arm_finite(q[1]) && !arm_finite(p[4]) && !arm_finite(s[4]));
+  printf("%d %d ", p[0] == 1e308, !arm_finite(q[1]) && !arm_finite(p[4]) && !arm_finite(s[4]));
   y = x; printf("%d ", arm_step(&y, 0.5, 0));
   y = x; y.q[0] += 2.0; printf("%d ", arm_step(&y, 0.1, 0));
+  y = x; y.q[0] += 8 * atan(1.0); printf("%d ", arm_step(&y, 0.1, 0));
+  y = x; printf("%d ", arm_rollout(&y, 0.1, 8, 2, q, p, s)); printf("%d %d ", q[0] == x.q[0], q[4] == y.q[0]);
+  printf("%d %d ", arm_rollout(&x, 0.1, -1, 1, q, p, s), arm_rollout(&x, 0.1, 1, 0, q, p, s));
   many[0] = many[1] = many[2] = x; many[1].q[0] = nan;
   printf("%d ", arm_step_batch(3, many, 0.1, statuses));
   printf("%d %d %d\\n", statuses[0], statuses[1], statuses[2]);
@@ -83,10 +86,11 @@ int main(void) {
 @pytest.mark.parametrize("flags", [("-O2",), FAST], ids=["O2", "fast-math"])
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_statuses_survive_fast_math(tmp_path, compiler, flags):
-    # fails if a check for NaN is a comparison, which -ffast-math deletes
+    # fails if bad input, overflow or the box goes unnoticed, an angle is not wrapped, a failed step moves the state, or
+    # a check for NaN is a comparison, which -ffast-math deletes
     (tmp_path / "stepper.h").write_text(header(box=True, correction_width=4))
     words = run(tmp_path, STATUSES, compiler, *flags)
-    assert " ".join(words) == "0 5 5 5 5 3 3 3 3 1 1 1 32 16 3 0 3 0"
+    assert " ".join(words) == "0 5 5 5 5 3 3 3 3 1 1 1 1 1 32 16 0 0 1 1 5 5 3 0 3 0"
 
 
 INIT = """

@@ -134,22 +134,6 @@ def test_a_file_names_no_local_path(written):
     assert b"src/herglotz" not in content
 
 
-def test_steps_keep_the_shape_of_the_state(written):
-    # fails if leading dimensions or a per-sample h are lost
-    model, _, exported = written
-    q, p, s = (x.reshape(2, 3, *x.shape[1:]) for x in states_of(2, 6))
-    h = torch.linspace(0.05, 0.3, 6, dtype=torch.float64).reshape(2, 3)
-    ours, eager = exported.step(State(q, p, s), h), Stepper(model).step(State(q, p, s), h)
-    for a, b in zip((*ours.state, ours.c), (*eager.state, eager.c), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
-    steps = torch.tensor([0.1, 0.2, 0.05], dtype=torch.float64)
-    a, b = (x.rollout(q, p, s, h=steps) for x in (exported, Stepper(model)))
-    torch.testing.assert_close(a.q, b.q, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(a.sigma, b.sigma, rtol=1e-12, atol=1e-12)
-    single = exported.step(State(q[0, 0], p[0, 0], s[0, 0]), 0.1)
-    assert single.state.q.shape == (2,)
-
-
 def test_a_failed_sample_is_nan_and_leaves_its_neighbours_alone(written):
     # fails if a status is lost or a failure spreads
     exported = written[2]

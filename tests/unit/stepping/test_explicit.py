@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.models import TERMS, ModelConfig, Term
-from herglotz.stepping import State, Status, Stepper
+from herglotz.stepping import Status, Stepper
 from herglotz.stepping.explicit import leapfrog
 from herglotz.stepping.field import FieldOf
 from tests.lagrangians import random_model, states_in_turn
@@ -129,18 +129,3 @@ def test_gradients_equal_those_of_the_implicit_step(config):
 
     for a, b in zip(gradients(True), gradients(False), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
-
-
-def test_its_failures_have_a_status():
-    # fails if a number that is not finite comes without a status, or reaches a neighbour
-    model = random_model(ModelConfig())
-    q = torch.tensor([[0.3], [torch.nan], [0.2], [torch.inf]], dtype=torch.float64)
-    start = State(q, torch.ones_like(q), torch.zeros(4, dtype=torch.float64))
-    out = Stepper(model).rollout(*start, h=0.1, steps=3)
-    assert out.status[:, -1].tolist() == [Status.CONVERGED, Status.DIVERGED, Status.CONVERGED, Status.DIVERGED]
-    assert bool(out.q[[1, 3], 1:].isnan().all())
-    alone = Stepper(model).rollout(q[[0, 2]], torch.ones(2, 1).double(), h=0.1, steps=3)
-    torch.testing.assert_close(out.q[[0, 2]], alone.q, rtol=1e-14, atol=1e-14)
-    # c = e^{−γh} = 0
-    gone = Stepper(model).step(states(ModelConfig()), 1e5)
-    assert set(gone.status.tolist()) == {int(Status.SINGULAR)}

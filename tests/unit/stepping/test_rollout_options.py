@@ -126,23 +126,6 @@ def test_checkpointing_gives_the_same_gradient_with_less_memory(settings):
     assert thin < kept / 20
 
 
-def test_batches_of_every_size():
-    # fails if a batch size takes another path to another answer
-    made = model(correction_width=4)
-    q = torch.linspace(-1, 1, 257, dtype=torch.float64)[:, None]
-    with torch.no_grad():
-        all_at_once = Stepper(made).rollout(q, torch.cos(q), h=0.2, steps=5)
-        for pick in (slice(0, 1), slice(100, 102), slice(250, 257)):
-            few = Stepper(made).rollout(q[pick], torch.cos(q[pick]), h=0.2, steps=5)
-            torch.testing.assert_close(few.q, all_at_once.q[pick], rtol=1e-13, atol=1e-13)
-        bare = Stepper(made).rollout(q[7], torch.cos(q[7]), h=0.2, steps=5)
-        torch.testing.assert_close(bare.q, all_at_once.q[7], rtol=1e-13, atol=1e-13)
-        none = Stepper(made).rollout(q[:0], q[:0], h=0.2, steps=5)
-        grid = Stepper(made).rollout(q[:6].view(2, 3, 1), torch.cos(q[:6]).view(2, 3, 1), h=0.2, steps=5)
-    assert none.q.shape == (0, 6, 1)
-    torch.testing.assert_close(grid.q.flatten(0, 1), all_at_once.q[:6], rtol=1e-13, atol=1e-13)
-
-
 def test_extrapolation_is_exact_for_cubics():
     # fails if a weight belongs to another position, or equal steps have other constants than Lagrange's
     h = torch.tensor([0.1, 0.3, 0.2, 0.15, 0.4, 0.1], dtype=torch.float64)
@@ -160,6 +143,8 @@ def test_extrapolation_is_exact_for_cubics():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda s, x: s.rollout(*x, h=0.1), "a scalar h needs steps >= 1"),
+        (lambda s, x: s.rollout(*x, h=torch.ones(3), steps=4), "h lists 3 steps but steps=4"),
         (lambda s, x: s.rollout(*x, h=0.1, steps=4, inputs=torch.ones(4, 1)), "takes no inputs: it has no method"),
         (lambda s, x: s.step(x, 0.1, u=torch.ones(1)), "takes no inputs"),
         (lambda s, x: s.init(x.q, x.q, u=torch.ones(1)), "takes no inputs"),

@@ -7,7 +7,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
-from tests.lagrangians import cubic, even_model
+from tests.lagrangians import even_model
 
 
 def start(batch=3, dtype=torch.float64):
@@ -27,20 +27,6 @@ def test_step_solves_the_equation_in_both_precisions():
             assert float((value - reference).abs().max()) < tolerance
 
 
-def test_a_failing_sample_leaves_its_neighbours_alone():
-    # fails if a failed sample poisons or stops the batch, or returns a number without a status
-    q = torch.zeros(3, 1, dtype=torch.float64)
-    # q1 − q1³/3 = 5 only far beyond the turning point
-    p = torch.tensor([[0.1], [5.0], [0.2]], dtype=torch.float64)
-    out = Stepper(cubic, max_iterations=8).step(State(q, p, torch.zeros(3, dtype=torch.float64)), 1.0, guess=q)
-    assert out.status[[0, 2]].tolist() == [Status.CONVERGED] * 2
-    alone = Stepper(cubic).step(State(q[:1], p[:1], torch.zeros(1, dtype=torch.float64)), 1.0, guess=q[:1])
-    assert torch.equal(alone.state.q, out.state.q[:1])
-    assert int(out.status[1]) != Status.CONVERGED
-    assert bool(out.state.q[1].isnan().all())
-    assert not bool(out.state.q[[0, 2]].isnan().any())
-
-
 def test_singular_and_non_finite_statuses():
     # fails if det M = 0 or an overflow is reported as convergence
     state = start()
@@ -58,23 +44,6 @@ def test_rollout_with_irregular_steps():
     exact = oscillator.flow(*start(), h.sum(-1))
     torch.testing.assert_close(tuple(out.final), exact, rtol=1e-12, atol=1e-13)
     torch.testing.assert_close(out.sigma[:, -1], torch.exp(-0.2 * h.sum(-1)))
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda s, x: s.step(x, -0.1), "h must be > 0, got -0.1"),
-        (lambda s, x: s.step(State(x.q, x.p[:2], x.s), 0.1), "q, p, s need shapes"),
-        (lambda s, x: s.step(State(x.q, x.p.float(), x.s), 0.1), "need one dtype"),
-        (lambda s, x: s.step(State(x.q.long(), x.p, x.s), 0.1), "floating point"),
-        (lambda s, x: s.rollout(*x, h=0.1), "a scalar h needs steps >= 1"),
-        (lambda s, x: s.rollout(*x, h=torch.ones(3), steps=4), "h lists 3 steps but steps=4"),
-    ],
-)
-def test_wrong_input_is_named(call, message):
-    # fails if a wrong call reaches the solver
-    with pytest.raises(InputError, match=message):
-        call(Stepper(scene("damped_oscillator").L_d), start())
 
 
 def test_rest_stays_at_rest():

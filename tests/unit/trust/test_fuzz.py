@@ -1,4 +1,4 @@
-"""A slice of `make fuzz`: 25 damaged files of every kind that needs no export; test_bit_flips.py has those."""
+"""A slice of `make fuzz`: 25 damaged files of every kind that needs no export; test_bit_flips.py has exported ones."""
 
 from tests.fuzz import fuzz
 

@@ -34,14 +34,6 @@ def test_an_exact_scene_is_also_held_to_its_flow():
         verify("damped_pendulum", samples=4, steps=2)["exact_flow"]
 
 
-def test_a_stepper_with_states():
-    # fails if a stepper is differentiated through something else than its own step
-    L_d, states = pair()
-    report = verify((Stepper(L_d), states), h=0.1, steps=3)
-    assert report.passed, report.table()
-    assert report.details["samples"] == 8
-
-
 def test_an_exported_file(tmp_path):
     # fails if a file, which has no L_d, cannot be judged by its map alone, or is not said to be
     model = ContactLagrangian(ModelConfig())
