@@ -6,6 +6,7 @@ import torch
 from herglotz.mechanics import autograd_partials, partials
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
+from tests.compared import f64
 from tests.lagrangians import nonlinear
 
 RTOL = 1e-12
@@ -33,19 +34,11 @@ ROLLOUTS = [
 ]
 
 
-def tensor(*x):
-    return torch.tensor(x, dtype=torch.float64)
-
-
-def scalar(x):
-    return torch.tensor(x, dtype=torch.float64)
-
-
 @pytest.mark.parametrize(("name", "rule", "start", "expected"), ROLLOUTS)
 def test_rule(name, rule, start, expected):
     # fails if a rule takes s, q or v at another place, or if σ is not the product of the c's
     q, p, s = start
-    out = Stepper(scene(name).L_d_rules[rule]).rollout(tensor(q), tensor(p), scalar(s), h=0.2, steps=8)
+    out = Stepper(scene(name).L_d_rules[rule]).rollout(f64(q), f64(p), f64(s)[0], h=0.2, steps=8)
     got = (out.q[-1, 0], out.p[-1, 0], out.s[-1], out.sigma[-1])
     assert bool(out.ok)
     for value, number in zip(got, expected, strict=True):
@@ -56,7 +49,7 @@ def test_rule(name, rule, start, expected):
 def test_two_degrees_of_freedom_nonlinear_in_s(L_d):
     # fails if D12 is transposed or D13, D23 exchanged: neither shows with one degree of freedom or constant c; and if
     # the scene's L or its plain midpoint is not the one of tests/lagrangians.py
-    out = Stepper(L_d).rollout(tensor(0.3, -0.5), tensor(0.7, 0.2), scalar(0.4), h=0.2, steps=8)
+    out = Stepper(L_d).rollout(f64(0.3, -0.5), f64(0.7, 0.2), f64(0.4)[0], h=0.2, steps=8)
     expected = (
         (0.790147768842206419, -0.321134983997739986),
         (0.105386926461592157, 0.154339975878171863),
@@ -64,13 +57,13 @@ def test_two_degrees_of_freedom_nonlinear_in_s(L_d):
         (0.517477449149657664,),
     )
     for value, number in zip((out.q[-1], out.p[-1], out.s[-1:], out.sigma[-1:]), expected, strict=True):
-        torch.testing.assert_close(value.detach(), tensor(*number), rtol=RTOL, atol=0)
+        torch.testing.assert_close(value.detach(), f64(*number), rtol=RTOL, atol=0)
 
 
 @pytest.mark.parametrize("door", [partials, autograd_partials])
 def test_hamilton_jacobi_riccati(door):
     # fails if a Hessian block of the exact L_d (closed form or autograd) or its D3 is wrong
-    P = door(scene("damped_oscillator").L_d, tensor(0.0), tensor(0.0), scalar(0.0), 0.1, order=2)
+    P = door(scene("damped_oscillator").L_d, f64(0.0), f64(0.0), f64(0.0)[0], 0.1, order=2)
     A, B, C, c = P.D11.item(), P.D12.item(), P.D22.item(), P.c.item()
     alpha, beta, delta = 1.0, 0.5, 0.25
     for _ in range(10):

@@ -9,6 +9,7 @@ from herglotz.stepping import State, Step, Stepper
 from herglotz.verify import verify
 from herglotz.verify.action import fan, hamilton_jacobi
 from herglotz.verify.subject import subject
+from tests.compared import failed
 from tests.lagrangians import states
 
 H = 0.1
@@ -29,10 +30,6 @@ class Altered:
 
 def with_state(step, **parts):
     return replace(step, state=step.state._replace(**parts))
-
-
-def failed(report):
-    return {check.name for check in report.checks if not check.passed}
 
 
 def test_the_unaltered_stepper_passes():

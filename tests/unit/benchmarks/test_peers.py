@@ -20,12 +20,9 @@ from benchmarks.peers.samples import Motion, Samples, differences
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
+from tests.compared import f64
 
 H = 0.25
-
-
-def tensor(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def oscillator(damping=0.0, exact=True):
@@ -130,8 +127,8 @@ def test_discrete_lagrangian_is_a_free_particle_without_its_network_and_forces_e
     with torch.no_grad():
         [*force.parameters()][-1].fill_(1.0)  # a constant force
     assert torch.allclose(model.residual(q0, q1, q2), want + 1, atol=1e-12)
-    drift = ThreePoint(lambda a, b, c: c - 2 * b + a, 0).rollout(tensor([0.0]), tensor([0.5]), 3)
-    assert torch.allclose(drift[0, :, 0], tensor(0.0, 0.5, 1.0, 1.5, 2.0))
+    drift = ThreePoint(lambda a, b, c: c - 2 * b + a, 0).rollout(f64([0.0]), f64([0.5]), 3)
+    assert torch.allclose(drift[0, :, 0], f64(0.0, 0.5, 1.0, 1.5, 2.0))
 
 
 LONGER = [pytest.param(name, marks=pytest.mark.slow) for name in ("dissipative_hnn", "delan", "mlp")]
@@ -155,9 +152,9 @@ def test_sindy_finds_the_terms_of_a_damped_pendulum():
     # fails if the library misses sin q or v, or thresholds drop one of them
     samples = PROBLEMS["pendulum_one"]().samples(0, True)
     model: Any = PEERS["sindy"].train(samples, 0, 1.0)
-    rates = model.field(tensor([0.7, 0.4]))
+    rates = model.field(f64([0.7, 0.4]))
     assert model.parameters == 2
-    assert torch.allclose(rates[0], torch.stack([tensor(0.4), -tensor(0.7).sin() - 0.2 * 0.4])[:, 0], atol=1e-8)
+    assert torch.allclose(rates[0], torch.stack([f64(0.4), -f64(0.7).sin() - 0.2 * 0.4])[:, 0], atol=1e-8)
 
 
 @pytest.mark.slow
@@ -173,11 +170,11 @@ def test_double_pendulum_in_joint_angles_is_the_scene_without_friction():
     # fails if the angle between the arms is taken for an absolute one, or the momentum is not ∂L/∂v
     system, theta = scene("double_pendulum", gamma=0.0), DOUBLE.clone()
     theta[:, 4:] = 0.0
-    q, v = tensor([0.9, -0.4]), tensor([0.3, 0.7])
+    q, v = f64([0.9, -0.4]), f64([0.3, 0.7])
     y = torch.cat([q, v], -1)
     field = lambda y: torch.cat([y[:, 2:], Equation(True).acceleration(y[:, :2], y[:, 2:], theta)], -1)  # noqa: E731
     y = rk4(field, y, 0.2, 200)
-    state = (q.cumsum(-1), system.momentum(q.cumsum(-1), v.cumsum(-1), tensor(0.0)), tensor(0.0))
+    state = (q.cumsum(-1), system.momentum(q.cumsum(-1), v.cumsum(-1), f64(0.0)), f64(0.0))
     q_end, p_end, _ = system.flow(*state, 0.2)
     assert torch.allclose(y[:, :2].cumsum(-1), q_end, atol=1e-9)
     assert torch.allclose(double_momentum(y[:, :2], y[:, 2:])[:, 1], p_end[:, 1], atol=1e-9)
@@ -189,7 +186,7 @@ def test_shooting_meets_the_second_position_and_starts_are_found_from_noiseless_
     # fails if Newton's slope is wrong, or a missing sample counts as one
     field = lambda y: torch.stack([y[:, 1], -y[:, 0].sin()], -1)  # noqa: E731
     model = Flow(field, H, 4, 0)
-    q0, q1 = tensor([0.3], [-1.0]), tensor([0.5], [-0.9])
+    q0, q1 = f64([0.3], [-1.0]), f64([0.5], [-0.9])
     v = model.shoot(q0, q1)
     assert torch.allclose(model.advance(torch.cat([q0, v], -1))[:, :1], q1, atol=1e-12)
     history = model.rollout(q0, q1, 18)
@@ -218,7 +215,7 @@ def test_neural_ode_steps_as_the_classical_rule_does():
     pytest.importorskip("torchdiffeq", reason="torchdiffeq is an extra of the benchmarks")
     # fails if the package's step is not of fourth order
     field = lambda y: torch.stack([y[:, 1], -y[:, 0]], -1)  # noqa: E731
-    y = tensor([0.4, -0.2])
+    y = f64([0.4, -0.2])
     assert torch.allclose(continuous.integrator(field, 0.2, 2)(y), rk4(field, y, 0.2, 2), atol=1e-6)
 
 
@@ -269,8 +266,8 @@ def test_a_learned_model_takes_its_own_steps(parts):
     # step's, and not the model's
     shape: Any = {"scale": (1.0,), "speed": (1.0,), "stiffness": (1.0,), "tilt": (0.0,), "rate": 0.1}
     model = ContactLagrangian(ModelConfig((False,), **shape, potential_width=0))
-    q, p = tensor([0.4], [-0.7]), tensor([0.3], [0.1])
+    q, p = f64([0.4], [-0.7]), f64([0.3], [0.1])
     with torch.no_grad():
-        motion = Stepper(model).rollout(q, p, tensor(0, 0), h=H / parts, steps=20 * parts).q[:, ::parts]
+        motion = Stepper(model).rollout(q, p, f64(0, 0), h=H / parts, steps=20 * parts).q[:, ::parts]
     run: Any = SimpleNamespace(model=model, h=H / parts, metrics={"parameters": 0})
     torch.testing.assert_close(Learned(run, H).rollout(q, motion[:, 1], 19), motion, rtol=0, atol=1e-12)

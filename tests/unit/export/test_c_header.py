@@ -14,6 +14,7 @@ from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compile_c, export_c, load_c, weights_digest
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
+from tests.compared import relative
 from tests.compilers import CC, needs_compiler
 from tests.lagrangians import even_model, random_model, states as normal_states
 
@@ -41,10 +42,6 @@ def damped(n, kind, dtype=torch.float64):
 def states_of(n, batch, dtype=torch.float64):
     q, p, s = normal_states(n, batch, 5, dtype)
     return State(0.5 * q, 0.5 * p, s)
-
-
-def relative(a, b):
-    return float((a - b).abs().max() / b.abs().max())
 
 
 def eager_rollout(model, states, **options):

@@ -12,6 +12,7 @@ from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.mass import PositionKinetic
 from herglotz.stepping import State, Stepper
+from tests.compared import relative
 from tests.compilers import needs_compiler
 
 pytestmark = needs_compiler
@@ -111,10 +112,6 @@ def one(b, states, options):
     """Sample b by itself."""
     inputs = {"inputs": options["inputs"][b]} if "inputs" in options else {}
     return State(*(x[b] for x in states)), {**options, **inputs}
-
-
-def relative(a, b):
-    return float((a.double() - b.double()).abs().max() / b.double().abs().max())
 
 
 @pytest.mark.parametrize("case", [x for x in CASES if x not in MATRIX])

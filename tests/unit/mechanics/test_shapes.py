@@ -19,15 +19,12 @@ from herglotz.theory import (
     invariance_defect,
 )
 from herglotz.verify import verify
+from tests.compared import f64
 
 
 def forgetful(q0, q1, s0, h):
     """A Lagrangian without .sum(-1): with one coordinate everything broadcasts."""
     return (q1 - q0) ** 2 / (2 * h) - h / 2 * q0**2 - 0.02 * s0[..., None]
-
-
-def f64(*x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 Q, P, S = f64(1.0)[None], f64(0.5)[None], f64(0.3)

@@ -9,14 +9,11 @@ from herglotz.scenes import NumericallyExact, Reason, exact_discrete_lagrangian,
 from herglotz.scenes.collocation import lobatto
 from herglotz.scenes.motion import constant_rate
 from herglotz.stepping import State, Status, Stepper
+from tests.compared import f64
 from tests.lagrangians import scene_states
 
 NUMERICAL = [scene(name) for name in scene_names() if scene(name).numerical]
 BLOCKS = ("L", "D1", "D2", "D3", "D11", "D12", "D22", "D13", "D23", "D33")
-
-
-def f64(*x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def numerical(system):

@@ -8,10 +8,7 @@ from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
 from herglotz.stepping.continuous_equation import weights
 from herglotz.theory import ContinuousEquation, FractionalStepper, contact_vector_field, inverse_step
-
-
-def f64(*x):
-    return torch.tensor(x, dtype=torch.float64)
+from tests.compared import f64
 
 
 def states(system, count=5, seed=0):

@@ -6,6 +6,7 @@ import torch
 from herglotz.scenes import scene
 from herglotz.stepping import Status, StepError, Stepper
 from herglotz.theory import boundary_value, initial_value
+from tests.compared import relative
 from tests.lagrangians import nonlinear
 
 OSCILLATOR = scene("damped_oscillator")
@@ -28,10 +29,6 @@ def motion(name, steps, count=6, irregular=False):
     out = Stepper(L_d).rollout(x[:, :n] + shift, x[:, n : 2 * n], x[:, -1], h=size)
     assert bool(out.ok.all())
     return L_d, size, out
-
-
-def relative(value, expected):
-    return float((value - expected).abs().max() / expected.abs().max())
 
 
 @pytest.mark.parametrize("irregular", [False, True])

@@ -7,13 +7,10 @@ from herglotz.errors import InputError
 from herglotz.mechanics import partials
 from herglotz.scenes import scene
 from herglotz.theory import PointSource, Propagated, Quadratic, check, riccati_step
+from tests.compared import f64
 from tests.lagrangians import bowl, nonlinear
 
 OSCILLATOR = scene("damped_oscillator").L_d
-
-
-def f64(*x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def quadratic(q0, q1, s0, h):

@@ -18,6 +18,7 @@ from herglotz.theory import (
     right_leg_states,
     tulczyjew_triple,
 )
+from tests.compared import f64
 from tests.lagrangians import nonlinear, states
 
 
@@ -25,10 +26,6 @@ def stage(q0, q1, s0, h):
     """A degenerate L_d: the second coordinate is an inner stage v of the step, and belongs to its start alone."""
     v, d = q0[..., 1], (q1[..., 0] - q0[..., 0]) / h
     return h * (v * d - 0.5 * v * v - torch.cos(q0[..., 0])) - 0.1 * h * s0
-
-
-def f64(*x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def points(n=2, count=7, seed=0):

@@ -9,6 +9,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import reference_solve, scene
 from herglotz.training import FitConfig, Prior, fit
 from herglotz.training.problems.supervised import SupervisedProblem
+from tests.compared import assert_gradient
 
 
 def pendulum(unit=1.0, **settings):
@@ -54,13 +55,7 @@ def test_gradients_match_finite_differences(level, momenta, freedom):
             p += 0.1 * torch.randn(p.shape, generator=make, dtype=p.dtype)
     prior = Prior(model, data.q.amin(0), data.q.amax(0), departure=0.1)
     problem = SupervisedProblem(model, data, momenta=momenta, sigma=0.1, prior=prior, freedom=freedom, chunk=10)
-    x = problem.start()
-    cost, _, b = problem.normal_equations(x)
-    assert float(cost) == pytest.approx(float(problem.cost(x)), rel=1e-12)
-    for _ in range(3):
-        d = torch.randn(len(x), generator=make, dtype=x.dtype)
-        slope = (float(problem.cost(x + 1e-6 * d)) - float(problem.cost(x - 1e-6 * d))) / 2e-6
-        assert float(b @ d) == pytest.approx(slope, rel=2e-5, abs=1e-6 * float(cost))
+    assert_gradient(problem, problem.start(), 2e-5, make)
 
 
 @pytest.mark.parametrize("supervision", ["qs", "qps"])

@@ -7,6 +7,7 @@ import torch
 from herglotz.scenes import scene
 from herglotz.stepping import State
 from herglotz.verify import verify
+from tests.compared import failed
 from tests.lagrangians import states
 
 
@@ -28,10 +29,6 @@ def table(q0, q1, s0, h):
 
 def jump(q0, q1, s0, h):
     return kinetic(q0, q1, s0, h) - 0.1 * h * (q0 > 0.3).double().sum(-1)
-
-
-def failed(report):
-    return {check.name for check in report.checks if not check.passed}
 
 
 @pytest.mark.parametrize("hidden", [detached, table, jump])

@@ -10,6 +10,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.verify import verify
 from herglotz.verify.legendre import _one_sign
+from tests.compared import failed
 from tests.compilers import needs_compiler
 
 H = 0.05
@@ -65,10 +66,6 @@ def file_of(model, kind, programs=None) -> ExportedStepper:
     names = {"pt2": ("model", "rollout"), "onnx": ("linearise", "rollout"), "aoti": ("rollout",)}[kind]
     metadata = describe(model, H, box(model.dof), (), 30, {})
     return ExportedStepper({name: getattr(programs, name) for name in names}, metadata, kind=kind)
-
-
-def failed(report):
-    return {check.name for check in report.checks if not check.passed}
 
 
 @pytest.mark.parametrize(
