@@ -4,7 +4,6 @@ import torch
 
 from herglotz.mechanics import (
     Forced,
-    contact_defect,
     flow_derivative,
     herglotz_residual,
     legendre_minus,
@@ -61,22 +60,6 @@ def test_the_derivative_of_a_forced_step_is_the_closed_form():
     with torch.no_grad():
         P = partials(L_d, state.q, q1, state.s, H, 2)
         torch.testing.assert_close(step_derivative(P, state.p), D, rtol=1e-11, atol=1e-12)
-
-
-def test_the_contact_defect_is_exactly_the_forces():
-    # fails if forces change s, or the defect is not −F⁻dq0 − F⁺dq1
-    L_d, state = ForcedPendula(), states_in_turn(2, 5)
-    with torch.no_grad():
-        step = Stepper(L_d).step(state, H)
-        P = partials(L_d, state.q, step.state.q, state.s, H, 2)
-        D = step_derivative(P, state.p)
-        defect = contact_defect(D, state.p, step.state.p, step.c)
-        assert P.force is not None
-        minus, plus = P.force.minus, P.force.plus
-        expected = -(D[..., :2, :].mT @ plus[..., None])[..., 0]
-        expected[..., :2] -= minus
-    assert defect.abs().max() > 1e-3
-    torch.testing.assert_close(defect, expected, rtol=1e-11, atol=1e-12)
 
 
 def test_the_forced_residual_vanishes_along_steps():

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from herglotz.mechanics import autograd_partials, partials
-from herglotz.mechanics.regularity import left_hessian
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.theory import (
@@ -62,14 +61,6 @@ def test_left_second_derivatives_against_autograd(name):
     for key, value in vars(auto).items():
         if key != "force":
             assert float(((getattr(closed, key) - value).abs() / (1 + value.abs().max())).max()) < 1e-12, key
-
-
-def test_the_hessian_that_decides_about_the_left_hamiltonian():
-    # fails if a cross term with D13 is dropped or not symmetric: c D1D1 L⁻ from the partials of L_d alone
-    L_d, h, start, end, c = solved("nonlinear")
-    P = partials(L_d, start.q, end.q, start.s, h, 2)
-    left = autograd_partials(LeftLagrangian(L_d), start.q, end.q, end.s, h, 2)
-    close(left_hessian(P), c[:, None, None] * left.D11, 1e-12)
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

@@ -43,19 +43,6 @@ def test_duffing_is_found_from_one_noisy_recording(duffing):
     assert duffing.metrics["extrapolation_rms"] < 1.5 * 0.003
 
 
-def test_with_translations_the_candidates_are_those_that_no_translation_moves():
-    # fails if the potential of what is not translated is left out, or the baseline's springs, which hold every
-    # coordinate where it is, stay
-    t = torch.arange(30, dtype=torch.float64) / 10
-    q = torch.stack([t.sin(), t.cos(), (2 * t).sin()], 1)
-    data = Trajectories.of(t, q, angles=(False, False, True), units=("m", "m", "rad"))
-    found = candidates(data, ("q1 + q2",))
-    assert (found.one_rate, found.springs, found.drag) == (True, False, ())
-    potentials = {text for text in found.features if "v" not in text}
-    assert {f"(q1 - q2)^{k}" for k in range(1, 5)} | {"sin(q3)", "cos(q3)"} <= potentials
-    assert not any(text.startswith(("q1", "q2")) for text in potentials)
-
-
 def test_the_equation_is_printed_with_deviations(duffing):
     # fails if a sign, a factor of a derivative, a unit or a covariance is wrong: 4 deviations are 6e-5 of chance
     terms = {term.what: term for term in duffing.equation().terms}
