@@ -88,7 +88,7 @@ def _fit_into(
     arguments: argparse.Namespace,
 ) -> None:  # fmt: skip
     """Train and save; remove the folders that were made if the fit fails."""
-    from herglotz.data.lock import locked
+    from herglotz.data.files import locked
     from herglotz.training import fit, save_run
 
     made = _make(out)

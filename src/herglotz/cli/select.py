@@ -42,8 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_run_folder(out, arguments.resume)
     import_torch()
 
-    from herglotz.data.files import write_atomically
-    from herglotz.data.lock import locked
+    from herglotz.data.files import locked, write_atomically
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import save_run, select
     from herglotz.training.selection import check_levels

@@ -1,14 +1,24 @@
-"""Reading and writing whole files: every failure is an `InputError`, and no file is ever half written."""
+"""Whole files: reading and writing, the seal at the end of a file, and the lock of a folder.
+
+Every failure is an `InputError`, and no file is ever half written.
+
+A sealed file ends with the sha256 of all bytes before, in a place that the format leaves free. A seal finds damage and
+careless changes, not malice: whoever changes a file on purpose can seal the file again. `SECURITY.md` says what that
+means for files from strangers. The lock of a folder names its owner, and the system removes the lock when the process
+of the owner ends.
+"""
 
 from __future__ import annotations
 
 import codecs
 import errno
+import hashlib
 import os
+import re
 import stat
 import tempfile
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from herglotz.errors import InputError, no_such_file
@@ -133,4 +143,115 @@ def _sync(folder: Path) -> None:
         with suppress(OSError):
             os.fsync(handle)
     finally:
+        os.close(handle)
+
+
+# Hexadecimal digits of a sha256.
+DIGITS = 64
+# A zip archive ends with the length of its comment.
+EMPTY_ZIP_COMMENT = b"\0\0"
+ONNX_KEY = b"sha256"
+# An entry of `metadata_props`, field 14 of ModelProto: the message so far and one more entry are again a message.
+ONNX_ENTRY = b"\x72" + bytes([4 + len(ONNX_KEY) + DIGITS, 0x0A, len(ONNX_KEY)]) + ONNX_KEY + b"\x12" + bytes([DIGITS])
+TEXT_SEAL = (b"/* sha256 of all above: ", b" */\n")
+
+
+def sealed_zip(content: bytes) -> bytes:
+    """A zip archive (`.pt2`, `.pt`, `.npz`) whose comment is the hash.
+
+    Raise ValueError if the archive has a comment already: another program wrote the archive.
+    """
+    if content[-22:-18] != b"PK\5\6" or content[-2:] != EMPTY_ZIP_COMMENT:
+        raise ValueError("not a zip archive without a comment")
+    return sealed_bytes(content[:-2] + DIGITS.to_bytes(2, "little"))
+
+
+def sealed_onnx(content: bytes) -> bytes:
+    """An ONNX model whose last metadata entry is the hash."""
+    return sealed_bytes(content + ONNX_ENTRY)
+
+
+def sealed_text(content: str) -> str:
+    """A C header whose last line is the hash, independent of line ends."""
+    return sealed_bytes(content.encode() + TEXT_SEAL[0], TEXT_SEAL[1]).decode()
+
+
+def sealed_bytes(content: bytes, tail: bytes = b"") -> bytes:
+    """A file whose format ignores trailing bytes, such as a shared library: the content, its hash, and the tail."""
+    return content + hashlib.sha256(content).hexdigest().encode() + tail
+
+
+def check_seal(content: bytes, path: PathLike, remedy: str = "export the model again", text: bool = False) -> None:
+    """Raise InputError if the hash is missing (the file is cut, or older than seals) or is not the file's."""
+    if text:
+        content = content.replace(b"\r\n", b"\n").removesuffix(TEXT_SEAL[1])
+    body, seal = content[:-DIGITS], content[-DIGITS:]
+    if not re.fullmatch(rb"[0-9a-f]{64}", seal):
+        raise InputError(
+            f"{path}: does not end with its sha256: it was cut off, or this version did not write it; {remedy}"
+        )
+    if hashlib.sha256(body).hexdigest().encode() != seal:
+        raise InputError(f"{path}: its sha256 is not the one it was written with: it was damaged or changed; {remedy}")
+
+
+try:
+    import fcntl
+except ImportError:
+    # Not a POSIX system: folders are not locked.
+    fcntl = None
+
+LOCK = "fit.lock"
+# Folders that this process has locked; it may lock a folder inside its own lock.
+_locked: set[str] = set()
+
+
+@contextmanager
+def locked(folder: PathLike) -> Iterator[None]:
+    """Hold a folder, which is made if missing, for this process alone.
+
+    The system itself holds the lock (`flock`) and releases the lock when the process ends, so that neither a dead
+    process nor a reused process number locks a folder. The file holds the owner's number for the error message. In a
+    group of `torchrun` the first process locks for all. Raise InputError if another process holds the folder, or the
+    folder cannot be written to.
+    """
+    key = str(Path(folder).resolve())
+    if fcntl is None or key in _locked or os.environ.get("RANK", "0") != "0":
+        yield
+        return
+    handle = _taken(Path(folder))
+    _locked.add(key)
+    try:
+        yield
+    finally:
+        _locked.discard(key)
+        with suppress(OSError):
+            (Path(folder) / LOCK).unlink()
+        os.close(handle)
+
+
+def _taken(folder: Path) -> int:
+    """The locked file, open, with this process's number in it."""
+    assert fcntl is not None
+    path = folder / LOCK
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be locked ({error.strerror}); choose another folder") from None
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.stat(path).st_ino == os.fstat(handle).st_ino:
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+                return handle
+        except FileNotFoundError:
+            # The owner removed the file between our opening and our locking.
+            pass
+        except OSError:
+            owner = os.pread(handle, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            os.close(handle)
+            raise InputError(
+                f"{folder}: process {owner} is writing a fit there; wait for it, stop it, or choose another folder"
+            ) from None
         os.close(handle)

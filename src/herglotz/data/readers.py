@@ -12,7 +12,6 @@ from herglotz.data.checks import check_alike
 from herglotz.data.column_table import of_file
 from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.csv_format import read_csv, write_csv
-from herglotz.data.degrees import with_angles_in_degrees
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
@@ -25,7 +24,7 @@ from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import usable
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.units import in_radians_and_seconds
+from herglotz.data.units import in_radians_and_seconds, with_angles_in_degrees
 from herglotz.errors import InputError, refuse
 from herglotz.telling import tell
 

@@ -11,7 +11,7 @@ from herglotz.data.checks import offsets_of
 from herglotz.data.gaps import complete
 from herglotz.data.splits import SHOWN
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.window_polynomials import powers, pseudo_inverses
+from herglotz.data.windows import powers, pseudo_inverses
 
 # A polynomial of this degree is fitted to so many samples in a row.
 SAMPLES, DEGREE = SHOWN, 5

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.window_polynomials import powers, pseudo_inverses
+from herglotz.data.windows import powers, pseudo_inverses
 
 # A sample is compared with the polynomial of degree 3 through four neighbours on either side.
 BESIDE, DEGREE = 4, 3

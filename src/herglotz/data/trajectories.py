@@ -51,7 +51,7 @@ class Trajectories:
         on the reading.
     hold, delay, lag
         The input between samples (`herglotz.data.holds`), "" if unspecified; the delay and the time constant of the
-        actuator (`herglotz.data.actuator`), in the unit of t: None if unspecified, 0: u itself acts.
+        actuator (`herglotz.data.driving`), in the unit of t: None if unspecified, 0: u itself acts.
 
     Raises
     ------

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 
 from herglotz.codegen.c_function import as_scalars
-from herglotz.data.files import PathLike
+from herglotz.data.files import PathLike, sealed_text
 from herglotz.data.holds import Arrival
-from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_extras import check_extras, extras_source
 from herglotz.export.c_numbers import number, numbers, text_constant, written

@@ -7,8 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from herglotz.data.files import PathLike
-from herglotz.data.seal import sealed_text
+from herglotz.data.files import PathLike, sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, runtime
 from herglotz.export.trusted import write_trusted

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.codegen.c_compiler import SOURCE, compiler, portable_library
-from herglotz.data.files import PathLike
-from herglotz.data.seal import sealed_zip
+from herglotz.data.files import PathLike, sealed_zip
 from herglotz.errors import InputError
 from herglotz.export.c_header import read_metadata, runtime
 from herglotz.export.c_numbers import numbers

@@ -15,8 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.data.files import PathLike, read_bytes
-from herglotz.data.seal import TEXT, check_seal, sealed_text
+from herglotz.data.files import TEXT_SEAL, PathLike, check_seal, read_bytes, sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_header import c_source, read_metadata
 from herglotz.export.c_stepper import compiled
@@ -167,7 +166,7 @@ def _header(content: bytes, path: PathLike) -> str:
     if _is_fmu(path):
         return header_in(content, path)
     text = content.decode("utf-8", "replace").replace("\r\n", "\n")
-    seal = re.search(r"^.*" + re.escape(TEXT[0].decode()) + ".*\n", text, re.MULTILINE)
+    seal = re.search(r"^.*" + re.escape(TEXT_SEAL[0].decode()) + ".*\n", text, re.MULTILINE)
     return text[: seal.end()] if seal else text
 
 

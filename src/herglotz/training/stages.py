@@ -13,8 +13,7 @@ from typing import Any, Literal, TypedDict
 import torch
 from torch import Tensor
 
-from herglotz.data.files import read_bytes, write_atomically
-from herglotz.data.seal import check_seal, sealed_zip
+from herglotz.data.files import check_seal, read_bytes, sealed_zip, write_atomically
 from herglotz.errors import InputError
 from herglotz.progress import FINDING, LOOKING, STAGES, FitBar
 from herglotz.schema import check_entries

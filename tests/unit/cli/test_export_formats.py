@@ -17,7 +17,7 @@ import torch
 from herglotz.cli import main
 from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
-from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
+from herglotz.data.files import ONNX_ENTRY, SIZE, sealed_onnx
 from herglotz.export import compare, export_run, load_exported
 from herglotz.export.load import _is_of, read_header
 from herglotz.export.metadata import KEY

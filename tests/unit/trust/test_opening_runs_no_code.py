@@ -8,7 +8,7 @@ import pytest
 
 from herglotz.cli import main
 from herglotz.codegen import cache
-from herglotz.data.seal import sealed_text
+from herglotz.data.files import sealed_text
 from herglotz.errors import InputError
 from herglotz.export import compile, compile_c, load_c, load_exported, trusted
 from tests.compilers import needs_compiler

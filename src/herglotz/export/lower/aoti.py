@@ -10,7 +10,7 @@ import torch
 from torch.export import ExportedProgram
 
 from herglotz.codegen.c_compiler import compiler
-from herglotz.data.seal import sealed_zip
+from herglotz.data.files import sealed_zip
 from herglotz.errors import InputError
 from herglotz.export.compare import compare
 from herglotz.export.load import load_pt2

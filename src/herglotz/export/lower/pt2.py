@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
-from herglotz.data.seal import sealed_zip
+from herglotz.data.files import sealed_zip
 from herglotz.export.metadata import METADATA, to_json
 from herglotz.export.programs import programs_of, quiet, writes
 from herglotz.models import ContactLagrangian
