@@ -11,9 +11,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import herglotz.mechanics.newton as newton
 import herglotz.stepping.single_step as engine
 from herglotz.models.action import ActionFlow
-from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.network import Network
+from herglotz.models.terms import FeatureKinetic
 from herglotz.stepping import Stepper
 from herglotz.stepping.field import FieldOf
 

@@ -4,9 +4,9 @@ The force between the plates of a capacitor grows as V², a motor pulls a one-si
 mass by k r + c r′, and an amplifier gives no more than its level c, as sat(u/c) or, softly, tanh(u/c). The learned map
 from inputs to forces is linear in all columns. A rate is the slope of a parabola through a value and its neighbours.
 
-A periodic force of known frequency and unknown amplitude and phase has the inputs cos νt and sin νt:
-f cos(νt + φ) = f cos φ · cos νt − f sin φ · sin νt is linear in two inputs, so that the learned map from inputs to
-forces is the amplitude and the phase (f cos φ, −f sin φ). The time stands in the inputs: L_d is time-dependent.
+A periodic force of known frequency and unknown amplitude and phase has the inputs cos νt and sin νt: f cos(νt + φ) = f
+cos φ · cos νt − f sin φ · sin νt is linear in two inputs, so that the learned map from inputs to forces is the
+amplitude and the phase (f cos φ, −f sin φ). The time stands in the inputs: L_d is time-dependent.
 """
 
 from __future__ import annotations

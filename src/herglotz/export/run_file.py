@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from herglotz.errors import InputError, refuse
-from herglotz.export.noise import noise_of
+from herglotz.export.filtering import noise_of
 from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.formats import FORMATS, endings, of_ending
 from herglotz.training import Run

@@ -15,10 +15,8 @@ from herglotz.export.equation import Equations, example, field_like
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian, OwnLagrangian
-from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.jet import Jet
-from herglotz.models.mass import PositionKinetic
-from herglotz.models.terms import Potential
+from herglotz.models.terms import FeatureKinetic, PositionKinetic, Potential
 from herglotz.stepping import State
 from herglotz.stepping.equation import model_equation
 from herglotz.stepping.explicit import Leapfrog

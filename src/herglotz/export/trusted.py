@@ -11,7 +11,7 @@ import hashlib
 from contextlib import suppress
 from pathlib import Path
 
-from herglotz.codegen.cache import private_folder
+from herglotz.codegen.c_compiler import private_folder
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 

@@ -4,6 +4,7 @@ from herglotz.mechanics.contact import (
     contact_defect as contact_defect,
     contact_form as contact_form,
     flow_derivative as flow_derivative,
+    step_derivative as step_derivative,
 )
 from herglotz.mechanics.legendre import (
     herglotz_residual as herglotz_residual,
@@ -26,4 +27,3 @@ from herglotz.mechanics.partials import (
     partials as partials,
 )
 from herglotz.mechanics.regularity import Regularity as Regularity, regularity as regularity
-from herglotz.mechanics.tangent import step_derivative as step_derivative

@@ -10,8 +10,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.driven import driven_scene
-from herglotz.scenes.natural import natural_scene
+from herglotz.scenes.natural import driven_scene, natural_scene
 from herglotz.scenes.scene import Scene, require_positive
 
 

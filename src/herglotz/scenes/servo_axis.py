@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.driven import driven_scene
+from herglotz.scenes.natural import driven_scene
 from herglotz.scenes.scene import Scene, State, Step, require_positive
 
 # L_d has no set-valued force: its dry friction is F_c tanh(v / this width), in m/s, a twentieth of the

@@ -1,6 +1,6 @@
 """Time steppers: batched Newton, steps, rollouts."""
 
-from herglotz.mechanics.linear import solve as solve
+from herglotz.mechanics.newton import solve as solve
 from herglotz.stepping.events import Event as Event
 from herglotz.stepping.explain import explain_step as explain_step
 from herglotz.stepping.linearise import Linearised as Linearised

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian, Partials
-from herglotz.mechanics.linear import solve
-from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, newton_step, norm
+from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, newton_step, norm, solve
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import State, Status
 from herglotz.stepping.stick_slip import StickSlip, at_rest, sticks

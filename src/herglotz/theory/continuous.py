@@ -3,8 +3,8 @@
 All functions are batched over leading dimensions. A result can be differentiated again where an argument wants a
 gradient.
 
-The Legendre transform p = L_v, H = v·L_v − L has the inverse v = H_p, L = p·H_p − H: the transform is an involution,
-so one function serves both directions. The dual of f(q, x, s) is f*(q, y, s) = x·y − f(q, x, s) with f_x(q, x, s) = y.
+The Legendre transform p = L_v, H = v·L_v − L has the inverse v = H_p, L = p·H_p − H: the transform is an involution, so
+one function serves both directions. The dual of f(q, x, s) is f*(q, y, s) = x·y − f(q, x, s) with f_x(q, x, s) = y.
 
 Theorem 1 says when a field is tangent to the section γ = j¹F of T*Q × R → Q:
 

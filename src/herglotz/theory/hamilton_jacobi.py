@@ -12,8 +12,8 @@ The functions below compute S from the flow and never from these identities, so 
 
 S is the paper's S_d^k = ŝ0 + S^k(q̂0, ·, ŝ0): the values of S are values of s.
 
-`check` says whether S^{k+1} follows S^k on an open set of q_k, by Theorem 3. Three residuals are measured at
-q_{k+1} = Φ̃^γ(q_k). None is computed from another:
+`check` says whether S^{k+1} follows S^k on an open set of q_k, by Theorem 3. Three residuals are measured at q_{k+1} =
+Φ̃^γ(q_k). None is computed from another:
 
     right      S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, S^k(q_k))
     left       S^{k+1}(q_{k+1}) − S^k(q_k) + dS^k·q_k + H⁻(dS^k, q_{k+1}, S^{k+1}(q_{k+1}))

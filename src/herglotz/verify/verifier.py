@@ -13,13 +13,13 @@ from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
 from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.data_checks import data_checks
-from herglotz.verify.derivative import derivative
-from herglotz.verify.dry_friction import forces, holding
 from herglotz.verify.explicit_time import in_time
 from herglotz.verify.legendre import (
     NO_H_MINUS,
     NO_H_PLUS,
+    forces,
     hamiltonians_exist,
+    holding,
     left_formalism,
     momentum_matching,
     regularity,
@@ -29,6 +29,7 @@ from herglotz.verify.sampled_rollout import (
     SampledRollout,
     contact,
     convergence,
+    derivative,
     positive_factor,
     rounded,
     sampled_rollout,
@@ -65,7 +66,7 @@ def verify(
     Hamilton–Jacobi equation. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
     scene with an exact L_d its closed-form flow, a run its data, and a time-dependent L_d (`theory.TimeDependent`),
     which steps at its own times, the form η + E dt. The step of an L_d with forces is not a contact map: DΦ̃ᵀη = cη −
-    F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. `herglotz.verify.dry_friction`
+    F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. `herglotz.verify.legendre`
     judges coordinates that set-valued friction holds.
 
     Parameters

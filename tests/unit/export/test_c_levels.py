@@ -11,7 +11,7 @@ from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import ActionFlow
-from herglotz.models.mass import PositionKinetic
+from herglotz.models.terms import PositionKinetic
 from herglotz.stepping import State, Stepper
 from tests.compilers import needs_compiler
 

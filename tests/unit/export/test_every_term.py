@@ -26,8 +26,7 @@ from herglotz.export.metadata import describe
 from herglotz.export.programs import programs_of, quiet
 from herglotz.models import LEVELS, ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
-from herglotz.models.feature_grammar import parse
-from herglotz.models.features import expand
+from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
 from herglotz.stepping import State, Stepper
 from herglotz.training.named_terms import candidates
