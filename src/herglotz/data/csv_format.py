@@ -209,10 +209,7 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
         In float64, as measured (`load` unwraps angles and converts degrees and milliseconds); `columns` holds the role
         of every column.
 
-    Raises
-    ------
-    InputError
-        Naming file, row (line of the file, from 1), column, value and remedy.
+    InputError names file, row (line of the file, from 1), column, value and remedy.
     """
     path = Path(path)
     lines = read_lines(path)

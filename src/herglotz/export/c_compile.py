@@ -105,10 +105,7 @@ def compile_c(
     ExportedStepper
         A drop-in for `Stepper`.
 
-    Raises
-    ------
-    InputError
-        If no compiler is installed, or an argument is not usable.
+    Raise InputError if no compiler is installed, or an argument is not usable.
     """
     given: object = model
     if not isinstance(given, MODELS):

@@ -167,10 +167,7 @@ def export_c(
     Path
         The file written.
 
-    Raises
-    ------
-    InputError
-        If an argument is not usable, a weight is not finite, or the file cannot be written.
+    Raise InputError if an argument is not usable, a weight is not finite, or the file cannot be written.
     """
     path = Path(path)
     name = identifier(path.stem) if name is None else name

@@ -52,10 +52,7 @@ def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None 
     model, path, name, settings
         As in `export_casadi`; h is the shooting interval.
 
-    Raises
-    ------
-    InputError
-        As in `export_c`, and if the model has more than 8 coordinates: acados needs the Jacobian.
+    Raise InputError as in `export_c`, and if the model has more than 8 coordinates: acados needs the Jacobian.
     """
     if (n := model.config.dof) > MAX_DERIVATIVES:
         raise InputError(

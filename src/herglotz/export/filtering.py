@@ -59,10 +59,7 @@ def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
     Noise
         Standard deviations in the units of the data, and `adaptation`, by which the filter learns their scale.
 
-    Raises
-    ------
-    InputError
-        If the fit found no noise.
+    Raise InputError if the fit found no noise.
     """
     problem, h = _problem(run), run.h
     n = problem.n

@@ -182,10 +182,7 @@ def export_fmu(
     version
         Version of FMI, "3.0" or "2.0".
 
-    Raises
-    ------
-    InputError
-        As in `export_c`, and if the version is neither.
+    Raise InputError as in `export_c`, and if the version is neither.
     """
     if version not in VERSIONS:
         raise InputError(f"version must be one of {', '.join(VERSIONS)} (of FMI), got {version!r}")

@@ -46,10 +46,7 @@ def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedSteppe
     ExportedStepper
         With `init`, `step`, `rollout`, `linearise`, `outside_box`, `metadata`, `dof`, `dtype` and `h`.
 
-    Raises
-    ------
-    InputError
-        As in the reader of that format.
+    Raise InputError as in the reader of that format.
     """
     form = FORMATS[of_ending(Path(path).suffix) or "pt2"]
     return form.read(path, trust_code=trust_code) if form.runs_code else form.read(path)
@@ -137,10 +134,8 @@ def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian
     ExportedStepper
         With the header's own dtype and its `metadata`.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, was changed, has no such header or is not trusted, or no compiler is installed.
+    Raise InputError if the file cannot be read, was changed, has no such header or is not trusted, or no compiler is
+    installed.
     """
     content = _sealed(path, text=not _is_fmu(path))
     text = _header(content, path)

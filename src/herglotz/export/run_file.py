@@ -58,10 +58,8 @@ def export_run(
     unroll
         Newton's iterations of an ONNX file of a single step without a loop, as in `export_onnx`.
 
-    Raises
-    ------
-    InputError
-        If the name has another end, the format cannot hold the model, or an argument is not one of this format.
+    Raise InputError if the name has another end, the format cannot hold the model, or an argument is not one of this
+    format.
     """
     path = Path(path)
     kind = kind or of_ending(path.suffix)

@@ -67,10 +67,7 @@ class OwnLagrangian(nn.Module):
     angles, scale, speed
         (n,) which coordinates are angles in rad, and typical sizes of q and q̇, in the data's units.
 
-    Raises
-    ------
-    InputError
-        If L_d is no function, or lacks `at(u)`.
+    Raise InputError if L_d is no function, or lacks `at(u)`.
     """
 
     friction = damping = kinetic = correction = None

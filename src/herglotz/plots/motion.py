@@ -57,10 +57,7 @@ def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
         Number of the trajectory whose coordinates are drawn, at most four; None: up to four trajectories spread over
         the data.
 
-    Raises
-    ------
-    InputError
-        If the data have no such trajectory.
+    Raise InputError if the data have no such trajectory.
     """
     if trajectory is not None and not 0 <= trajectory < len(run.data):
         raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(run.data) - 1}")

@@ -148,10 +148,7 @@ def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None)
     h
         Step; None: the typical model step of a run, a tenth of the typical time of a model.
 
-    Raises
-    ------
-    InputError
-        If no solution has an S^k: all failed, or all are at a caustic.
+    Raise InputError if no solution has an S^k: all failed, or all are at a caustic.
     """
     fan = spread_fan(source, 32, h)
     pairs, points, left_out = [], 0, 0
@@ -199,10 +196,7 @@ def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Fig
     source, h
         As for `plot_momentum_vs_generating_function`.
 
-    Raises
-    ------
-    InputError
-        If no solution has an S^k: all failed, or all are at a caustic.
+    Raise InputError if no solution has an S^k: all failed, or all are at a caustic.
     """
     fan = point_fan(source, SIZE, h)
     S = fan.generating_functions(STEPS + 1)

@@ -113,10 +113,7 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
     gamma
         Damping rate γ, 1/s; γ = 2Ω is critical.
 
-    Raises
-    ------
-    InputError
-        If m ≤ 0.
+    Raise InputError if m ≤ 0.
 
     Source: section 3 of `docs/mathematics.md`.
     """
@@ -162,11 +159,8 @@ class ExactForcedOscillator:
     m, omega0, gamma
         Mass, undamped angular frequency Ω and damping rate γ, as of `ExactOscillator`.
 
-    Raises
-    ------
-    InputError
-        If m or ν is not positive, or the force drives an undamped oscillator at its own frequency, where no motion is
-        periodic.
+    Raise InputError if m or ν is not positive, or the force drives an undamped oscillator at its own frequency, where
+    no motion is periodic.
     """
 
     amplitude: float

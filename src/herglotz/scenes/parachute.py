@@ -172,10 +172,7 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
     lam
         Drag λ, 1/m, not 0; positive brakes downward motion.
 
-    Raises
-    ------
-    InputError
-        If m ≤ 0 or lam = 0.
+    Raise InputError if m ≤ 0 or lam = 0.
 
     Source: section 3 and erratum E9 of `docs/mathematics.md`.
     """
@@ -220,10 +217,7 @@ def quadratic_drag(m: float = 1.0, lam: float = 0.01) -> Scene:
     lam
         Drag λ, 1/m, not 0; positive brakes motion to negative q.
 
-    Raises
-    ------
-    InputError
-        If m ≤ 0 or lam = 0.
+    Raise InputError if m ≤ 0 or lam = 0.
 
     Source: section 3 of `docs/mathematics.md`.
     """

@@ -50,10 +50,7 @@ def servo_axis(
     amplitude, frequency
         Force A of the motor, N, and its angular frequency ν, rad/s.
 
-    Raises
-    ------
-    InputError
-        If the mass is not positive or a friction is negative.
+    Raise InputError if the mass is not positive or a friction is negative.
     """
     require_positive("servo_axis", mass_m=m)
     for name, value in (("viscous", viscous), ("dry", dry)):

@@ -38,10 +38,7 @@ class EvolutionStepper(OneStepMethod):
     field
         "evolution" for E_H, which keeps H, or "contact" for X_H, along which H shrinks by the reported factor c.
 
-    Raises
-    ------
-    InputError
-        If `field` is unknown.
+    Raise InputError if `field` is unknown.
 
     Source: section 6 of `docs/mathematics.md`.
     """

@@ -318,10 +318,7 @@ def check(
     bound
         Largest residual that passes, relative to the terms of its equation.
 
-    Raises
-    ------
-    InputError
-        If the points do not spread, or a function or L_d is not usable.
+    Raise InputError if the points do not spread, or a function or L_d is not usable.
 
     Source: Theorems 2 and 3 of the paper; errata E5 to E7 and E10.
     """

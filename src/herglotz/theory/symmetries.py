@@ -153,10 +153,7 @@ def symmetries(
     coordinates
         Names of the coordinates; by default q1, q2, ….
 
-    Raises
-    ------
-    InputError
-        If the shapes do not fit, or no motion could be stepped.
+    Raise InputError if the shapes do not fit, or no motion could be stepped.
     """
     state = check_batch(states)
     n = state.q.shape[-1]

@@ -29,10 +29,7 @@ def local_errors(stepper: OneStepMethod, out: Rollout, h: Tensor | float) -> Ten
     h
         Step of the rollout: a scalar, (K,) or (..., K).
 
-    Raises
-    ------
-    InputError
-        If h lists another number of steps than the rollout keeps.
+    Raise InputError if h lists another number of steps than the rollout keeps.
     """
     h, steps = check_h(h, out.q), out.status.shape[-1]
     if h.ndim and h.shape[-1] != steps:
@@ -59,10 +56,7 @@ def flag_unresolved(stepper: OneStepMethod, out: Rollout, h: Tensor | float, bou
     bound
         Error of a step relative to its move, > 0.
 
-    Raises
-    ------
-    InputError
-        If the bound is not a finite number > 0, or `local_errors` refuses h.
+    Raise InputError if the bound is not a finite number > 0, or `local_errors` refuses h.
     """
     if not 0 < bound < float("inf"):
         raise InputError(f"bound must be a finite number > 0, got {bound:g}")

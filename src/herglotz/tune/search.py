@@ -126,10 +126,7 @@ def tune(
     progress
         Show a progress bar; None: on a terminal only.
 
-    Raises
-    ------
-    InputError
-        If not exactly one of the two demands is made, no setting meets it, or the run cannot be tuned.
+    Raise InputError if not exactly one of the two demands is made, no setting meets it, or the run cannot be tuned.
     """
     config = config or TuneConfig()
     asked = _demand(max_error, budget_us)

@@ -52,10 +52,7 @@ def symmetries(
     herglotz.theory.Symmetries
         `print` names each symmetry.
 
-    Raises
-    ------
-    InputError
-        If the target has no L_d, such as an exported file, or its motions cannot be stepped.
+    Raise InputError if the target has no L_d, such as an exported file, or its motions cannot be stepped.
     """
     known = subject(target, h, samples, seed)
     states = known.states
