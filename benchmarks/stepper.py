@@ -31,7 +31,7 @@ from herglotz import export
 from herglotz.codegen.c_compiler import FLAGS
 from herglotz.errors import InputError
 from herglotz.export import compile_c
-from herglotz.export.c_stepper import CLibrary
+from herglotz.export.load import CLibrary
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 

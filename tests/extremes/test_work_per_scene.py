@@ -15,7 +15,7 @@ from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.network import Network
 from herglotz.models.terms import FeatureKinetic
 from herglotz.stepping import Stepper
-from herglotz.stepping.field import FieldOf
+from herglotz.stepping.explicit import FieldOf
 
 # What each scene names, and the parameters that this brings.
 BASE = {"kinetic", "potential"}

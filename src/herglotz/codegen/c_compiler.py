@@ -1,57 +1,21 @@
-"""A C compiler, a cache of shared libraries in a folder of this user alone, and loops over samples around a header."""
+"""The compiled header: a C compiler, a cache of shared libraries, and loops over samples around the header."""
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import hashlib
 import os
 import platform
 import shlex
 import shutil
-import stat
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
-from herglotz.data.files import check_seal, sealed_bytes, write_atomically
+from herglotz.data.files import check_seal, private_folder, sealed_bytes, write_atomically
 from herglotz.errors import InputError
-
-
-def private_folder(name: str) -> Path:
-    """A folder of ~/.cache/herglotz (or $XDG_CACHE_HOME) that no other user can write to.
-
-    A temporary folder of this process replaces a folder that cannot be made or is not private.
-    """
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    folder = Path(base, "herglotz", name)
-    with suppress(OSError):
-        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.mkdir(mode=0o700, exist_ok=True)
-        if _is_private(folder) and os.access(folder, os.W_OK):
-            return folder
-    return _temporary(name)
-
-
-def _is_private(folder: Path) -> bool:
-    """Whether the path is a folder, not a link, that this user owns and no other user can write to."""
-    if not hasattr(os, "getuid"):
-        return True
-    found = folder.lstat()
-    others = stat.S_IWGRP | stat.S_IWOTH
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & others
-
-
-@cache
-def _temporary(name: str) -> Path:
-    folder = tempfile.mkdtemp(prefix=f"herglotz-{name}-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
-
 
 # No -ffast-math, which flushes denormals of the whole process that loads the library, and drops the compensation of
 # rounding. -ffp-contract keeps the fused multiply-adds that -std=c99 turns off.

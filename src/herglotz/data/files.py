@@ -1,4 +1,4 @@
-"""Whole files: reading and writing, the seal at the end of a file, and the lock of a folder.
+"""Whole files: reading and writing, the seal at the end of a file, the lock of a folder, and files that may run code.
 
 Every failure is an `InputError`, and no file is ever half written.
 
@@ -6,19 +6,26 @@ A sealed file ends with the sha256 of all bytes before, in a place that the form
 careless changes, not malice: whoever changes a file on purpose can seal the file again. `SECURITY.md` says what that
 means for files from strangers. The lock of a folder names its owner, and the system removes the lock when the process
 of the owner ends.
+
+Opening a C header compiles and loads its code. A `.pt2` file holds machine code (AOTInductor), or graphs whose reader
+in torch evaluates text and unpickles. An ONNX file and the folder of a run are read without running anything. Every
+file that herglotz writes is remembered by its sha256 in a folder that only this user can write to.
 """
 
 from __future__ import annotations
 
+import atexit
 import codecs
 import errno
 import hashlib
 import os
 import re
+import shutil
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from herglotz.errors import InputError, no_such_file
@@ -255,3 +262,59 @@ def _taken(folder: Path) -> int:
                 f"{folder}: process {owner} is writing a fit there; wait for it, stop it, or choose another folder"
             ) from None
         os.close(handle)
+
+
+def private_folder(name: str) -> Path:
+    """A folder of ~/.cache/herglotz (or $XDG_CACHE_HOME) that no other user can write to.
+
+    A temporary folder of this process replaces a folder that cannot be made or is not private.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(base, "herglotz", name)
+    with suppress(OSError):
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if _is_private(folder) and os.access(folder, os.W_OK):
+            return folder
+    return _temporary(name)
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether the path is a folder, not a link, that this user owns and no other user can write to."""
+    if not hasattr(os, "getuid"):
+        return True
+    found = folder.lstat()
+    others = stat.S_IWGRP | stat.S_IWOTH
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & others
+
+
+@cache
+def _temporary(name: str) -> Path:
+    folder = tempfile.mkdtemp(prefix=f"herglotz-{name}-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+# The sha256 of files that this process wrote, for machines on which no folder can remember them.
+_written: set[str] = set()
+
+
+def write_trusted(path: PathLike, content: bytes) -> Path:
+    """Write a file, and remember that this user's herglotz wrote it; return the path."""
+    write_atomically(path, content)
+    digest = hashlib.sha256(content).hexdigest()
+    _written.add(digest)
+    with suppress(OSError):
+        (private_folder("written") / digest).touch(mode=0o600)
+    return Path(path)
+
+
+def check_trusted(content: bytes, path: PathLike, trust_code: bool) -> None:
+    """Refuse a file that runs code when it is opened, unless this user wrote it here or `trust_code` is true."""
+    digest = hashlib.sha256(content).hexdigest()
+    if trust_code or digest in _written or (private_folder("written") / digest).exists():
+        return
+    raise InputError(
+        f"{path}: opening it runs code that it holds, and this user's herglotz did not write it on this machine; if "
+        "you trust who did, use --trust-code (Python: trust_code=True), else ask for an .onnx file or the run's folder"
+    )

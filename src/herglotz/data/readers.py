@@ -25,8 +25,7 @@ from herglotz.data.sensors import calibrated
 from herglotz.data.table import usable
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds, with_angles_in_degrees
-from herglotz.errors import InputError, refuse
-from herglotz.telling import tell
+from herglotz.errors import InputError, refuse, tell
 
 
 @dataclass(frozen=True)

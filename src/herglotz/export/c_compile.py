@@ -12,9 +12,8 @@ from herglotz.codegen.c_compiler import compiler
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 from herglotz.export.c_header import c_source, described
-from herglotz.export.c_stepper import compiled
 from herglotz.export.exported import ExportedStepper
-from herglotz.export.load import load_c
+from herglotz.export.load import compiled, load_c
 from herglotz.export.metadata import describe
 from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.export.step import MAX_ITERATIONS

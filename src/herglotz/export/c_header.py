@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from herglotz.codegen.c_function import as_scalars
-from herglotz.data.files import PathLike, sealed_text
+from herglotz.data.files import PathLike, sealed_text, write_trusted
 from herglotz.data.holds import Arrival
 from herglotz.errors import InputError
 from herglotz.export.equation import Equations
@@ -33,7 +33,6 @@ from herglotz.export.metadata import EXTRAS, check_metadata, describe, from_json
 from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step import MAX_ITERATIONS, ROUNDING_EPSILONS
 from herglotz.export.step_parts import pushed
-from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "

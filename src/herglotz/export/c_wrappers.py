@@ -7,10 +7,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from herglotz.data.files import PathLike, sealed_text
+from herglotz.data.files import PathLike, sealed_text, write_trusted
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, runtime
-from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
 # The suffix of the header's own prefix: the header has a NAME_step, and CasADi calls another NAME_step.

@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree as xml
 
 from herglotz.codegen.c_compiler import SOURCE, compiler, portable_library
-from herglotz.data.files import PathLike, sealed_zip
+from herglotz.data.files import PathLike, sealed_zip, write_trusted
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, read_metadata, runtime
 from herglotz.export.c_wrappers import header_of, prefix
 from herglotz.export.lower.c_parameters import numbers
-from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
 # The versions of FMI, with their names of the capabilities to give derivatives and to save states.

@@ -21,12 +21,11 @@ from torch._higher_order_ops.scan import scan_op
 from torch._higher_order_ops.while_loop import while_loop_op
 from torch.export import Dim, ExportedProgram
 
-from herglotz.data.files import PathLike
+from herglotz.data.files import PathLike, write_trusted
 from herglotz.export.equation import Equations, dense, example
 from herglotz.export.inline import inlined, opaque
 from herglotz.export.metadata import describe
 from herglotz.export.step import CARRIED, MAX_ITERATIONS, STATE, Layout, StepGraphs, Values, unfinished
-from herglotz.export.trusted import write_trusted
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Status

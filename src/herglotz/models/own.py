@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from herglotz.errors import InputError
 from herglotz.mechanics import ClosedForm, DiscreteLagrangian, Driven, Forced, Partials
-from herglotz.mechanics.functional import functional_partials
+from herglotz.mechanics.partials import functional_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.driven import DrivenLagrangian
 

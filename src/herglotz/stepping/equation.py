@@ -22,7 +22,7 @@ from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.sweep import Sweep, trigonometry
 from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
-from herglotz.stepping.field import Field, FieldOf
+from herglotz.stepping.explicit import Field, FieldOf
 from herglotz.stepping.partials_equation import End
 from herglotz.stepping.state import State
 

@@ -33,9 +33,9 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import Flow, flow_derivative, flow_derivatives, join
+from herglotz.mechanics.legendre import least_singular_value
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
-from herglotz.mechanics.regularity import least_singular_value
 from herglotz.stepping import State, Stepper
 from herglotz.theory.contact_manifolds import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.hamiltonian_dynamics import LeftHamiltonian, RightHamiltonian

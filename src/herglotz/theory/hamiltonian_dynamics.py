@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.legendre import scaled_margin
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
-from herglotz.mechanics.regularity import scaled_margin
 
 
 class LeftLagrangian:

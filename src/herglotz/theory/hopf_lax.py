@@ -64,7 +64,7 @@ def hopf_lax(
     -------
     HopfLax
         Status SINGULAR where the second derivative in x is singular (A + cα = 0 for a quadratic S), or where the
-        inertia of W shows a crossed caustic (`theory.caustics`).
+        inertia of W shows a crossed caustic (`theory.lagrangian_dynamics`).
 
     Source: erratum E7.
     """

@@ -33,10 +33,9 @@ from herglotz.mechanics import (
     partials,
     step_derivative,
 )
-from herglotz.mechanics.legendre import momentum_residual
+from herglotz.mechanics.legendre import least_singular_value, left_hessian, momentum_residual, scaled_margin
 from herglotz.mechanics.newton import Root, find_root
 from herglotz.mechanics.partials import value
-from herglotz.mechanics.regularity import least_singular_value, left_hessian, scaled_margin
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
 from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Rollout, State, Status, Step, StepError, status_of_root, step_sizes

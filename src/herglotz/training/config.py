@@ -81,7 +81,7 @@ class FitConfig:
     coulomb
         Dry friction beside viscous friction, at the forced level.
     sticking
-        Set-valued dry friction, with which a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
+        Set-valued dry friction, with which a joint can stand still (`herglotz.stepping.newton`). Whole trajectories
         are fitted, from a start with smooth friction. None: if a search for named terms finds dry friction, and
         set-valued friction is as likely (`herglotz.training.search`).
     robust

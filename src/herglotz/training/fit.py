@@ -19,8 +19,7 @@ from herglotz.data.gaps import complete
 from herglotz.data.holds import Arrival
 from herglotz.data.input_terms import with_input_terms, with_waves
 from herglotz.data.splits import trained_whole
-from herglotz.errors import InputError, refuse
-from herglotz.telling import tell
+from herglotz.errors import InputError, refuse, tell
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig

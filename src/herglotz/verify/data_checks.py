@@ -16,8 +16,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from herglotz.data.roughness import precision, precisions
-from herglotz.data.spikes import spikes
+from herglotz.data.noise import precision, precisions, spikes
 from herglotz.data.splits import leading, leading_rows
 from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials

@@ -6,7 +6,7 @@ stays at q1 = q0 for all states nearby: q1 does not depend on p0, so that M = �
 coordinates alone. The holding impulse balances the momentum, F⁻ = −D1 − c p0. Friction can supply the impulse if the
 part λ of dry friction is within c h (τ + ε).
 
-Source: `herglotz.stepping.stick_slip`.
+Source: `herglotz.stepping.newton`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import Forces, herglotz_residual, mixed_hessian, momentum_jacobian, momentum_plus, partials
-from herglotz.mechanics.legendre import soft_threshold, unheld_residual
-from herglotz.mechanics.regularity import left_hessian, scaled_margin
+from herglotz.mechanics.legendre import left_hessian, scaled_margin, soft_threshold, unheld_residual
 from herglotz.stepping import Status, solve
 from herglotz.theory import LeftHamiltonian, left_equations
 from herglotz.verify.report import Check

@@ -11,9 +11,8 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Forces
 from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
-from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
+from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, in_time, left_hamilton_jacobi
 from herglotz.verify.data_checks import data_checks
-from herglotz.verify.explicit_time import in_time
 from herglotz.verify.legendre import (
     NO_H_MINUS,
     NO_H_PLUS,

@@ -218,10 +218,10 @@ def test_files_around_the_header(form, tiny_run, tmp_path, capsys):
         (start,) = re.findall(r'name="q.theta"[^>]*start="([^"]*)"', description)
         assert float(start) == said["metadata"]["start"]["q"][0]
         few = ["--samples", "4", "--steps", "2", "--against", str(tiny_run)]
-        monkey = "herglotz.export.trusted.private_folder"
+        monkey = "herglotz.data.files.private_folder"
         with pytest.MonkeyPatch.context() as patch:  # a file that another user wrote, beside its run
             patch.setattr(monkey, lambda name: tmp_path / name)
-            patch.setattr("herglotz.export.trusted._written", set())
+            patch.setattr("herglotz.data.files._written", set())
             assert main(["rollout", str(out), "--steps", "5", "--out", str(tmp_path / "c.npz")]) == 2
             assert "opening it runs code" in capsys.readouterr().err
             patch.setattr("herglotz.export.compare", partial(compare, steps=20))

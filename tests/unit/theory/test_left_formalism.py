@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.mechanics import autograd_partials, partials
-from herglotz.mechanics.regularity import left_hessian
+from herglotz.mechanics.legendre import left_hessian
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.theory import (
