@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from herglotz.data.checks import EXACT
+from herglotz.data.checks import EXACT, MISSING, number, quote
 from herglotz.data.column_roles import is_time, kind_of
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.header_cells import name_and_unit
-from herglotz.data.rows import MISSING, number, quote
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import from_table, in_dates, moment, with_units
 from herglotz.data.trajectories import Trajectories

@@ -6,9 +6,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+from herglotz.data.checks import number, quote
 from herglotz.data.csv_columns import Columns
 from herglotz.data.files import PathLike, read_lines
-from herglotz.data.rows import number, quote
 from herglotz.data.table import from_table
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError

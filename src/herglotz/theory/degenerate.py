@@ -26,7 +26,7 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.contact import Triple, jacobian
 from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
-from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.theory.contact_manifolds import contact_product_point
 

@@ -20,7 +20,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import attached, find_root
 from herglotz.mechanics.scalar_fields import Hamiltonian, gradient, square_jacobian
-from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 from herglotz.theory.contact_manifolds import sharp_bivector
 from herglotz.theory.continuous import contact_vector_field, evolution_vector_field
