@@ -2,12 +2,15 @@
 
 from herglotz.export.c_compile import compile as compile, compile_c as compile_c
 from herglotz.export.c_header import export_c as export_c
-from herglotz.export.c_wrappers import export_acados as export_acados, export_casadi as export_casadi
+from herglotz.export.c_wrappers import (
+    export_acados as export_acados,
+    export_casadi as export_casadi,
+    export_fmu as export_fmu,
+)
 from herglotz.export.compare import compare as compare
 from herglotz.export.differences import DifferencedStepper as DifferencedStepper
 from herglotz.export.exported import ExportedStepper as ExportedStepper
 from herglotz.export.filtering import Filtered as Filtered, filter as filter, noise_of as noise_of
-from herglotz.export.fmu import export_fmu as export_fmu
 from herglotz.export.load import (
     load_c as load_c,
     load_exported as load_exported,

@@ -21,11 +21,10 @@ from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.numbers import WithNumbers
 from herglotz.stepping import State
-from herglotz.stepping.equation import StepOfModel, model_equation
+from herglotz.stepping.equation import End, PartialsEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Field, FieldOf
 from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian, step_pull
 from herglotz.stepping.newton import StickSlip
-from herglotz.stepping.partials_equation import End, PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.velocity import legendre
 

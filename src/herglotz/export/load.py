@@ -24,8 +24,8 @@ from herglotz.codegen.c_compiler import build
 from herglotz.data.files import TEXT_SEAL, PathLike, check_seal, check_trusted, read_bytes, sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, c_source, read_metadata, runtime
+from herglotz.export.c_wrappers import header_in
 from herglotz.export.exported import ExportedStepper, Program
-from herglotz.export.fmu import header_in
 from herglotz.export.lower.c_parameters import without_parameters
 from herglotz.export.metadata import AOTI, KEY, METADATA, from_json, weights_digest
 from herglotz.export.parameters import checked_values

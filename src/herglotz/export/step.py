@@ -28,9 +28,9 @@ from herglotz.export.equation import Terms, dense, example, inverse, length, ste
 from herglotz.export.metadata import TOLERANCE
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Status
+from herglotz.stepping.equation import PartialsEquation
 from herglotz.stepping.explicit import Field, FieldOf, Leapfrog
 from herglotz.stepping.newton import at_rest
-from herglotz.stepping.partials_equation import PartialsEquation
 
 # The guess of Δ/h extrapolates the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear,
 # affine and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six. Where step sizes differ

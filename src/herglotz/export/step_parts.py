@@ -18,10 +18,9 @@ from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.models.jet import Jet
 from herglotz.models.terms import FeatureKinetic, PositionKinetic, Potential
 from herglotz.stepping import State
-from herglotz.stepping.equation import model_equation
+from herglotz.stepping.equation import PartialsEquation, model_equation
 from herglotz.stepping.explicit import Field, Leapfrog
 from herglotz.stepping.newton import StickSlip, at_rest
-from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.single_step import driven_by
 
 # The potential at q0 and q1.

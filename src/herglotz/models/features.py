@@ -275,9 +275,6 @@ class _Reader:
         return InputError(f"feature '{self.text}': {what}")
 
 
-__all__ = ["LIBRARIES", "Feature", "Product", "expand", "parse"]
-
-
 def expand(names: Sequence[str], angles: Sequence[bool]) -> list[str]:
     """The features with every library name replaced by the features of that library, each feature once."""
     out: list[str] = []

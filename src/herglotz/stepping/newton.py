@@ -28,7 +28,7 @@ from torch import Tensor
 from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
 from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, newton_step, norm, solve
-from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
+from herglotz.stepping.equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import State, Status
 
 # Sweeps of Gauss–Seidel find which coordinates stick; Newton's iteration then finds how far the other coordinates move.

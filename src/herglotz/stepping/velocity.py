@@ -29,8 +29,8 @@ from herglotz.mechanics.legendre import momentum_minus, momentum_plus
 from herglotz.mechanics.newton import Point, attached
 from herglotz.models import ContactLagrangian
 from herglotz.models.driven import DrivenLagrangian
+from herglotz.stepping.equation import End
 from herglotz.stepping.newton import find_root, status_of
-from herglotz.stepping.partials_equation import End
 from herglotz.stepping.state import State, Status
 
 # Tolerance in machine epsilons of v, and bound on Newton iterations, both as those of a step.

@@ -36,8 +36,8 @@ from herglotz.codegen.trace import traced
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative
 from herglotz.models import Capabilities, ContactLagrangian, ModelConfig, numbers_of
+from herglotz.stepping.equation import PartialsEquation
 from herglotz.stepping.newton import StickSlip, at_rest
-from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.state import State
 from herglotz.training.dictionary import dictionary, keys_of
 from herglotz.training.parameter_vector import ParameterVector
