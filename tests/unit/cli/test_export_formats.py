@@ -17,7 +17,7 @@ import torch
 from herglotz.cli import main
 from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
-from herglotz.data.files import ONNX_ENTRY, SIZE, sealed_onnx
+from herglotz.data.files import DIGITS, ONNX_ENTRY, sealed_onnx
 from herglotz.export import compare, export_run, load_exported
 from herglotz.export.load import _is_of, read_header
 from herglotz.export.metadata import KEY
@@ -189,7 +189,7 @@ def test_a_name_of_another_format_is_refused(form, name, tiny_run, tmp_path, cap
 def test_a_file_made_by_hand_is_one_message(tiny_onnx, tmp_path, capsys):
     # fails if an entry that cannot be is a traceback where it is used, and no word of file, key and remedy
     onnx = pytest.importorskip("onnx")
-    made = onnx.load_model_from_string(tiny_onnx.read_bytes()[: -SIZE - len(ONNX_ENTRY)])
+    made = onnx.load_model_from_string(tiny_onnx.read_bytes()[: -DIGITS - len(ONNX_ENTRY)])
     (said,) = (entry for entry in made.metadata_props if entry.key == KEY)
     said.value = json.dumps(json.loads(said.value) | {"columns": [["t", "time"]]})
     path = tmp_path / "made.onnx"
