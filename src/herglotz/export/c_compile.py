@@ -92,19 +92,9 @@ def compile_c(
     The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
     processor. The compiler is $CC, or cc, gcc or clang from the PATH.
 
-    Parameters
-    ----------
-    model
-        A ContactLagrangian or OwnLagrangian, not changed.
-    h, box, units, dtype, tolerance, parameters
-        As in `export_c`; dtype defaults to the model's. `with_parameters` of the stepper sets parameters.
-
-    Returns
-    -------
-    ExportedStepper
-        A drop-in for `Stepper`.
-
-    Raise InputError if no compiler is installed, or an argument is not usable.
+    The model, a ContactLagrangian or OwnLagrangian, is not changed. The other arguments are those of `export_c`; dtype
+    defaults to the model's. The result is a drop-in for `Stepper`, and its `with_parameters` sets parameters. Raise
+    InputError if no compiler is installed, or an argument is not usable.
     """
     given: object = model
     if not isinstance(given, MODELS):

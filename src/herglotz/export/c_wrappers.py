@@ -36,13 +36,8 @@ def export_casadi(model: ContactLagrangian, path: PathLike, *, name: str | None 
     h of the fewest equal steps that are no longer than the typical one; NAME_shoot, NAME_hold of all intervals of a
     horizon in one call, where the file is compiled with -DNAME_HORIZON=COUNT; and up to 8 coordinates their Jacobians.
     Without inputs no function has the argument u. A step without a solution is an error of CasADi. docs/control.md has
-    an example.
-
-    Parameters
-    ----------
-    model, path, name, settings
-        As in `export_c`, without parameters and extras; the name of the file should end in `.c`. Results and errors
-        are those of `export_c`.
+    an example. Arguments, results and errors are those of `export_c`, without parameters and extras; the name of the
+    file should end in `.c`.
     """
     one, held = "1.0", "hz_steps_of(h, (double)hz_h)"
     step, hold, shoot = (
@@ -58,13 +53,8 @@ def export_acados(model: ContactLagrangian, path: PathLike, *, name: str | None 
     """Write the step as the C file that acados takes for discrete dynamics (`dyn_generic_source`).
 
     The file has NAME_disc_fun and NAME_disc_fun_jac: one step of h, x = (q, p, s). docs/control.md has an example.
-
-    Parameters
-    ----------
-    model, path, name, settings
-        As in `export_casadi`; h is the shooting interval.
-
-    Raise InputError as in `export_c`, and if the model has more than 8 coordinates: acados needs the Jacobian.
+    Arguments are those of `export_casadi`; h is the shooting interval. Raise InputError as in `export_c`, and if the
+    model has more than 8 coordinates: acados needs the Jacobian.
     """
     if (n := model.config.dof) > MAX_DERIVATIVES:
         raise InputError(

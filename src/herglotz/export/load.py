@@ -178,19 +178,9 @@ MODELS, EXTRA = "models/", f"extra/{METADATA}"
 def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
     """Read an exported file by the end of its name: `.pt2`, `.onnx`, or a file with a C header (`.h`, `.c`, `.fmu`).
 
-    Parameters
-    ----------
-    path
-        The file.
-    trust_code
-        As in `load_pt2`, also for a header. Opening an ONNX file runs nothing and needs no trust.
-
-    Returns
-    -------
-    ExportedStepper
-        With `init`, `step`, `rollout`, `linearise`, `outside_box`, `metadata`, `dof`, `dtype` and `h`.
-
-    Raise InputError as in the reader of that format.
+    `trust_code` is as in `load_pt2`, also for a header; opening an ONNX file runs nothing and needs no trust. The
+    stepper has `init`, `step`, `rollout`, `linearise`, `outside_box`, `metadata`, `dof`, `dtype` and `h`. Raise
+    InputError as in the reader of that format.
     """
     form = FORMATS[of_ending(Path(path).suffix) or "pt2"]
     return form.read(path, trust_code=trust_code) if form.runs_code else form.read(path)
@@ -263,23 +253,10 @@ def load_onnx(path: PathLike) -> ExportedStepper:
 def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian | None = None) -> ExportedStepper:
     """Compile and load a header of `export_c`, also the header in a file for CasADi or acados, or in an FMU.
 
-    Parameters
-    ----------
-    path
-        The header, or the file that holds it.
-    trust_code
-        Compile a header that this user did not write on this machine: loading the header runs the code in it.
-    model
-        The model of the run that the header was exported from. A header that equals this model's header letter for
-        letter needs no trust.
-
-    Returns
-    -------
-    ExportedStepper
-        With the header's own dtype and its `metadata`.
-
-    Raise InputError if the file cannot be read, was changed, has no such header or is not trusted, or no compiler is
-    installed.
+    The stepper has the header's own dtype and its `metadata`. `trust_code` compiles a header that this user did not
+    write on this machine: loading the header runs the code in it. A header that equals the header of `model`, the model
+    of the run that the header was exported from, letter for letter needs no trust. Raise InputError if the file cannot
+    be read, was changed, has no such header or is not trusted, or no compiler is installed.
     """
     content = _sealed(path, text=not _is_fmu(path))
     text = _header(content, path)

@@ -42,14 +42,8 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     The functions are V(q_i), the force −∂V/∂q_i, friction over the velocity, and, if they depend on position, damping
     and the entries m_jk of the mass (`herglotz.training.learned_functions`). The mean of the first mass over the data
     is 1, so that forces are accelerations of the first coordinate. The range of the data is shaded: the mean of V over
-    this range is 0, and beyond the range the model extrapolates.
-
-    Parameters
-    ----------
-    run
-        A fitted run.
-    posterior
-        If given, bands of two standard deviations about the posterior's mean are drawn over the range of the data.
+    this range is 0, and beyond the range the model extrapolates. With a `posterior`, bands of two standard deviations
+    about its mean are drawn over the range of the data.
     """
     functions = learned_functions(run if posterior is None else posterior, points=POINTS, beyond=BEYOND)
     columns = min(run.data.dof, MAX_COLUMNS)

@@ -189,14 +189,8 @@ def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Fig
     Left: |S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k)| over the sum of its terms' sizes,
     for a fan of solutions through one point. Right: the same with q_{k+1} of a neighbouring solution of the fan. Off
     the flow the equation is no identity (erratum E7), and the residual must grow with the square of the distance: a
-    check whose residual stayed small off the flow would check nothing.
-
-    Parameters
-    ----------
-    source, h
-        As for `plot_momentum_vs_generating_function`.
-
-    Raise InputError if no solution has an S^k: all failed, or all are at a caustic.
+    check whose residual stayed small off the flow would check nothing. Arguments and errors are those of
+    `plot_momentum_vs_generating_function`.
     """
     fan = point_fan(source, SIZE, h)
     S = fan.generating_functions(STEPS + 1)

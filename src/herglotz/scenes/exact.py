@@ -307,13 +307,8 @@ class NumericallyExact:
 def exact_discrete_lagrangian(system: Motion | StateFunction, **options: Any) -> NumericallyExact:
     """The exact discrete Lagrangian of a continuous L(q, v, s), or of a `Motion`; see `NumericallyExact`.
 
-    Parameters
-    ----------
-    system
-        Any regular L(q, v, s), differentiated by autograd; or a `Motion` with the equations written out, which is
-        several times faster.
-    **options
-        `tolerance`, `max_nodes` and `max_iterations` of `NumericallyExact`.
+    `system` is any regular L(q, v, s), differentiated by autograd, or a `Motion` with the equations written out, which
+    is several times faster; `options` are `tolerance`, `max_nodes` and `max_iterations` of `NumericallyExact`.
     """
     return NumericallyExact(system if isinstance(system, Motion) else lagrangian_motion(system), **options)
 

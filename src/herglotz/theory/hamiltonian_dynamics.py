@@ -23,11 +23,6 @@ class LeftLagrangian:
     Newton's method solves the scalar equation from s0 = s1. The slope of the equation is c: the solution is unique if
     c > 0 for every s0. Value and derivatives are NaN where c = 0 or no solution is found; `regularity` names the cause.
 
-    Parameters
-    ----------
-    L_d
-        The (right) discrete Lagrangian.
-
     Source: erratum E5, for the paper's L_d(q_k, q_{k+1}, s_{k+1}) in the left discrete Hamiltonian.
     """
 
@@ -109,14 +104,8 @@ class RightHamiltonian:
     D1H⁺ = −D1L_d,    D2H⁺ = q1,    D3H⁺ = −D3L_d  (envelope theorem).
 
     H⁺ exists where det D2D2L_d ≠ 0; stepping does *not* need this condition (erratum E4). NaN where Newton's method
-    finds no q1, or where that determinant is zero to rounding; `regularity` names the condition.
-
-    Parameters
-    ----------
-    L_d
-        The discrete Lagrangian.
-    near
-        (..., n) start of Newton's method for q1, by default q0. H⁺ can have several branches; `near` selects one.
+    finds no q1, or where that determinant is zero to rounding; `regularity` names the condition. H⁺ can have several
+    branches; `near` (..., n), the start of Newton's method for q1, by default q0, selects one.
 
     Source: right discrete Hamiltonian of the paper.
     """
@@ -175,14 +164,8 @@ class LeftHamiltonian:
     D1H⁻ = −q0,    D2H⁻ = −D2L⁻,    D3H⁻ = −D3L⁻  (envelope theorem).
 
     H⁻ is the right Hamiltonian of L⁻ with the two positions exchanged, at the momentum −p0. H⁻ exists where c ≠ 0 and
-    det D1D1L⁻ ≠ 0; NaN elsewhere, and where Newton's method finds no q0.
-
-    Parameters
-    ----------
-    L_d
-        The (right) discrete Lagrangian, from which L⁻ follows.
-    near
-        (..., n) start of Newton's method for q0, by default q1.
+    det D1D1L⁻ ≠ 0; NaN elsewhere, and where Newton's method finds no q0. `near` (..., n) is the start of Newton's
+    method for q0, by default q1.
 
     Source: left discrete Hamiltonian of the paper, with the left Lagrangian of erratum E5.
     """
