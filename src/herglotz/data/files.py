@@ -30,6 +30,12 @@ from pathlib import Path
 
 from herglotz.errors import InputError, no_such_file
 
+try:
+    import fcntl
+except ImportError:
+    # Not a POSIX system: folders are not locked.
+    fcntl = None
+
 PathLike = str | os.PathLike[str]
 # The disk or the user's quota is full.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
@@ -200,12 +206,6 @@ def check_seal(content: bytes, path: PathLike, remedy: str = "export the model a
     if hashlib.sha256(body).hexdigest().encode() != seal:
         raise InputError(f"{path}: its sha256 is not the one it was written with: it was damaged or changed; {remedy}")
 
-
-try:
-    import fcntl
-except ImportError:
-    # Not a POSIX system: folders are not locked.
-    fcntl = None
 
 LOCK = "fit.lock"
 # Folders that this process has locked; it may lock a folder inside its own lock.
