@@ -23,9 +23,8 @@ from herglotz.stepping import State
 from herglotz.training import FitConfig, Run, fit
 from herglotz.tune.cost import Timed as Timing, measure_costs, timed_stepping
 from herglotz.tune.distil import pairs_of
-from herglotz.tune.kick_composition import can_kick, fit_kicks
-from herglotz.tune.kick_header import CompiledKicks
-from herglotz.tune.reference import JITTER, draw_starts, record
+from herglotz.tune.kick_composition import CompiledKicks, can_kick, fit_kicks
+from herglotz.tune.search import JITTER, draw_starts, record
 
 CHECKS = 4  # times at which errors are taken
 COUNT = 192  # motions whose errors are taken: half to choose a setting by, half to judge it

@@ -22,7 +22,7 @@ from unittest import mock
 
 from herglotz.data import load, save, simulate
 from herglotz.errors import InputError
-from herglotz.export import c_stepper, export_c, export_onnx, export_pt2, load_c, load_onnx, load_pt2
+from herglotz.export import export_c, export_onnx, export_pt2, load as loading, load_c, load_onnx, load_pt2
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.features import parse
 from herglotz.scenes import scene
@@ -84,7 +84,7 @@ def watched(count: Count) -> Iterator[None]:
         raise InputError("reached")
 
     with (
-        mock.patch.object(c_stepper, "build", reached),
+        mock.patch.object(loading, "build", reached),
         mock.patch.object(_package, "_load_exported_programs", reached),
     ):
         yield

@@ -21,8 +21,8 @@ from herglotz.data.files import PathLike
 from herglotz.data.input_terms import input_terms_of
 from herglotz.errors import InputError, refuse
 from herglotz.export import ExportedStepper, export_run, load_c
-from herglotz.export.c_stepper import CLibrary
 from herglotz.export.exported import check_range
+from herglotz.export.load import CLibrary
 from herglotz.stepping import Status
 from herglotz.stepping.state import check_h
 from herglotz.training import Run

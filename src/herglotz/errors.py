@@ -1,5 +1,9 @@
-"""`InputError`, which every mistake of a user raises: the command line prints one line and ends with exit code 2."""
+"""`InputError`, which every mistake of a user raises, and messages while a command or a fit runs.
 
+The command line prints one line for an error, and ends with exit code 2.
+"""
+
+import sys
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -46,3 +50,8 @@ def no_such_file(path: Path) -> str:
     except OSError:
         beside = []
     return f"{path}: there is no such file; check the name and the folder{did_you_mean(path.name, beside)}"
+
+
+def tell(text: str) -> None:
+    """Print on stderr; in a notebook on stdout, because notebooks show stderr on a red background, like a failure."""
+    print(text, file=sys.stdout if "ipykernel" in sys.modules else sys.stderr, flush=True)

@@ -56,7 +56,7 @@ FORMATS = {
     ),
     "aoti": Format(
         ".pt2",
-        "lower.aoti:export_aoti",
+        "lower.pt2:export_aoti",
         "load:load_pt2",
         "K steps and a start compiled to machine code (needs g++ or clang++, one or two minutes): fast batches",
     ),
@@ -91,12 +91,12 @@ FORMATS = {
     ),
     "fmu": Format(
         ".fmu",
-        "fmu:export_fmu",
+        "c_wrappers:export_fmu",
         "load:load_c",
         "an FMU for co-simulation, FMI 3.0, with C sources and a binary for this machine",
         OF_C,
     ),
-    "fmu2": Format(".fmu", "fmu:export_fmu2", "load:load_c", "the same for FMI 2.0", OF_C),
+    "fmu2": Format(".fmu", "c_wrappers:export_fmu2", "load:load_c", "the same for FMI 2.0", OF_C),
 }
 
 

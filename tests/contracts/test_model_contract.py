@@ -22,8 +22,7 @@ from herglotz.mechanics import (
 )
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
-from herglotz.stepping.equation import model_equation
-from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.equation import PartialsEquation, model_equation
 from tests.lagrangians import randomise
 
 

@@ -11,11 +11,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import herglotz.mechanics.newton as newton
 import herglotz.stepping.single_step as engine
 from herglotz.models.action import ActionFlow
-from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.network import Network
+from herglotz.models.terms import FeatureKinetic
 from herglotz.stepping import Stepper
-from herglotz.stepping.field import FieldOf
+from herglotz.stepping.explicit import FieldOf
 
 # What each scene names, and the parameters that this brings.
 BASE = {"kinetic", "potential"}

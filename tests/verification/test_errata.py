@@ -12,7 +12,7 @@ import torch
 from herglotz.mechanics import contact_defect, flow_derivative
 from herglotz.plots import parachute as figures
 from herglotz.scenes import PrintedParachute, scene
-from herglotz.scenes.printed_parachute import MAP_START
+from herglotz.scenes.parachute import MAP_START
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "train"))  # as for a script that is run there

@@ -9,7 +9,7 @@ from torch import Tensor
 from herglotz.mechanics import partials
 from herglotz.mechanics.scalar_fields import derivatives
 from herglotz.scenes import scene
-from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
+from herglotz.scenes.parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State
 from herglotz.theory import contact_vector_field, generating_function, right_equations
 from paper_errata.erratum import PARACHUTE, Erratum, Row, parachute_start, size, tensor

@@ -18,8 +18,20 @@ from herglotz.cli.common import (
     print_next_of,
     say,
 )
-from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
-from herglotz.cli.settings import EXPERT, MACHINE, MODEL, OPTIMISER, data_of, settings_of
+from herglotz.cli.flags import (
+    EXPERT,
+    MACHINE,
+    MODEL,
+    OPTIMISER,
+    PROGRESS,
+    READING,
+    RUN,
+    check_run_folder,
+    columns_of,
+    data_of,
+    progress,
+    settings_of,
+)
 
 if TYPE_CHECKING:
     from herglotz.data import Trajectories
@@ -88,7 +100,7 @@ def _fit_into(
     arguments: argparse.Namespace,
 ) -> None:  # fmt: skip
     """Train and save; remove the folders that were made if the fit fails."""
-    from herglotz.data.lock import locked
+    from herglotz.data.files import locked
     from herglotz.training import fit, save_run
 
     made = _make(out)

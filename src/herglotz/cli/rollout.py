@@ -293,7 +293,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
     import torch
 
     from herglotz.data.driving import driven, even_times, input_recording
-    from herglotz.data.waves import waves
+    from herglotz.data.input_terms import waves
 
     steps, path = arguments.steps, arguments.inputs
     if path is None:

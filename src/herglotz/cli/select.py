@@ -9,8 +9,18 @@ from pathlib import Path
 
 from herglotz.cli.common import count, exit_code, flag, import_torch, print_json, print_next_of
 from herglotz.cli.fit import USAGE as USAGE
-from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
-from herglotz.cli.settings import LEVELS, MACHINE, data_of, settings_of
+from herglotz.cli.flags import (
+    LEVELS,
+    MACHINE,
+    PROGRESS,
+    READING,
+    RUN,
+    check_run_folder,
+    columns_of,
+    data_of,
+    progress,
+    settings_of,
+)
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
@@ -42,8 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_run_folder(out, arguments.resume)
     import_torch()
 
-    from herglotz.data.files import write_atomically
-    from herglotz.data.lock import locked
+    from herglotz.data.files import locked, write_atomically
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import save_run, select
     from herglotz.training.selection import check_levels

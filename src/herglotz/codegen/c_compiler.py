@@ -14,9 +14,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from herglotz.codegen.cache import private_folder
-from herglotz.data.files import write_atomically
-from herglotz.data.seal import check_seal, sealed_bytes
+from herglotz.data.files import check_seal, private_folder, sealed_bytes, write_atomically
 from herglotz.errors import InputError
 
 # No -ffast-math, which flushes denormals of the whole process that loads the library, and drops the compensation of

@@ -24,8 +24,7 @@ from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame, plain, seconds
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
-from herglotz.errors import InputError, refuse
-from herglotz.telling import tell
+from herglotz.errors import InputError, refuse, tell
 
 # With more coordinates a sample than this an array is taken for transposed: so few samples determine no model.
 MAX_COORDINATES_PER_SAMPLE = 4

@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from herglotz.data.checks import quote
 from herglotz.data.column_roles import (
     READING,
     ROLES,
@@ -23,7 +24,6 @@ from herglotz.data.column_roles import (
     words_of,
 )
 from herglotz.data.header_cells import heads_of
-from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
 # Fields of `Wanted` that give columns a role, and the role.

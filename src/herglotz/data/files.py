@@ -1,17 +1,40 @@
-"""Reading and writing whole files: every failure is an `InputError`, and no file is ever half written."""
+"""Whole files: reading and writing, the seal at the end of a file, the lock of a folder, and files that may run code.
+
+Every failure is an `InputError`, and no file is ever half written.
+
+A sealed file ends with the sha256 of all bytes before, in a place that the format leaves free. A seal finds damage and
+careless changes, not malice: whoever changes a file on purpose can seal the file again. `SECURITY.md` says what that
+means for files from strangers. The lock of a folder names its owner, and the system removes the lock when the process
+of the owner ends.
+
+Opening a C header compiles and loads its code. A `.pt2` file holds machine code (AOTInductor), or graphs whose reader
+in torch evaluates text and unpickles. An ONNX file and the folder of a run are read without running anything. Every
+file that herglotz writes is remembered by its sha256 in a folder that only this user can write to.
+"""
 
 from __future__ import annotations
 
+import atexit
 import codecs
 import errno
+import hashlib
 import os
+import re
+import shutil
 import stat
 import tempfile
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from herglotz.errors import InputError, no_such_file
+
+try:
+    import fcntl
+except ImportError:
+    # Not a POSIX system: folders are not locked.
+    fcntl = None
 
 PathLike = str | os.PathLike[str]
 # The disk or the user's quota is full.
@@ -134,3 +157,164 @@ def _sync(folder: Path) -> None:
             os.fsync(handle)
     finally:
         os.close(handle)
+
+
+# Hexadecimal digits of a sha256.
+DIGITS = 64
+# A zip archive ends with the length of its comment.
+EMPTY_ZIP_COMMENT = b"\0\0"
+ONNX_KEY = b"sha256"
+# An entry of `metadata_props`, field 14 of ModelProto: the message so far and one more entry are again a message.
+ONNX_ENTRY = b"\x72" + bytes([4 + len(ONNX_KEY) + DIGITS, 0x0A, len(ONNX_KEY)]) + ONNX_KEY + b"\x12" + bytes([DIGITS])
+TEXT_SEAL = (b"/* sha256 of all above: ", b" */\n")
+
+
+def sealed_zip(content: bytes) -> bytes:
+    """A zip archive (`.pt2`, `.pt`, `.npz`) whose comment is the hash.
+
+    Raise ValueError if the archive has a comment already: another program wrote the archive.
+    """
+    if content[-22:-18] != b"PK\5\6" or content[-2:] != EMPTY_ZIP_COMMENT:
+        raise ValueError("not a zip archive without a comment")
+    return sealed_bytes(content[:-2] + DIGITS.to_bytes(2, "little"))
+
+
+def sealed_onnx(content: bytes) -> bytes:
+    """An ONNX model whose last metadata entry is the hash."""
+    return sealed_bytes(content + ONNX_ENTRY)
+
+
+def sealed_text(content: str) -> str:
+    """A C header whose last line is the hash, independent of line ends."""
+    return sealed_bytes(content.encode() + TEXT_SEAL[0], TEXT_SEAL[1]).decode()
+
+
+def sealed_bytes(content: bytes, tail: bytes = b"") -> bytes:
+    """A file whose format ignores trailing bytes, such as a shared library: the content, its hash, and the tail."""
+    return content + hashlib.sha256(content).hexdigest().encode() + tail
+
+
+def check_seal(content: bytes, path: PathLike, remedy: str = "export the model again", text: bool = False) -> None:
+    """Raise InputError if the hash is missing (the file is cut, or older than seals) or is not the file's."""
+    if text:
+        content = content.replace(b"\r\n", b"\n").removesuffix(TEXT_SEAL[1])
+    body, seal = content[:-DIGITS], content[-DIGITS:]
+    if not re.fullmatch(rb"[0-9a-f]{64}", seal):
+        raise InputError(
+            f"{path}: does not end with its sha256: it was cut off, or this version did not write it; {remedy}"
+        )
+    if hashlib.sha256(body).hexdigest().encode() != seal:
+        raise InputError(f"{path}: its sha256 is not the one it was written with: it was damaged or changed; {remedy}")
+
+
+LOCK = "fit.lock"
+# Folders that this process has locked; it may lock a folder inside its own lock.
+_locked: set[str] = set()
+
+
+@contextmanager
+def locked(folder: PathLike) -> Iterator[None]:
+    """Hold a folder, which is made if missing, for this process alone.
+
+    The system itself holds the lock (`flock`) and releases the lock when the process ends, so that neither a dead
+    process nor a reused process number locks a folder. The file holds the owner's number for the error message. In a
+    group of `torchrun` the first process locks for all. Raise InputError if another process holds the folder, or the
+    folder cannot be written to.
+    """
+    key = str(Path(folder).resolve())
+    if fcntl is None or key in _locked or os.environ.get("RANK", "0") != "0":
+        yield
+        return
+    handle = _taken(Path(folder))
+    _locked.add(key)
+    try:
+        yield
+    finally:
+        _locked.discard(key)
+        with suppress(OSError):
+            (Path(folder) / LOCK).unlink()
+        os.close(handle)
+
+
+def _taken(folder: Path) -> int:
+    """The locked file, open, with this process's number in it."""
+    assert fcntl is not None
+    path = folder / LOCK
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be locked ({error.strerror}); choose another folder") from None
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.stat(path).st_ino == os.fstat(handle).st_ino:
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+                return handle
+        except FileNotFoundError:
+            # The owner removed the file between our opening and our locking.
+            pass
+        except OSError:
+            owner = os.pread(handle, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            os.close(handle)
+            raise InputError(
+                f"{folder}: process {owner} is writing a fit there; wait for it, stop it, or choose another folder"
+            ) from None
+        os.close(handle)
+
+
+def private_folder(name: str) -> Path:
+    """A folder of ~/.cache/herglotz (or $XDG_CACHE_HOME) that no other user can write to.
+
+    A temporary folder of this process replaces a folder that cannot be made or is not private.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(base, "herglotz", name)
+    with suppress(OSError):
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if _is_private(folder) and os.access(folder, os.W_OK):
+            return folder
+    return _temporary(name)
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether the path is a folder, not a link, that this user owns and no other user can write to."""
+    if not hasattr(os, "getuid"):
+        return True
+    found = folder.lstat()
+    others = stat.S_IWGRP | stat.S_IWOTH
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & others
+
+
+@cache
+def _temporary(name: str) -> Path:
+    folder = tempfile.mkdtemp(prefix=f"herglotz-{name}-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+# The sha256 of files that this process wrote, for machines on which no folder can remember them.
+_written: set[str] = set()
+
+
+def write_trusted(path: PathLike, content: bytes) -> Path:
+    """Write a file, and remember that this user's herglotz wrote it; return the path."""
+    write_atomically(path, content)
+    digest = hashlib.sha256(content).hexdigest()
+    _written.add(digest)
+    with suppress(OSError):
+        (private_folder("written") / digest).touch(mode=0o600)
+    return Path(path)
+
+
+def check_trusted(content: bytes, path: PathLike, trust_code: bool) -> None:
+    """Refuse a file that runs code when it is opened, unless this user wrote it here or `trust_code` is true."""
+    digest = hashlib.sha256(content).hexdigest()
+    if trust_code or digest in _written or (private_folder("written") / digest).exists():
+        return
+    raise InputError(
+        f"{path}: opening it runs code that it holds, and this user's herglotz did not write it on this machine; if "
+        "you trust who did, use --trust-code (Python: trust_code=True), else ask for an .onnx file or the run's folder"
+    )

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
-from herglotz.data.missing import interpolated
+from herglotz.data.holds import interpolated
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 

@@ -1,4 +1,6 @@
-"""The hold of an input between samples: how the recorded u_k become the input of a step, or of a part of it.
+"""Values between samples: inputs by their hold, and missing positions from readings of the same coordinate.
+
+The hold of an input says how the recorded u_k become the input of a step, or of a part of it:
 
     zero     u_k from sample k to the next: a controller's output
     first    straight lines between the samples: the mean over a step is (u_k + u_{k+1})/2
@@ -101,3 +103,32 @@ def _denominators(nodes: Sequence[Tensor]) -> list[Tensor]:
         math.prod((other - own for other in (*nodes[:i], *nodes[i + 1 :])), start=torch.ones_like(own))
         for i, own in enumerate(nodes)
     ]
+
+
+# Readings through which a cubic gives the value between them.
+CUBIC_POINTS = 4
+
+
+def interpolated(t: Tensor, q: Tensor, known: Tensor, lengths: tuple[int, ...]) -> Tensor:
+    """Positions (N, n); those that are not `known`, (N, n) bool, are on cubics through the known positions."""
+    q = q.clone()
+    for x, own in zip(q.T, known.T, strict=True):
+        for time, part, read in zip(t.split(lengths), x.split(lengths), own.split(lengths), strict=True):
+            if bool(read.any()):
+                part[~read] = between(time[read], part[read], time[~read])
+    return q
+
+
+def between(t: Tensor, x: Tensor, at: Tensor) -> Tensor:
+    """Values (M,) at other times of cubics through the nearest four readings (t, x), or through all if fewer."""
+    count = min(CUBIC_POINTS, len(t))
+    first = (torch.searchsorted(t, at) - count // 2).clamp(0, len(t) - count)
+    near = first[:, None] + torch.arange(count, device=t.device)
+    return (lagrange(t[near] - at[:, None]) * x[near]).sum(1)
+
+
+def last_read(q: Tensor, known: Tensor, trajectory: Tensor) -> Tensor:
+    """Positions (N, n); in place of a position that is not `known`, (N, n) bool, stands the last known position."""
+    row = torch.arange(len(q), device=q.device)[:, None]
+    first = torch.searchsorted(trajectory, trajectory)[:, None]
+    return q.gather(0, torch.where(known, row, first).cummax(0).values)

@@ -13,9 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS, EXACT
+from herglotz.data.checks import ARRAYS, EXACT, quote
 from herglotz.data.files import PathLike, read_bytes, write_atomically
-from herglotz.data.rows import quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 from herglotz.schema import check_entries

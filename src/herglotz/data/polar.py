@@ -18,7 +18,7 @@ from herglotz.data.column_roles import kind_of
 from herglotz.data.csv_columns import is_number
 from herglotz.data.gaps import complete
 from herglotz.data.header_cells import name_and_unit
-from herglotz.data.roughness import AT_THE_NOISE, precision
+from herglotz.data.noise import AT_THE_NOISE, precision
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import check_coordinates, refuse
 from herglotz.least_squares import least_squares

@@ -16,7 +16,7 @@ import torch
 
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Columns
-from herglotz.data.missing import CUBIC_POINTS, between
+from herglotz.data.holds import CUBIC_POINTS, between
 from herglotz.data.trajectories import Trajectories
 
 # Stamps within this part of a count are whole counts: decimal numbers are rounded in float64.

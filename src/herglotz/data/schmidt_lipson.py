@@ -6,9 +6,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+from herglotz.data.checks import number, quote
 from herglotz.data.csv_columns import Columns
 from herglotz.data.files import PathLike, read_lines
-from herglotz.data.rows import number, quote
 from herglotz.data.table import from_table
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
@@ -32,10 +32,7 @@ def read_schmidt_lipson(path: PathLike) -> Trajectories:
     Trajectories
         In float64, angles as they stand in the file.
 
-    Raises
-    ------
-    InputError
-        Naming file, row (line of the file, from 1), column, value and remedy.
+    InputError names file, row (line of the file, from 1), column, value and remedy.
     """
     path = Path(path)
     rows = [(at, line.strip()) for at, line in enumerate(read_lines(path), 1) if line.strip()]

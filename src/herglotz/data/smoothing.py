@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.window_polynomials import powers, pseudo_inverses
-from herglotz.data.windows import Triples
+from herglotz.data.windows import Triples, powers, pseudo_inverses
 
 # Even: at the middle of a window an odd power adds nothing to position and acceleration.
 DEGREES = (4, 6)

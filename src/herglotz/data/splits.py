@@ -12,7 +12,7 @@ from herglotz.errors import InputError
 
 # A part of a trajectory has at least so many samples in a row.
 RUN = 200
-# Samples in a row that show their noise: polynomials in time are fitted to as many (`herglotz.data.roughness`).
+# Samples in a row that show their noise: polynomials in time are fitted to as many (`herglotz.data.noise`).
 SHOWN = 9
 # Rows of the concatenation, and the number of rows of each trajectory.
 Part = tuple[Tensor, tuple[int, ...]]

@@ -12,12 +12,11 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from herglotz.data.checks import EXACT, MIN_SAMPLES
+from herglotz.data.checks import EXACT, MIN_SAMPLES, Unusable, out_of_order, quote
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import with_missing
 from herglotz.data.header_cells import name_and_unit
 from herglotz.data.rates import Recording, completed, in_order, without_repeats
-from herglotz.data.rows import Unusable, out_of_order, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import PER_SECOND, in_seconds
 from herglotz.errors import InputError, refuse

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
 from herglotz.data.column_table import INPUT_TERM, column_table, summary_of
-from herglotz.data.holds import Arrival, check_arrival, interpolated_input
-from herglotz.data.missing import interpolated, last_read
+from herglotz.data.holds import Arrival, check_arrival, interpolated, interpolated_input, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
 from herglotz.errors import check_coordinates, refuse
@@ -51,7 +50,7 @@ class Trajectories:
         on the reading.
     hold, delay, lag
         The input between samples (`herglotz.data.holds`), "" if unspecified; the delay and the time constant of the
-        actuator (`herglotz.data.actuator`), in the unit of t: None if unspecified, 0: u itself acts.
+        actuator (`herglotz.data.driving`), in the unit of t: None if unspecified, 0: u itself acts.
 
     Raises
     ------

@@ -12,9 +12,8 @@ from herglotz.codegen.c_compiler import compiler
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 from herglotz.export.c_header import c_source, described
-from herglotz.export.c_stepper import compiled
 from herglotz.export.exported import ExportedStepper
-from herglotz.export.load import load_c
+from herglotz.export.load import compiled, load_c
 from herglotz.export.metadata import describe
 from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.export.step import MAX_ITERATIONS
@@ -93,22 +92,9 @@ def compile_c(
     The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
     processor. The compiler is $CC, or cc, gcc or clang from the PATH.
 
-    Parameters
-    ----------
-    model
-        A ContactLagrangian or OwnLagrangian, not changed.
-    h, box, units, dtype, tolerance, parameters
-        As in `export_c`; dtype defaults to the model's. `with_parameters` of the stepper sets parameters.
-
-    Returns
-    -------
-    ExportedStepper
-        A drop-in for `Stepper`.
-
-    Raises
-    ------
-    InputError
-        If no compiler is installed, or an argument is not usable.
+    The model, a ContactLagrangian or OwnLagrangian, is not changed. The other arguments are those of `export_c`; dtype
+    defaults to the model's. The result is a drop-in for `Stepper`, and its `with_parameters` sets parameters. Raise
+    InputError if no compiler is installed, or an argument is not usable.
     """
     given: object = model
     if not isinstance(given, MODELS):

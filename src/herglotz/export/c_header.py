@@ -6,7 +6,7 @@ import copy
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,28 +14,30 @@ from typing import Any
 import torch
 
 from herglotz.codegen.c_function import as_scalars
-from herglotz.data.files import PathLike
+from herglotz.data.files import PathLike, sealed_text, write_trusted
 from herglotz.data.holds import Arrival
-from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
-from herglotz.export.c_extras import check_extras, extras_source
-from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, as_lanes, model_source
 from herglotz.export.lower.c_parameters import (
     constants as parameter_constants,
     inputs_constants,
     inputs_source,
+    number,
+    numbers,
+    text_constant,
     without_parameters,
+    written,
 )
-from herglotz.export.metadata import check_metadata, describe, from_json
+from herglotz.export.metadata import EXTRAS, check_metadata, describe, from_json
 from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step import MAX_ITERATIONS, ROUNDING_EPSILONS
 from herglotz.export.step_parts import pushed
-from herglotz.export.trusted import write_trusted
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "
+# The files of `export/runtime` of each extra.
+FILES = {"adjoint": ("adjoint",), "filter": ("filter", "smoother")}
 # The prefix of the names in a header.
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,40}"
 # Newton's default tolerance in machine epsilons of q, which a step in increments reaches.
@@ -164,10 +166,7 @@ def export_c(
     Path
         The file written.
 
-    Raises
-    ------
-    InputError
-        If an argument is not usable, a weight is not finite, or the file cannot be written.
+    Raise InputError if an argument is not usable, a weight is not finite, or the file cannot be written.
     """
     path = Path(path)
     name = identifier(path.stem) if name is None else name
@@ -177,7 +176,7 @@ def export_c(
         extra["parameters"] = described_parameters(model, parameters)
         extra |= moved_numbers(model, extra["parameters"])
     if extras:
-        check_extras(extras, model.dof, MAX_DERIVATIVES)
+        _check_extras(extras, model.dof)
         extra["extras"] = list(extras)
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     check_metadata(entries, path)
@@ -211,7 +210,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     if velocities:
         parts += [as_scalars(emitted.momentum), shown(runtime("velocity.h"))]
         parts += ["#ifdef hz_BATCHED", as_lanes(emitted.momentum), "#endif", as_lanes(shown(runtime("velocities.h")))]
-    parts += [*extras_source(entries, lambda x: shown(runtime(x))), "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+    parts += [*_extras_source(entries, shown), "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), entries["dtype"]))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     last = {
@@ -226,6 +225,31 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
 def runtime(file: str) -> str:
     """The text of a file of the C runtime, which is package data."""
     return resources.files("herglotz.export").joinpath("runtime", file).read_text(encoding="utf-8")
+
+
+def _check_extras(extras: object, dof: int) -> None:
+    """Refuse unknown extras, and a filter of more than `MAX_DERIVATIVES` coordinates."""
+    unknown = [x for x in extras if x not in EXTRAS] if isinstance(extras, list | tuple) else [extras]
+    if unknown:
+        raise InputError(f"extras may be {', '.join(EXTRAS)}, got {unknown[0]!r}; name them as a list")
+    if "filter" in extras and dof > MAX_DERIVATIVES:  # pyright: ignore[reportOperatorIssue]
+        raise InputError(
+            f"a filter in C needs the derivative of a step, up to {MAX_DERIVATIVES} coordinates; this has {dof}"
+        )
+
+
+def _extras_source(entries: Mapping[str, Any], shown: Callable[[str], str]) -> list[str]:
+    """The texts of the extras that a header's metadata names, as `shown` changes files of the runtime."""
+    found = []
+    for name in entries.get("extras", ()):
+        found += [shown(runtime(f"{x}.h")) for x in FILES[name]]
+        if name == "filter" and (noise := entries.get("noise")):
+            rows = [noise["position"], noise["momentum"]]
+            rows += [noise["theta"]] if entries.get("parameters") else []
+            values = ", ".join(f"{{{numbers(row, entries['dtype'])}}}" for row in rows)
+            values += f", {number(noise['adaptation'], entries['dtype'])}"
+            found += [f"/* The noise of the fit. */\nstatic const hz_noise hz_noise_of_fit = {{{values}}};\n"]
+    return found
 
 
 def read_metadata(text: str, path: PathLike) -> dict[str, Any]:

@@ -19,12 +19,7 @@ OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
 class LinearisedStepper:
     """A stepper whose `step` gives autograd the derivative of `linearise` (`ExportedStepper.linearise`).
 
-    For verification only.
-
-    Parameters
-    ----------
-    stepper
-        Anything with `step(state, h) -> Step` and `linearise(state, h) -> Linearised`.
+    For verification only. `stepper` has `step(state, h) -> Step` and `linearise(state, h) -> Linearised`.
     """
 
     def __init__(self, stepper: Any):
@@ -39,14 +34,8 @@ class DifferencedStepper:
     """A stepper whose `step` gives autograd a derivative by central differences, 8 (2n + 1) further steps.
 
     For verification only. The relative error is about 1e-12 in float64 where the map is smooth over 4 % of its
-    arguments, and about 1e-4 in float32.
-
-    Parameters
-    ----------
-    stepper
-        Anything with `step(state, h) -> Step`.
-    sticks
-        Whether dry friction can hold a coordinate: see `central_differences`.
+    arguments, and about 1e-4 in float32. `stepper` has `step(state, h) -> Step`; `sticks` says whether dry friction can
+    hold a coordinate (`central_differences`).
     """
 
     def __init__(self, stepper: Any, sticks: bool = False):

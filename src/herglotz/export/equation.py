@@ -21,12 +21,11 @@ from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.numbers import WithNumbers
 from herglotz.stepping import State
-from herglotz.stepping.equation import StepOfModel, model_equation
-from herglotz.stepping.field import Field, FieldOf
+from herglotz.stepping.equation import End, PartialsEquation, StepOfModel, model_equation
+from herglotz.stepping.explicit import Field, FieldOf
 from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian, step_pull
-from herglotz.stepping.partials_equation import End, PartialsEquation
+from herglotz.stepping.newton import StickSlip
 from herglotz.stepping.single_step import driven_by
-from herglotz.stepping.stick_slip import StickSlip
 from herglotz.stepping.velocity import legendre
 
 
@@ -59,7 +58,7 @@ class Terms:
 def step_equation(model: ContactLagrangian, bounds: int, *x: Tensor) -> tuple[Tensor, ...]:
     """A Newton step from a trial Δ and the end of the step there: −J⁻¹F, |J⁻¹cp0|, |F|, p1, L, c, J.
 
-    Where the arguments end with K and w/K (`bounds` is 2), Δ is the z of `herglotz.stepping.stick_slip`.
+    Where the arguments end with K and w/K (`bounds` is 2), Δ is the z of `herglotz.stepping.newton`.
     """
     (q, p, s, h, delta), more, sticking = x[:5], x[5 : len(x) - bounds], x[len(x) - bounds :]
     form = terms = Terms(model, State(q, p, s), h, more)

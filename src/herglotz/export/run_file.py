@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from herglotz.errors import InputError, refuse
-from herglotz.export.noise import noise_of
+from herglotz.export.filtering import noise_of
 from herglotz.export.parameters import Chosen, described_parameters
 from herglotz.formats import FORMATS, endings, of_ending
 from herglotz.training import Run
@@ -58,10 +58,8 @@ def export_run(
     unroll
         Newton's iterations of an ONNX file of a single step without a loop, as in `export_onnx`.
 
-    Raises
-    ------
-    InputError
-        If the name has another end, the format cannot hold the model, or an argument is not one of this format.
+    Raise InputError if the name has another end, the format cannot hold the model, or an argument is not one of this
+    format.
     """
     path = Path(path)
     kind = kind or of_ending(path.suffix)

@@ -11,7 +11,7 @@ The carry is q, p, s; then V and V′ at q where the model's terms are known; th
 continues them; then, in float32, the rounding errors of q and s (Kahan's sum; without it a digit is lost every ten
 steps). Vectors are (B, n), scalars of a sample (B,). Newton's unknown is Δ = q1 − q0, because the difference q1 − q0
 would lose the digits of a small step; where dry friction can hold a coordinate, the unknown is the z of
-`herglotz.stepping.stick_slip`.
+`herglotz.stepping.newton`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ from herglotz.export.equation import Terms, dense, example, inverse, length, ste
 from herglotz.export.metadata import TOLERANCE
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Status
-from herglotz.stepping.explicit import Leapfrog
-from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.partials_equation import PartialsEquation
-from herglotz.stepping.stick_slip import at_rest
+from herglotz.stepping.equation import PartialsEquation
+from herglotz.stepping.explicit import Field, FieldOf, Leapfrog
+from herglotz.stepping.newton import at_rest
 
 # The guess of Δ/h extrapolates the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear,
 # affine and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six. Where step sizes differ
@@ -152,7 +151,7 @@ def begin(h: Tensor, trail: Tensor) -> Values:
 
 
 def begin_sticking(model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
-    """Newton's first carry in z, K and w/K: `herglotz.stepping.stick_slip`."""
+    """Newton's first carry in z, K and w/K: `herglotz.stepping.newton`."""
     equation = Terms(model, State(q, p, s), h, u).equation
     assert isinstance(equation, PartialsEquation)
     z, *bounds = at_rest(equation)

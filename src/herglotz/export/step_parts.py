@@ -15,17 +15,13 @@ from herglotz.export.equation import Equations, example, field_like
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian, OwnLagrangian
-from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.jet import Jet
-from herglotz.models.mass import PositionKinetic
-from herglotz.models.terms import Potential
+from herglotz.models.terms import FeatureKinetic, PositionKinetic, Potential
 from herglotz.stepping import State
-from herglotz.stepping.equation import model_equation
-from herglotz.stepping.explicit import Leapfrog
-from herglotz.stepping.field import Field
-from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.equation import PartialsEquation, model_equation
+from herglotz.stepping.explicit import Field, Leapfrog
+from herglotz.stepping.newton import StickSlip, at_rest
 from herglotz.stepping.single_step import driven_by
-from herglotz.stepping.stick_slip import StickSlip, at_rest
 
 # The potential at q0 and q1.
 Ends = tuple[Field, Field]
@@ -88,7 +84,7 @@ class StepParts:
 
         The arguments are q, p (B, n), s, h (B,), V0 (B,) and V′ (B, n) at q0, a trial Δ = q1 − q0 and the exact Δ near
         the trial (B, n), V1 and V′ at q1, and u (B, m) where the model takes inputs. Where dry friction can hold a
-        coordinate, Δ stands for the z of `herglotz.stepping.stick_slip`, and w/K is a last result.
+        coordinate, Δ stands for the z of `herglotz.stepping.newton`, and w/K is a last result.
         """
         (q, p, s, h, V0, slope0, delta, x, V1, slope1), u = arguments[:10], arguments[10:]
         ends = Field(V0, slope0), Field(V1, slope1)

@@ -6,6 +6,7 @@ from herglotz.mechanics.contact import (
     flow_derivative as flow_derivative,
 )
 from herglotz.mechanics.legendre import (
+    Regularity as Regularity,
     herglotz_residual as herglotz_residual,
     legendre_minus as legendre_minus,
     legendre_plus as legendre_plus,
@@ -14,6 +15,8 @@ from herglotz.mechanics.legendre import (
     momentum_minus as momentum_minus,
     momentum_plus as momentum_plus,
     momentum_residual as momentum_residual,
+    regularity as regularity,
+    step_derivative as step_derivative,
 )
 from herglotz.mechanics.partials import (
     ClosedForm as ClosedForm,
@@ -25,5 +28,3 @@ from herglotz.mechanics.partials import (
     autograd_partials as autograd_partials,
     partials as partials,
 )
-from herglotz.mechanics.regularity import Regularity as Regularity, regularity as regularity
-from herglotz.mechanics.tangent import step_derivative as step_derivative

@@ -14,11 +14,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.jet import Jet, of_mean, pairs
-from herglotz.models.phase import Phase
-from herglotz.models.terms import Kinetic
+from herglotz.models.terms import FeatureKinetic, Kinetic, Phase
 
 
 class Slope:

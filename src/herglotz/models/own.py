@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from herglotz.errors import InputError
 from herglotz.mechanics import ClosedForm, DiscreteLagrangian, Driven, Forced, Partials
-from herglotz.mechanics.functional import functional_partials
+from herglotz.mechanics.partials import functional_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.driven import DrivenLagrangian
 
@@ -67,10 +67,7 @@ class OwnLagrangian(nn.Module):
     angles, scale, speed
         (n,) which coordinates are angles in rad, and typical sizes of q and q̇, in the data's units.
 
-    Raises
-    ------
-    InputError
-        If L_d is no function, or lacks `at(u)`.
+    Raise InputError if L_d is no function, or lacks `at(u)`.
     """
 
     friction = damping = kinetic = correction = None

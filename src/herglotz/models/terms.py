@@ -8,16 +8,66 @@ every g(q, v), and exact for linear drag up to a constant factor on K.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
+
 import torch
 from torch import Tensor, nn
 
 from herglotz.models.config import ModelConfig
-from herglotz.models.feature_potential import named_potential
-from herglotz.models.jet import Jet, coordinates, pairs
-from herglotz.models.network import Network, feature_count, position_features
-from herglotz.models.phase import Phase
+from herglotz.models.feature_potential import Combination, named_potential, sorted_features
+from herglotz.models.features import Feature
+from herglotz.models.jet import Jet, concatenate, coordinates, of_mean_and_velocity, pairs
+from herglotz.models.network import Network, feature_count, midpoint_velocity_jets, position_features
 from herglotz.models.term import Term
 from herglotz.models.translations import blind, projection
+
+
+@dataclass(eq=False)
+class Phase:
+    """q̄ = (q0 + q1)/2, v = Δ/h and their features as jets over (q0, q1), each computed at its first use.
+
+    `order` is that of the jets, 0, 1 or 2; `sizes` has the angles, scale and speed of the coordinates.
+    """
+
+    q0: Tensor  # (..., n)
+    q1: Tensor  # (..., n)
+    h: Tensor  # (...)
+    order: int
+    sizes: ModelConfig
+    delta: Tensor | None = None  # (..., n) q1 − q0 without the rounding of the subtraction
+
+    @property
+    def move(self) -> Tensor:
+        """Δ = q1 − q0, (..., n)."""
+        return self.q1 - self.q0 if self.delta is None else self.delta
+
+    @property
+    def mean(self) -> Jet:
+        """q̄, vector-valued (..., n)."""
+        return self._pair[0]
+
+    @property
+    def velocity(self) -> Jet:
+        """v, vector-valued (..., n)."""
+        return self._pair[1]
+
+    @cached_property
+    def position(self) -> Jet:
+        """Features of q̄: (sin, cos) of an angle, q̄ / scale of another coordinate."""
+        return position_features(self.mean, self.sizes.angles, self.sizes.scale)
+
+    @cached_property
+    def features(self) -> Jet:
+        """Features of q̄, then v / speed."""
+        v = self.velocity
+        v = Jet(v.data / v.data.new_tensor(self.sizes.speed), v.tangents, v.order)
+        return concatenate([self.position, v])
+
+    @cached_property
+    def _pair(self) -> tuple[Jet, Jet]:
+        return midpoint_velocity_jets(self.q0, self.q1, self.h, self.order, self.delta)
 
 
 class Kinetic(nn.Module):
@@ -217,3 +267,175 @@ def _of_position_and_velocity(
     network = Network([inputs, *[width] * depth], gain, generator, zero=zero, activation=config.activation)
     network.projection = blind(config, config.dof)
     return network
+
+
+# A diagonal factor of the mass stays within e^±2 of its value at q = 0.
+MAX_LOG_FACTOR = 2.0
+
+
+class PositionKinetic(nn.Module):
+    """K = h |Tᵀ C̄ᵀ v|² / 2, so m(q̄) = C̄ T(q̄) T(q̄)ᵀ C̄ᵀ is symmetric and positive definite for every weight.
+
+    C̄ is the constant Cholesky factor of `Kinetic`. The lower triangular matrix T(q̄) comes from one zero-initialised
+    network r of the position's features: T_ii = exp(2 tanh(r_ii / 2)), within e^±2 of 1, and T_ij = r_ij below the
+    diagonal. The network's value at q = 0 is subtracted, so T(0) = I and C̄C̄ᵀ is the mass at q = 0, where C̄₁₁ = 1 fixes
+    the scale of L_d that positions do not determine (gauge).
+    """
+
+    def __init__(self, config: ModelConfig, generator: torch.Generator):
+        super().__init__()
+        n = config.dof
+        self.angles, self.scale = config.angles, config.scale
+        self.constant = Kinetic(n)
+        sizes = [feature_count(config.angles), *[config.mass_width] * config.mass_depth]
+        self.network = Network(sizes, 0.3, generator, outputs=n * (n + 1) // 2, activation=config.activation)
+        row, column = torch.tril_indices(n, n, -1)
+        place = torch.zeros(n, len(row), dtype=torch.float64)
+        place[column, torch.arange(len(row))] = 1.0
+        origin = torch.cat([torch.tensor([0.0, 1.0] if a else [0.0], dtype=torch.float64) for a in config.angles])
+        for name, value in (("row", row), ("place", place), ("origin", origin)):
+            self.register_buffer(name, value, persistent=False)
+        self.row: Tensor  # (pairs) row of each entry below the diagonal
+        self.place: Tensor  # (n, pairs) has 1 at the column of each entry
+        self.origin: Tensor  # (m) features of q = 0
+
+    def mass(self, q: Tensor) -> Tensor:
+        """Return m(q), (..., n, n), in units of the first coordinate's mass at q = 0; q is (..., n)."""
+        n = q.shape[-1]
+        diagonal, below = self._factors(position_features(Jet(q[None], 0, 1), self.angles, self.scale))
+        spread = torch.nn.functional.one_hot(self.row, n).to(q.dtype)  # (pairs, n)
+        T = torch.diag_embed(diagonal.value) + torch.einsum("...p,pi,jp->...ij", below.value, spread, self.place)
+        C = self.constant.factor() @ T
+        return C @ C.mT
+
+    def forward(self, phase: Phase) -> Jet:
+        """Return K as a jet over (q0, q1)."""
+        diagonal, below = self._factors(phase.position)
+        # w = C̄ᵀ v, and then Tᵀ w.
+        w = phase.velocity.linear(self.constant.factor().T)
+        Tw = diagonal * w
+        # Exported files take no tensor without entries.
+        if len(self.row):
+            Tw = Tw + (below * w.select(self.row)).linear(self.place)
+        return (Tw * Tw).sum() * (phase.h / 2)
+
+    def _factors(self, x: Jet) -> tuple[Jet, Jet]:
+        """Return the diagonal (..., n) of T and the entries below it (..., n(n−1)/2)."""
+        n = self.constant.dof
+        at_zero = self.network(Jet(self.origin[None], 0, 1)).value
+        r = self.network(x) - at_zero
+        log_diagonal = (r.select(slice(0, n)) / MAX_LOG_FACTOR).tanh() * MAX_LOG_FACTOR
+        return log_diagonal.exp(), r.select(slice(n, None))
+
+
+class FeatureKinetic(nn.Module):
+    """K = K of `base` + h Σ_g θ_g f_g(w·q̄) ∏v: couplings of speeds, magnetic terms.
+
+    A fit makes the mass positive definite where there are data, not elsewhere.
+    """
+
+    def __init__(
+        self, base: Kinetic | PositionKinetic, features: Sequence[Feature], known: Sequence[Feature], dof: int
+    ):
+        super().__init__()
+        self.base = base
+        self.sum = Combination(features, known, dof)
+        velocities = [tuple(sorted(p.velocities)) for p in self.sum.products]
+        self.monomials = list(dict.fromkeys(velocities))
+        # The row of a product has 1 at its monomial of velocities.
+        of = [[float(own == monomial) for monomial in self.monomials] for own in velocities]
+        self.register_buffer("of", torch.tensor(of, dtype=torch.float64), persistent=False)
+        self.of: Tensor  # (A, monomials)
+
+    def forward(self, phase: Phase) -> Jet:
+        """Return K as a jet over (q0, q1)."""
+        K, v = self.base(phase), coordinates(phase.velocity.value, phase.order)
+        return K + self._summed(phase, {0: self._each([_times(v, of) for of in self.monomials])}) * phase.h
+
+    def mass(self, q: Tensor) -> Tensor:
+        """Return the features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
+        c, n = self.sum, self.sum.dof
+        f = (c.value(q, c.ridge(c.forms(q), 0)) * c.weights()) @ self.of
+        out = q.new_zeros(*q.shape, n)
+        for k, velocities in enumerate(self.monomials):
+            if len(velocities) == 2:
+                i, j = velocities
+                unit = torch.zeros(n, n, dtype=q.dtype, device=q.device)
+                unit[i, j] += 1.0
+                unit[j, i] += 1.0
+                out = out + f[..., k, None, None] * unit
+        return out
+
+    def straight(self, phase: Phase, rate: Tensor) -> Jet:
+        """Return K_qq[v, v] + 2γ K_q v + γ² K of the features, the change of K along the straight line."""
+        v = coordinates(phase.velocity.value, phase.order)
+        P, w = self._each([_times(v, of) for of in self.monomials]), v.linear(self.sum.form)
+        Pw = P * w
+        return self._summed(phase, {0: P * (rate * rate), 1: Pw * (2 * rate), 2: Pw * w})
+
+    def along(self, phase: Phase, b: Tensor, y: Tensor, rate: Tensor) -> Jet:
+        """Return bᵀ(K_q − K_qv v − γ K_v − K_vv y) of the features, b and y (..., n) constant; up to two velocities."""
+        v, form = coordinates(phase.velocity.value, phase.order), self.sum.form
+        P = self._each([_times(v, of) for of in self.monomials])
+        by_b = self._each([_derivative(v, of, b) for of in self.monomials])
+        twice = torch.stack([_second(of, b, y) for of in self.monomials], -1) @ self.of.T
+        return self._summed(phase, {1: P * (b @ form.T) - by_b * v.linear(form), 0: by_b * -rate - twice})
+
+    def _each(self, monomials: list[Jet]) -> Jet:
+        """Return the scalar jet of each product's monomial, as a jet (..., A)."""
+        first = monomials[0]
+        return Jet(torch.stack([m.data for m in monomials], -1) @ self.of.T, first.tangents, first.order)
+
+    def _summed(self, phase: Phase, by_order: dict[int, Jet]) -> Jet:
+        """Return Σ_g θ_g Σ_k f_g⁽ᵏ⁾(w_g·q̄) R_k,g(v) over (q0, q1), for jets R_k over v, (..., A), by k.
+
+        Each f is a function of one number, so its derivatives are f′ w and f″ w wᵀ and no jets are multiplied.
+        """
+        c, order, q = self.sum, phase.order, phase.mean.value
+        weights, x = c.weights(), c.forms(q)
+        f = [c.ridge(x, k) * weights for k in range(max(by_order) + order + 1)]
+        # The sums over k of the j-th derivatives of f times a part of R.
+        total = lambda j, part: reduce(torch.add, [f[k + j] * part(R) for k, R in by_order.items()])  # noqa: E731
+        values = [total(j, lambda R: R.value) for j in range(order + 1)]
+        value = c.value(q, values[0]).sum(-1)
+        if not order:
+            return Jet(value[None], 0, 0)
+        slopes = [total(j, lambda R: R.gradient) for j in range(order)]
+        by_q, by_v = c.slope(q, *values[:2]), c.value(q, slopes[0]).sum(-1)
+        second = None
+        if order == 2:
+            by_qq, by_vq = c.bend(q, *values).movedim(-1, 0), c.slope(q, *slopes).movedim(-1, 1)
+            second = by_qq, by_vq, c.value(q, total(0, lambda R: R.second)).sum(-1)
+        return of_mean_and_velocity(value, by_q.movedim(-1, 0), by_v, second, phase.h)
+
+
+def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | PositionKinetic | FeatureKinetic:
+    """Return the K of a model: a constant or position-dependent mass, and the named features with velocities."""
+    n = config.dof
+    mass = PositionKinetic(config, generator) if config.mass_width else Kinetic(n, config.alike, config.diagonal)
+    learned, known = (sorted_features(names, config.angles)[1] for names in (config.features, config.known))
+    return FeatureKinetic(mass, learned, known, n) if learned or known else mass
+
+
+def _times(v: Jet, velocities: tuple[int, ...]) -> Jet:
+    """Return the product ∏v."""
+    product = v.select(velocities[0])
+    for i in velocities[1:]:
+        product = product * v.select(i)
+    return product
+
+
+def _derivative(v: Jet, velocities: tuple[int, ...], b: Tensor) -> Jet:
+    """Return the derivative of ∏v along b, for at most two velocities."""
+    if len(velocities) == 1:
+        return v.select(0) * 0.0 + b[..., velocities[0]]
+    i, j = velocities
+    return v.select(i) * b[..., j] + v.select(j) * b[..., i]
+
+
+def _second(velocities: tuple[int, ...], b: Tensor, y: Tensor) -> Tensor:
+    """Return the second derivative of ∏v along b and y, for at most two velocities."""
+    if len(velocities) == 1:
+        return torch.zeros_like(b[..., 0])
+    i, j = velocities
+    return b[..., i] * y[..., j] + b[..., j] * y[..., i]

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.models.feature_grammar import parse
-from herglotz.models.features import expand
+from herglotz.models.features import expand, parse
 
 # Rounding of the pseudo-inverse, for numbers of size 1.
 ROUNDING = 1e-9

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 from herglotz.data.files import PathLike
 from herglotz.plots.animation import save_animation as save_animation
-from herglotz.plots.bands import plot_bands as plot_bands
-from herglotz.plots.learned import plot_learned as plot_learned
+from herglotz.plots.learned import plot_bands as plot_bands, plot_learned as plot_learned
 from herglotz.plots.motion import plot_data as plot_data, plot_trajectory as plot_trajectory
 from herglotz.plots.phase import plot_phase_portrait as plot_phase_portrait
-from herglotz.plots.plan import plot_plan as plot_plan
-from herglotz.plots.selection import plot_selection as plot_selection
-from herglotz.plots.sizes import plot_sizes as plot_sizes
 from herglotz.plots.style import save_all, save_figure as save_figure
-from herglotz.plots.training import plot_training as plot_training
+from herglotz.plots.training import (
+    plot_plan as plot_plan,
+    plot_selection as plot_selection,
+    plot_sizes as plot_sizes,
+    plot_training as plot_training,
+)
 
 if TYPE_CHECKING:
     from herglotz.plots.theory import (

@@ -1,19 +1,34 @@
-"""The learned functions of a model: potential, force, friction, damping and mass along each coordinate."""
+"""What was learned: functions of the model along each coordinate, and the bands of its posterior."""
 
 from __future__ import annotations
 
 from itertools import product
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from herglotz.plots.motion import momentum_unit
-from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, position_axis, styled, with_unit
+from herglotz.data.units import as_recorded
+from herglotz.plots.motion import momentum_unit, trained_mask
+from herglotz.plots.style import (
+    MODEL,
+    MUTED,
+    SERIES,
+    SHADE,
+    SUPPORT,
+    UNSEEN,
+    captions,
+    new_figure,
+    position_axis,
+    styled,
+    with_unit,
+)
 from herglotz.training.learned_functions import LearnedFunction, learned_functions
 
 if TYPE_CHECKING:
-    from herglotz.training import Laplace, Run
+    from herglotz.training import Bands, Laplace, Run
+
 
 MAX_COLUMNS, POINTS = 3, 161
 # Functions are drawn beyond the data, on both sides by this part of the data's range.
@@ -27,14 +42,8 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     The functions are V(q_i), the force −∂V/∂q_i, friction over the velocity, and, if they depend on position, damping
     and the entries m_jk of the mass (`herglotz.training.learned_functions`). The mean of the first mass over the data
     is 1, so that forces are accelerations of the first coordinate. The range of the data is shaded: the mean of V over
-    this range is 0, and beyond the range the model extrapolates.
-
-    Parameters
-    ----------
-    run
-        A fitted run.
-    posterior
-        If given, bands of two standard deviations about the posterior's mean are drawn over the range of the data.
+    this range is 0, and beyond the range the model extrapolates. With a `posterior`, bands of two standard deviations
+    about its mean are drawn over the range of the data.
     """
     functions = learned_functions(run if posterior is None else posterior, points=POINTS, beyond=BEYOND)
     columns = min(run.data.dof, MAX_COLUMNS)
@@ -89,3 +98,52 @@ def _draw(ax: Axes, f: LearnedFunction, color: str) -> None:
         ax.fill_between(x, mean - width, mean + width, color=color, alpha=0.25, lw=0, zorder=2)
     ax.plot(f.x, f.value, color=color, zorder=3)
     ax.set_xlim(float(f.x[0]), float(f.x[-1]))
+
+
+# More panels are too small to read.
+MAX_PANELS = 4
+
+
+def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
+    """Draw data − model against time, with the bands of the model's position and of a measured value.
+
+    At most four panels: the coordinates of the first trajectory, then those of the next. Panels of the same unit have
+    the same scale.
+    """
+    inside, held_out = bands.inside(run.data.unwrapped().q, level), ~trained_mask(run)
+    data, factor = as_recorded(run.data.unwrapped())
+    part, word = (held_out, "held-out ") if bool(held_out.any()) else (~held_out, "")
+    share = 100 * float(inside[part].double().mean())
+    title = f"{share:.0f} % of the {word}samples lie in the {100 * level:g} % band"
+    cells = [(b, i) for b in range(len(data)) for i in range(data.dof)][:MAX_PANELS]
+    width = NormalDist().inv_cdf(0.5 + level / 2)
+    with styled():
+        figure = new_figure(8.0, 1.2 + 1.9 * len(cells), title)
+        axes, reaches = figure.subplots(len(cells), 1, squeeze=False)[:, 0], []
+        for (b, i), ax in zip(cells, axes, strict=True):
+            by = float(factor[i])
+            rows = slice(data.offsets[b], data.offsets[b] + data.lengths[b])
+            t, residual = data.t[rows].cpu(), (data.q - bands.q * factor)[rows, i].cpu()
+            model = width * bands.std[rows, i].cpu() * by
+            measured = (model.square() + (width * float(bands.sigma[i]) * by) ** 2).sqrt()
+            trained = run.train_lengths[b]
+            if trained < len(t):
+                ax.axvspan(float(t[trained - 1] + t[trained]) / 2, float(t[-1]), color=SHADE, lw=0, zorder=0)
+            ax.fill_between(t, -measured, measured, color=MODEL, alpha=0.18, lw=0, zorder=1)
+            ax.fill_between(t, -model, model, color=MODEL, alpha=0.45, lw=0, zorder=2)
+            ax.axhline(0.0, color=MUTED, lw=0.8, zorder=3)
+            ax.plot(t[:trained], residual[:trained], ".", color=MODEL, ms=4, zorder=4)
+            ax.plot(t[trained:], residual[trained:], ".", color=UNSEEN, ms=4, zorder=4)
+            ax.set_xlim(float(t[0]), float(t[-1]))
+            reaches.append(float(max(residual.abs().max(), measured.max())))
+            if len(data) > 1:
+                ax.set_title(f"trajectory {b}")
+            ax.set_ylabel(with_unit(f"residual of {data.names[i]}", data.units[i]))
+        units = [data.units[i] for _, i in cells]
+        # Panels of the same unit have the same scale, so that a reader can compare them.
+        for ax, unit in zip(axes, units, strict=True):
+            largest = max(reach for reach, other in zip(reaches, units, strict=True) if other == unit)
+            ax.set_ylim(-1.5 * largest, 1.5 * largest)
+        captions(axes[0], [("● training", MODEL), ("● held out", UNSEEN), ("dark: model, light: measurement", MUTED)])
+        axes[-1].set_xlabel(with_unit("time", data.time_unit))
+    return figure

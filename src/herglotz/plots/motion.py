@@ -49,18 +49,9 @@ def plot_data(data: Trajectories) -> Figure:
 def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
     """Draw data, free run and residual against time; held-out time is shaded.
 
-    Parameters
-    ----------
-    run
-        A fitted run; the prediction is one rollout of each trajectory, which no later sample corrects.
-    trajectory
-        Number of the trajectory whose coordinates are drawn, at most four; None: up to four trajectories spread over
-        the data.
-
-    Raises
-    ------
-    InputError
-        If the data have no such trajectory.
+    The prediction is one rollout of each trajectory, which no later sample corrects. Up to four coordinates of the
+    `trajectory` of this number are drawn; None: up to four trajectories spread over the data. Raise InputError if the
+    data have no such trajectory.
     """
     if trajectory is not None and not 0 <= trajectory < len(run.data):
         raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(run.data) - 1}")

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from herglotz.data.units import size
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled
 from herglotz.scenes import scene
-from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
+from herglotz.scenes.parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State, Stepper
 from herglotz.theory import generating_functions, hamilton_jacobi_residual
 

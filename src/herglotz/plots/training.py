@@ -1,21 +1,27 @@
-"""The cost of every iteration of a fit, one panel a stage."""
+"""How a run was fitted: the cost of every iteration, the plan with its reasons, and the models that were compared."""
 
 from __future__ import annotations
 
 import math
 from itertools import groupby
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
+from herglotz.data.units import common_unit
 from herglotz.errors import InputError
-from herglotz.plots.style import MODEL, MUTED, logarithmic, new_figure, styled
+from herglotz.plots.style import INK, MODEL, MUTED, SUPPORT, UNSEEN, label, logarithmic, new_figure, styled, with_unit
+from herglotz.training.plan import Plan
 
 if TYPE_CHECKING:
     from herglotz.training import Run
+    from herglotz.training.selection import Selection
+
 
 # Name of a stage, and the cost of every iteration.
 Stage = tuple[str, list[float]]
@@ -82,3 +88,101 @@ def _title(stages: list[Stage], shown: int) -> str:
 
 def _short(name: str) -> str:
     return name if len(name) <= 28 else name[:27] + "…"
+
+
+# Width of the figure, height of a line of text, and distance of two boxes. [inches]
+WIDTH, LINE, GAP = 7.4, 0.16, 0.14
+# Characters in a line of a decision and of a reason.
+DECISION, REASON = 26, 62
+
+
+def plot_plan(run: Run) -> Figure:
+    """Draw a box for the decisions of each reason, the reason beside the box, and arrows between the boxes.
+
+    Raise InputError if the run holds no plan.
+    """
+    if "plan" not in run.metrics:
+        raise InputError("the run holds no plan; fit it again to get one")
+    plan = Plan.from_dict(run.metrics["plan"])
+    rows = [
+        ("\n".join(fill(words, DECISION) for words in decisions), fill(reason, REASON))
+        for decisions, reason in plan.by_reason(common_unit(run.data.units))
+        if reason
+    ]
+    heights = [LINE * max(left.count("\n") + 1, right.count("\n") + 1) + 0.1 for left, right in rows]
+    total = sum(heights) + GAP * (len(rows) + 1)
+    with styled():
+        figure = new_figure(WIDTH, total + 0.45, f"What was decided for {run.data.source or 'the data'}, and why")
+        ax = figure.subplots()
+        ax.set(xlim=(0, WIDTH), ylim=(-total, 0))
+        ax.set_axis_off()
+        top = -GAP
+        for k, ((left, right), height) in enumerate(zip(rows, heights, strict=True)):
+            box = FancyBboxPatch((0.1, top - height), 2.6, height, "round,pad=0.02", fc=SUPPORT, ec=MODEL, lw=0.8)
+            ax.add_patch(box)
+            ax.text(1.4, top - height / 2, left, ha="center", va="center", color=INK, fontsize=8.5)
+            ax.text(2.95, top - height / 2, right, ha="left", va="center", color="#555555", fontsize=8.5)
+            if k + 1 < len(rows):
+                arrow = {"arrowstyle": "-|>", "color": MUTED, "lw": 0.8}
+                ax.annotate("", (1.4, top - height - GAP), (1.4, top - height), arrowprops=arrow)
+            top -= height + GAP
+    return figure
+
+
+def plot_sizes(run: Run) -> Figure:
+    """Draw the held-out error over the longest segments against the number of parameters, a point a model.
+
+    The line joins the best models of each size, and the model that was taken is in colour. Raise InputError if the
+    run has no search for terms.
+    """
+    compared = run.metrics.get("compared")
+    if not compared:
+        raise InputError("the run has no search for terms whose models could be drawn; fit without naming terms")
+    numbers, errors = (np.array([row[name] for row in compared]) for name in ("numbers", "held_out"))
+    taken = next(row for row in compared if row["taken"])
+    sizes = np.unique(numbers)
+    best = [errors[numbers == size].min() for size in sizes]
+    with styled():
+        title = f"Held-out time asks for {taken['numbers']} numbers; {len(compared)} models were compared"
+        figure = new_figure(7.2, 4.2, title)
+        ax = figure.subplots()
+        ax.plot(numbers, errors, "o", color=MUTED, alpha=0.5, ms=5)
+        ax.plot(sizes, best, color=MODEL)
+        ax.plot(taken["numbers"], taken["held_out"], "o", color=UNSEEN, ms=9)
+        label(ax, taken["numbers"], taken["held_out"], "taken", UNSEEN, ha="center", xytext=(0, -16))
+        if min(errors) > 0 and max(errors) > 3 * min(errors):
+            logarithmic(ax)
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.margins(0.08, 0.15)
+        unit = common_unit(run.data.units) if run.data.dof == 1 else ""
+        ax.set(xlabel="numbers of the model", ylabel=with_unit("RMS error over held-out blocks", unit))
+        ax.grid(axis="y", color="#EEEEEE", lw=0.8)
+    return figure
+
+
+def plot_selection(selection: Selection) -> Figure:
+    """Draw one column a level: the held-out RMS of every seed, and the median; the chosen level in colour."""
+    candidates = selection.candidates
+    finite = [x for c in candidates for x in c.of_seeds.tolist() if math.isfinite(x)]
+    ceiling = 3 * max(finite)
+    with styled():
+        figure = new_figure(7.2, 4.2, f"The {selection.chosen.level} level is the simplest that is not beaten")
+        ax = figure.subplots()
+        for k, c in enumerate(candidates):
+            color = UNSEEN if c is selection.chosen else MODEL
+            values = [min(x, ceiling) for x in c.of_seeds.tolist()]
+            failed = [x >= ceiling for x in values]
+            ax.plot([k] * len(values), values, "o", color=color, alpha=0.45, ms=6)
+            ax.plot([k - 0.22, k + 0.22], [min(c.error, ceiling)] * 2, color=color, lw=2.4)
+            text = f"{c.error:.3g}" if math.isfinite(c.error) else "failed"
+            label(ax, k + 0.22, min(c.error, ceiling), text, color, va="center", xytext=(5, 0))
+            if any(failed) and math.isfinite(c.error):
+                label(ax, k, ceiling, f"{sum(failed)} failed", MUTED, ha="center", xytext=(0, 6))
+        logarithmic(ax)
+        # The axis spans at least a decade, so that differences of a few per cent look small.
+        ax.set_ylim(min(finite) / 3, 1.5 * ceiling)
+        names = [f"{c.level}\n{c.parameters} parameters\n{c.step_us:.0f} µs a step" for c in candidates]
+        ax.set_xticks(range(len(names)), names)
+        ax.set(xlim=(-0.6, len(names) - 0.3), ylabel=with_unit("held-out RMS", common_unit(selection.run.data.units)))
+        ax.grid(axis="y", color="#EEEEEE", lw=0.8)
+    return figure

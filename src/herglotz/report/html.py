@@ -1,14 +1,70 @@
-"""A document as Markdown, and as one HTML file that contains its styles, pictures and script."""
+"""A document of text, tables, code and pictures, as Markdown and as one HTML file with styles, pictures and script."""
 
 from __future__ import annotations
 
 import base64
 import json
+from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
+from typing import Any
+
+from matplotlib.figure import Figure
 
 from herglotz.plots.style import image
-from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a header."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Code:
+    """Lines of code for the reader to copy."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure with a sentence that explains the figure."""
+
+    figure: Figure
+    caption: str
+
+
+@dataclass(frozen=True)
+class Slider:
+    """An interactive motion: times, data and model of a coordinate, and the last training sample."""
+
+    values: dict[str, Any]
+    caption: str
+
+
+Block = str | Table | Code | Picture | Slider
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and its blocks."""
+
+    title: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole report, which begins with a sentence of `herglotz.training.verdict` and its meaning for the reader."""
+
+    title: str
+    verdict: str
+    meaning: str
+    sections: tuple[Section, ...] = field(default_factory=tuple)
+
 
 COLOURS = {"fits to the noise": "#1b7f4d", "fits, worse": "#b26a00", "does not fit": "#b3261e"}
 # A table cell with up to this many characters, a number with its sign, stays on one line on a narrow screen.

@@ -18,8 +18,7 @@ from herglotz.models import refuse_own
 from herglotz.plots import plot_bands, plot_learned, plot_sizes, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
 from herglotz.progress import ProgressBar
-from herglotz.report.html import as_html, as_markdown
-from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
+from herglotz.report.html import Block, Code, Document, Picture, Section, Slider, Table, as_html, as_markdown
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
 from herglotz.training.evaluate import unseen_errors

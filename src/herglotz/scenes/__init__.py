@@ -9,20 +9,23 @@ from herglotz.scenes.exact import (
     Reason as Reason,
     exact_discrete_lagrangian as exact_discrete_lagrangian,
 )
-from herglotz.scenes.forced_oscillator import ExactForcedOscillator as ExactForcedOscillator
 from herglotz.scenes.kepler import kepler as kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag as ExactLinearDrag, linear_drag as linear_drag
-from herglotz.scenes.motion import herglotz_motion as herglotz_motion
 from herglotz.scenes.nonlinear_action import nonlinear_action as nonlinear_action
-from herglotz.scenes.oscillator import ExactOscillator as ExactOscillator, damped_oscillator as damped_oscillator
+from herglotz.scenes.oscillator import (
+    ExactForcedOscillator as ExactForcedOscillator,
+    ExactOscillator as ExactOscillator,
+    damped_oscillator as damped_oscillator,
+)
 from herglotz.scenes.parachute import (
     ExactParachute as ExactParachute,
+    PrintedParachute as PrintedParachute,
     parachute as parachute,
     quadratic_drag as quadratic_drag,
 )
 from herglotz.scenes.pendulum import damped_pendulum as damped_pendulum, driven_pendulum as driven_pendulum
-from herglotz.scenes.printed_parachute import PrintedParachute as PrintedParachute
 from herglotz.scenes.reference import (
+    herglotz_motion as herglotz_motion,
     path_action as path_action,
     reference_flow as reference_flow,
     reference_solve as reference_solve,

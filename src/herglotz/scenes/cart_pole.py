@@ -25,10 +25,7 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
     gamma
         Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `docs/mathematics.md`).
 
-    Raises
-    ------
-    InputError
-        If a mass or the length is not positive.
+    Raise InputError if a mass or the length is not positive.
     """
     require_positive("cart_pole", cart=cart, m=m, length=length)
     first, third = cart + m, m * length * length

@@ -28,10 +28,7 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
     gamma
         Damping rate γ, 1/s, the same for every mass.
 
-    Raises
-    ------
-    InputError
-        If `masses` is not a whole number ≥ 1, m ≤ 0, k ≤ 0 or β < 0.
+    Raise InputError if `masses` is not a whole number ≥ 1, m ≤ 0, k ≤ 0 or β < 0.
 
     Source: E. Fermi, J. Pasta and S. Ulam, Studies of nonlinear problems, Los Alamos report LA-1940 (1955): their
     chain with cubic forces, here damped.

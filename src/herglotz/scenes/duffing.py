@@ -10,8 +10,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.driven import driven_scene
-from herglotz.scenes.natural import natural_scene
+from herglotz.scenes.natural import driven_scene, natural_scene
 from herglotz.scenes.scene import Scene, require_positive
 
 
@@ -37,10 +36,7 @@ def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
     gamma
         Damping rate γ, 1/s.
 
-    Raises
-    ------
-    InputError
-        If β ≤ 0: the potential would have no lower bound.
+    Raise InputError if β ≤ 0: the potential would have no lower bound.
     """
     if not beta > 0:
         raise InputError(f"duffing: cubic stiffness beta must be > 0, got {beta}; damped_oscillator is linear")
@@ -72,10 +68,7 @@ def driven_duffing(
     amplitude, frequency
         Force A, N, and its angular frequency ν, rad/s.
 
-    Raises
-    ------
-    InputError
-        If β ≤ 0.
+    Raise InputError if β ≤ 0.
     """
     require_positive("driven_duffing", cubic_stiffness_beta=beta)
 

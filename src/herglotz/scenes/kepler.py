@@ -23,10 +23,7 @@ def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
     gamma
         Damping rate γ, 1/s.
 
-    Raises
-    ------
-    InputError
-        If m ≤ 0.
+    Raise InputError if m ≤ 0.
     """
     require_positive("kepler", mass_m=m)
 

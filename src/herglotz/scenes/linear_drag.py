@@ -74,10 +74,7 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
     gamma
         Damping rate γ, 1/s, of either sign or 0.
 
-    Raises
-    ------
-    InputError
-        If m ≤ 0.
+    Raise InputError if m ≤ 0.
 
     Source: section 3 of `docs/mathematics.md`.
     """

@@ -3,23 +3,27 @@
 A scene may have an external force that no L(q, v, s) of a single action s describes, for example friction of one joint:
 ṗ = L_q + L_s p + f(q, v) (Lagrange–d'Alembert–Herglotz). The motion is then no contact flow and has no exact discrete
 Lagrangian; the rules are discrete Lagrangians with discrete forces.
+
+A scene with one coordinate and a given force has L = m v²/2 − V(q) + u q − γs. The force u is held over a step, as by
+the amplifier of a motor, so that a motion is a product of contact maps, each with its own Lagrangian L_d^k = L_d(·;
+u_k).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics import DiscreteLagrangian, Forced
 from herglotz.scenes.exact import exact_discrete_lagrangian
-from herglotz.scenes.motion import constant_rate, herglotz_motion
-from herglotz.scenes.reference import reference_flow
-from herglotz.scenes.rules import all_rules, strang
-from herglotz.scenes.scene import Scene, StateFunction
+from herglotz.scenes.reference import constant_rate, herglotz_motion, reference_flow
+from herglotz.scenes.rules import RULES, all_rules, strang
+from herglotz.scenes.scene import Scene, State, StateFunction
 from herglotz.scenes.special import as_step
 
 External = Callable[[Tensor, Tensor], Tensor]  # (q, v), (..., n) each → f, (..., n)
@@ -161,3 +165,108 @@ def natural_scene(
         rules={"strang": strang(potential, m, gamma)} if rules is None else rules,
         **fields,
     )
+
+
+@dataclass(frozen=True)
+class DrivenRule:
+    """L_d at the input `u0`; `at(u)` is L_d of a step with the input u, (..., 1).
+
+    Source: section 6 of `docs/mathematics.md`, time-dependent L_d.
+    """
+
+    rule: Callable[[Tensor | float], DiscreteLagrangian]
+    u0: float
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """Return L_d, shape (...)."""
+        return self.rule(self.u0)(q0, q1, s0, h)
+
+    def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+        """F⁻ and F⁺ of the rule, (..., n) each; None for a rule without forces."""
+        own = self.rule(self.u0)
+        return own.forces(q0, q1, s0, h) if isinstance(own, Forced) else None
+
+    def at(self, u: Tensor) -> DiscreteLagrangian:
+        """The discrete Lagrangian of a step whose input is u, (..., 1)."""
+        return self.rule(u[..., 0])
+
+
+def _rules(
+    system_at: Callable[[Tensor | float], Natural], amplitude: float, external: External | None
+) -> dict[str, DiscreteLagrangian]:
+    """The rules of the system at each input, with the external force."""
+
+    def forced(rule: DiscreteLagrangian) -> DiscreteLagrangian:
+        return rule if external is None else ForcedRule(rule, external)
+
+    def composed(u: Tensor | float) -> DiscreteLagrangian:
+        system = system_at(u)
+        return forced(strang(system.potential, system.m, system.gamma))
+
+    rules: dict[str, DiscreteLagrangian] = {
+        name: DrivenRule(lambda u, r=rule: forced(r(system_at(u).lagrangian)), amplitude)
+        for name, rule in RULES.items()
+    }
+    return rules | {"strang": DrivenRule(composed, amplitude)}
+
+
+def driven_scene(
+    potential: Callable[[Tensor], Tensor],
+    slope: Callable[[Tensor], Tensor],
+    gamma: float,
+    amplitude: float,
+    frequency: float,
+    *,
+    m: float = 1.0,
+    external: External | None = None,
+    flow: Callable[..., State] | None = None,
+    **fields: Any,
+) -> Scene:
+    """The scene of a potential, one damping rate and the force u(t) = A cos νt.
+
+    The scene's functions have the force at t = 0; `at(u)` is the scene at the force u, and `drive(t)` is u(t).
+
+    Parameters
+    ----------
+    potential, slope
+        V(q), (...), and V'(q), (..., 1).
+    gamma
+        Damping rate γ.
+    amplitude, frequency
+        A, and the angular frequency ν.
+    m
+        Mass.
+    external
+        f(q, v), a force besides that of the Lagrangian.
+    flow
+        (u, q, p, s, h) → (q1, p1, s1) if known; by default the reference flow.
+    fields
+        The other fields of `Scene`.
+    """
+
+    def potential_at(u: Tensor | float) -> Callable[[Tensor], Tensor]:
+        return lambda q: potential(q) - u * q[..., 0]
+
+    def system_at(u: Tensor | float) -> Natural:
+        return Natural(potential_at(u), gamma, m)
+
+    def drive(t: Tensor) -> Tensor:
+        return amplitude * torch.cos(frequency * t)[..., None]
+
+    rules = _rules(system_at, amplitude, external)
+
+    def scene_at(u: Tensor | float) -> Scene:
+        made = natural_scene(
+            potential_at(u),
+            lambda q: slope(q) - (u[..., None] if isinstance(u, Tensor) else u),
+            gamma,
+            m,
+            rules=rules,
+            at=lambda u: scene_at(u[..., 0]),
+            drive=drive,
+            external=external,
+            **fields,
+        )
+        return made if flow is None else replace(made, flow=partial(flow, u))
+
+    return scene_at(amplitude)

@@ -8,8 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.scenes.driven import driven_scene
-from herglotz.scenes.natural import natural_scene
+from herglotz.scenes.natural import driven_scene, natural_scene
 from herglotz.scenes.scene import Scene
 
 

@@ -83,10 +83,7 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
     gamma
         Damping rate γ, 1/s.
 
-    Raises
-    ------
-    InputError
-        If a moment is not positive, or larger than the sum of the others.
+    Raise InputError if a moment is not positive, or larger than the sum of the others.
 
     Source: V. I. Arnold, Mathematical Methods of Classical Mechanics, §29; here with the damping of Herglotz.
     """

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian
-from herglotz.mechanics.linear import solve
-from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.newton import find_root, solve
 from herglotz.mechanics.scalar_fields import Lagrangian
 from herglotz.scenes.special import as_step
 

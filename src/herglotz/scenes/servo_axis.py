@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.driven import driven_scene
+from herglotz.scenes.natural import driven_scene
 from herglotz.scenes.scene import Scene, State, Step, require_positive
 
 # L_d has no set-valued force: its dry friction is F_c tanh(v / this width), in m/s, a twentieth of the
@@ -50,10 +50,7 @@ def servo_axis(
     amplitude, frequency
         Force A of the motor, N, and its angular frequency ν, rad/s.
 
-    Raises
-    ------
-    InputError
-        If the mass is not positive or a friction is negative.
+    Raise InputError if the mass is not positive or a friction is negative.
     """
     require_positive("servo_axis", mass_m=m)
     for name, value in (("viscous", viscous), ("dry", dry)):

@@ -18,10 +18,7 @@ def van_der_pol(mu: float = 1.0) -> Scene:
     mu
         Strength μ > 0 of the damping, per unit of time; the cycle is a sine for small μ and jumps for large μ.
 
-    Raises
-    ------
-    InputError
-        If μ ≤ 0; without negative damping use the scene damped_oscillator.
+    Raise InputError if μ ≤ 0; without negative damping use the scene damped_oscillator.
 
     Source: B. van der Pol, On relaxation-oscillations, Phil. Mag. 2 (1926) 978.
     """

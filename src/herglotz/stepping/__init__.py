@@ -1,11 +1,11 @@
 """Time steppers: batched Newton, steps, rollouts."""
 
-from herglotz.mechanics.linear import solve as solve
+from herglotz.mechanics.newton import solve as solve
 from herglotz.stepping.events import Event as Event
 from herglotz.stepping.explain import explain_step as explain_step
 from herglotz.stepping.linearise import Linearised as Linearised
-from herglotz.stepping.method import OneStepMethod as OneStepMethod
 from herglotz.stepping.newton import Solution as Solution, solve_step as solve_step
+from herglotz.stepping.rollout import OneStepMethod as OneStepMethod
 from herglotz.stepping.state import (
     Crossings as Crossings,
     Rollout as Rollout,

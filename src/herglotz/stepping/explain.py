@@ -7,7 +7,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.mechanics.regularity import CONDITIONS, Regularity, regularity
+from herglotz.mechanics.legendre import CONDITIONS, Regularity, regularity
 from herglotz.stepping.newton import solve_step
 from herglotz.stepping.state import State, Status
 

@@ -23,8 +23,7 @@ from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian, join
 from herglotz.models import ContactLagrangian
 from herglotz.models.numbers import WithNumbers, chosen, values_of
-from herglotz.stepping.equation import model_equation
-from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.equation import PartialsEquation, model_equation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import State, Step
 

@@ -1,4 +1,4 @@
-"""Many steps: inputs, decimation, events, and memory that does not grow with the number of steps.
+"""Rollouts of any stepper: inputs, decimation, events, and memory that does not grow with the number of steps.
 
 A rollout is a chain of segments. A segment steps `Carry` to `Carry` and returns a block of kept entries. Without
 gradients a block is written into buffers made beforehand; with `checkpoint` a segment saves its start only, and the
@@ -8,9 +8,11 @@ backward pass runs the segment again.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import comb
 from typing import Any, NamedTuple
 
 import torch
@@ -19,9 +21,63 @@ from torch.utils.checkpoint import checkpoint as save_start_only
 
 from herglotz.errors import InputError
 from herglotz.progress import ProgressBar
-from herglotz.stepping.events import Watch
-from herglotz.stepping.guess import LENGTH, Extrapolation
-from herglotz.stepping.state import Crossings, Status, Step, StepError
+from herglotz.stepping.events import Event, Watch
+from herglotz.stepping.state import (
+    Crossings,
+    Rollout,
+    State,
+    Status,
+    Step,
+    StepError,
+    check_h,
+    check_state,
+    step_sizes,
+    throw_failure,
+)
+
+# Number of positions: six take a third fewer evaluations than four (a cubic) at small h, and no more at large h.
+LENGTH = 6
+# Weights of polynomials through 1 … LENGTH equally spaced positions: binomials with alternating signs.
+EQUAL = {n: tuple((-1.0) ** (n - 1 - i) * comb(n, i) for i in range(n)) for n in range(1, LENGTH + 1)}
+
+
+def extrapolation_weights(h: Tensor, count: int) -> Tensor:
+    """Lagrange weights (..., count) of `count` positions for the next position; h (..., count) are the steps."""
+    t = torch.cat([torch.zeros_like(h[..., :1]), h.cumsum(-1)], -1)
+    t, target = t[..., :-1] - t[..., -2:-1], h[..., -1]
+    weights = []
+    for i in range(count):
+        weight = torch.ones_like(target)
+        for j in range(count):
+            if j != i:
+                weight = weight * (target - t[..., j]) / (t[..., i] - t[..., j])
+        weights.append(weight)
+    return torch.stack(weights, -1)
+
+
+class Extrapolation:
+    """The guesses of a rollout; the weights of equal steps are constants, other weights are computed once."""
+
+    def __init__(self, h: Tensor):
+        # A scalar h, expanded.
+        self.equal = h.stride(-1) == 0 or h.shape[-1] == 1
+        self.h = h.detach()
+        self._weights: dict[int, Tensor] = {}
+
+    def __call__(self, trail: tuple[Tensor, ...], k: int) -> Tensor:
+        """The guess for the end of step k from the positions (..., n) that led to its start, at most `LENGTH`."""
+        count = len(trail)
+        if self.equal:
+            weights = EQUAL[count]
+            guess = weights[-1] * trail[-1]
+            for weight, q in zip(weights[:-1], trail, strict=False):
+                guess = torch.add(guess, q, alpha=weight)
+            return guess
+        if count not in self._weights:
+            self._weights[count] = extrapolation_weights(self.h.unfold(-1, count, 1), count)
+        weights = self._weights[count][..., k - count + 1, :]
+        return (torch.stack(trail, -1) * weights[..., None, :]).sum(-1)
+
 
 # Seconds of a rollout before a progress bar appears: a shorter wait needs none.
 PROGRESS_AFTER = 2.0
@@ -205,3 +261,110 @@ def _write(buffers: Block, block: Block, start: int) -> None:
     for buffer, values in zip(buffers, block, strict=True):
         offset = start + (start > 0 and len(buffer) > len(buffers[-1]))
         buffer[offset : offset + len(values)] = values
+
+
+class OneStepMethod(ABC):
+    """A stepper of states (q, p, s). A concrete stepper implements `step`; rollouts are the same for all steppers.
+
+    With `throw` the first sample that fails raises `StepError`; `iterates` says whether steps want a guess.
+    """
+
+    throw: bool = False
+    iterates: bool = False
+
+    @abstractmethod
+    def step(self, state: Any, h: Tensor | float, guess: Tensor | None = None) -> Step:
+        """A step of h > 0, scalar or (...)."""
+
+    def rollout(
+        self,
+        q: Tensor,
+        p: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        inputs: Tensor | None = None,
+        every: int = 1,
+        events: Sequence[Event | Callable[[State], Tensor]] = (),
+        checkpoint: int | None = None,
+        chunk: int = 1024,
+    ) -> Rollout:
+        """Step K times from (q, p, s).
+
+        Parameters
+        ----------
+        q, p
+            (..., n).
+        s
+            (...); default 0.
+        h
+            A scalar for equal steps, (K,) for steps shared by the batch, or (..., K).
+        steps
+            K; needed for a scalar h without inputs only.
+        inputs
+            (K, m) or (..., K, m): u_k of each step, for an L_d with `at(u)`.
+        every
+            m: keep every m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
+        events
+            `Event`s, or functions of the state; a sample stops where a function changes sign. A stopped sample keeps
+            its state at the event, with `Status.STOPPED`. The time of an event is a constant for the gradient.
+        checkpoint
+            Length of the segments whose inner steps the backward pass computes again: K steps then need memory for
+            about K / length + length steps. Without gradients `checkpoint` has no effect.
+        chunk
+            Number of steps that are gathered before writing into the result.
+
+        Returns
+        -------
+        Rollout
+            K/m + 1 states and K/m statuses.
+
+        Raises
+        ------
+        InputError
+            If h is not positive, lengths disagree, the L_d takes no inputs, or options do not fit together.
+        """
+        start = self._checked(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
+        if inputs is not None:
+            inputs = self._checked_inputs(torch.as_tensor(inputs), q)
+            steps = inputs.shape[-2] if steps is None and torch.as_tensor(h).ndim == 0 else steps
+        if events and checkpoint is not None:
+            raise InputError("events and checkpoint exclude one another; leave one out")
+        watch = Watch(events, start) if events else None
+        track = self._roll_out(start, h, steps, inputs, watch, every=every, chunk=chunk, checkpoint=checkpoint)
+        q, p, s = track.states
+        return Rollout(q, p, s, track.sigma, track.status, track.residual, track.events, track.outside)
+
+    def _roll_out(
+        self,
+        start: Any,
+        h: Tensor | float,
+        steps: int | None,
+        inputs: Tensor | None = None,
+        watch: Watch | None = None,
+        **plan: Any,
+    ) -> Track:
+        """The rollout of a named tuple of tensors, the last of shape (...); exported files replace this loop."""
+        h_all = step_sizes(check_h(h, start[-1]), steps)
+        if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
+            raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
+        cut = Plan(h_all.shape[-1], **plan)
+        return roll_out(start, Drive(self._single_step, h_all, cut, inputs, watch, self.iterates, self._check_step))
+
+    def _checked(self, state: State) -> State:
+        """The state, if this stepper can start from it."""
+        return check_state(state)
+
+    def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:  # noqa: ARG002
+        """The inputs (K, m) or (..., K, m) for positions `like`; raise InputError if the stepper takes no inputs."""
+        raise InputError(f"{type(self).__name__} takes no inputs, got {tuple(inputs.shape)}; leave them out")
+
+    def _single_step(self) -> OneStep:
+        """The function that takes the steps of a rollout."""
+        return lambda state, h, guess, u, low: (self.step(state, h, guess), None)  # noqa: ARG005  same signature for all
+
+    def _check_step(self, step: Step, state: Any, h: Tensor, u: Tensor | None) -> None:  # noqa: ARG002
+        """With `throw`, raise `StepError` if a sample failed."""
+        if self.throw:
+            throw_failure(step.status, step.residual)

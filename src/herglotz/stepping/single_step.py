@@ -9,13 +9,19 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Driven, momentum_plus, momentum_residual
+from herglotz.mechanics.legendre import regularity
 from herglotz.mechanics.newton import Found, attached
-from herglotz.mechanics.regularity import regularity
-from herglotz.stepping.equation import ModelEquation, StepOfModel, model_equation
-from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
-from herglotz.stepping.field import Field
+from herglotz.stepping.equation import (
+    End,
+    ModelEquation,
+    PartialsEquation,
+    StepEquation,
+    StepOfModel,
+    model_equation,
+    partials_at,
+)
+from herglotz.stepping.explicit import Field, Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.newton import find_root, status_of
-from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation, partials_at
 from herglotz.stepping.state import State, Status, Step
 
 # Steps shorter than this part of a model's time, typical q over typical v, are solved for Δ. Solved for q1, p ~ mΔ/h

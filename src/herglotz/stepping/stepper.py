@@ -12,7 +12,7 @@ from herglotz.mechanics import DiscreteLagrangian, legendre_plus
 from herglotz.models import capabilities
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.linearise import Linearised, linearise
-from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.single_step import SingleStep, driven_by
 from herglotz.stepping.state import (
     State,

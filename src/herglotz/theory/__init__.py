@@ -1,10 +1,10 @@
-"""The paper, one file for each subject of a section. Fitting and stepping need none of these files.
+"""The paper, one file for each section or subject of one. Fitting and stepping need none of these files.
 
-    Contact manifolds                  jacobi, legendrian
-    Continuous dynamics                continuous, legendre_dual, function_germ, hj_on_q
-    Discrete Lagrangian dynamics       action, boundary, caustics
-    Discrete Hamiltonian dynamics      left, hamiltonian, hamilton_equations
-    Discrete Hamilton–Jacobi theory    generating, hamilton_jacobi, hopf_lax, check
+    Contact manifolds                  contact_manifolds
+    Continuous dynamics                continuous
+    Discrete Lagrangian dynamics       lagrangian_dynamics
+    Discrete Hamiltonian dynamics      hamiltonian_dynamics
+    Discrete Hamilton–Jacobi theory    hamilton_jacobi, hopf_lax
     The conclusions                    evolution, hj_on_qxr, degenerate, tulczyjew, explicit_time
     Beyond the paper                   noether, symmetries, constrained, rigid_body
 
@@ -17,14 +17,39 @@ from herglotz.stepping.continuous_equation import (
     FractionalStepper as FractionalStepper,
     inverse_step as inverse_step,
 )
-from herglotz.theory.action import Action as Action, curve_action as curve_action, herglotz_action as herglotz_action
-from herglotz.theory.boundary import Curve as Curve, boundary_value as boundary_value, initial_value as initial_value
-from herglotz.theory.check import TheoremCheck as TheoremCheck, check as check
 from herglotz.theory.constrained import ConstrainedStepper as ConstrainedStepper
+from herglotz.theory.contact_manifolds import (
+    Function as Function,
+    FunctionGerm as FunctionGerm,
+    LegendrianDefect as LegendrianDefect,
+    bivector as bivector,
+    contact_complement as contact_complement,
+    contact_curvature as contact_curvature,
+    contact_product_point as contact_product_point,
+    contact_product_states as contact_product_states,
+    differential as differential,
+    divergence as divergence,
+    flat as flat,
+    germ as germ,
+    jacobi_bracket as jacobi_bracket,
+    legendrian_defect as legendrian_defect,
+    lie_derivative_of_contact_form as lie_derivative_of_contact_form,
+    product_potential as product_potential,
+    prolongation as prolongation,
+    reeb_field as reeb_field,
+    sharp as sharp,
+    sharp_bivector as sharp_bivector,
+)
 from herglotz.theory.continuous import (
     contact_vector_field as contact_vector_field,
+    energy_on_section as energy_on_section,
     evolution_vector_field as evolution_vector_field,
+    fiber_derivative as fiber_derivative,
+    fiber_inverse as fiber_inverse,
     herglotz_acceleration as herglotz_acceleration,
+    legendre_dual as legendre_dual,
+    projected_field as projected_field,
+    relatedness_defect as relatedness_defect,
 )
 from herglotz.theory.degenerate import (
     LegendrianStepper as LegendrianStepper,
@@ -36,43 +61,31 @@ from herglotz.theory.explicit_time import (
     energies as energies,
     time_defect as time_defect,
 )
-from herglotz.theory.function_germ import (
-    Function as Function,
-    FunctionGerm as FunctionGerm,
-    germ as germ,
-    prolongation as prolongation,
-)
-from herglotz.theory.generating import (
+from herglotz.theory.hamilton_jacobi import (
     GeneratingFunction as GeneratingFunction,
+    PointSource as PointSource,
+    Quadratic as Quadratic,
+    TheoremCheck as TheoremCheck,
+    check as check,
+    commutation_defect as commutation_defect,
     generating_function as generating_function,
     generating_functions as generating_functions,
     hamilton_jacobi_residual as hamilton_jacobi_residual,
     left_generating_function as left_generating_function,
     left_hamilton_jacobi_residual as left_hamilton_jacobi_residual,
-)
-from herglotz.theory.hamilton_equations import (
-    left_equations as left_equations,
-    left_step as left_step,
-    right_equations as right_equations,
-    right_step as right_step,
-)
-from herglotz.theory.hamilton_jacobi import (
-    PointSource as PointSource,
-    Quadratic as Quadratic,
-    commutation_defect as commutation_defect,
     projected_flow as projected_flow,
     projected_step as projected_step,
     riccati_step as riccati_step,
 )
-from herglotz.theory.hamiltonian import (
+from herglotz.theory.hamiltonian_dynamics import (
     LeftHamiltonian as LeftHamiltonian,
+    LeftLagrangian as LeftLagrangian,
     RightHamiltonian as RightHamiltonian,
+    left_equations as left_equations,
+    left_step as left_step,
+    right_equations as right_equations,
     right_hamiltonian_on_flow as right_hamiltonian_on_flow,
-)
-from herglotz.theory.hj_on_q import (
-    energy_on_section as energy_on_section,
-    projected_field as projected_field,
-    relatedness_defect as relatedness_defect,
+    right_step as right_step,
 )
 from herglotz.theory.hj_on_qxr import (
     discrete_section_residuals as discrete_section_residuals,
@@ -82,31 +95,13 @@ from herglotz.theory.hj_on_qxr import (
     transport_section as transport_section,
 )
 from herglotz.theory.hopf_lax import HopfLax as HopfLax, Propagated as Propagated, hopf_lax as hopf_lax
-from herglotz.theory.jacobi import (
-    bivector as bivector,
-    contact_curvature as contact_curvature,
-    differential as differential,
-    divergence as divergence,
-    flat as flat,
-    jacobi_bracket as jacobi_bracket,
-    lie_derivative_of_contact_form as lie_derivative_of_contact_form,
-    reeb_field as reeb_field,
-    sharp as sharp,
-    sharp_bivector as sharp_bivector,
-)
-from herglotz.theory.left import LeftLagrangian as LeftLagrangian
-from herglotz.theory.legendre_dual import (
-    fiber_derivative as fiber_derivative,
-    fiber_inverse as fiber_inverse,
-    legendre_dual as legendre_dual,
-)
-from herglotz.theory.legendrian import (
-    LegendrianDefect as LegendrianDefect,
-    contact_complement as contact_complement,
-    contact_product_point as contact_product_point,
-    contact_product_states as contact_product_states,
-    legendrian_defect as legendrian_defect,
-    product_potential as product_potential,
+from herglotz.theory.lagrangian_dynamics import (
+    Action as Action,
+    Curve as Curve,
+    boundary_value as boundary_value,
+    curve_action as curve_action,
+    herglotz_action as herglotz_action,
+    initial_value as initial_value,
 )
 from herglotz.theory.noether import (
     dissipation_defect as dissipation_defect,

@@ -25,7 +25,7 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.newton import Root, find_root
-from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 
 # g(q), (..., n) → (..., m).

@@ -1,7 +1,18 @@
-"""Continuous dynamics of the paper: the fields of a contact Hamiltonian H(q, p, s), Herglotz's equations of L(q, v, s).
+"""Continuous dynamics: fields of H(q, p, s), Herglotz's equations of L(q, v, s), Legendre transform, Theorem 1.
 
 All functions are batched over leading dimensions. A result can be differentiated again where an argument wants a
 gradient.
+
+The Legendre transform p = L_v, H = v·L_v − L has the inverse v = H_p, L = p·H_p − H: the transform is an involution, so
+one function serves both directions. The dual of f(q, x, s) is f*(q, y, s) = x·y − f(q, x, s) with f_x(q, x, s) = y.
+
+Theorem 1 says when a field is tangent to the section γ = j¹F of T*Q × R → Q:
+
+    continuous   Tγ(X^γ) = X_H∘γ  ⇔  H∘γ = 0            for the contact field X_H
+                 Tγ(E^γ) = E_H∘γ  ⇔  d(H∘γ) = 0         for the evolution field E_H
+
+with the projected field X^γ = Tρ(X∘γ) on Q. The paper prints the second condition for the first field. H = p and F = q
+is a counterexample: d(H∘γ) = 0, and X_H is not related (erratum E2).
 """
 
 from __future__ import annotations
@@ -10,7 +21,10 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.scalar_fields import Hamiltonian, Lagrangian, derivatives
+from herglotz.mechanics.contact import join
+from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.scalar_fields import Hamiltonian, Lagrangian, ScalarField, derivatives, gradient
+from herglotz.theory.contact_manifolds import Field, Function, prolongation
 
 
 def contact_vector_field(
@@ -65,3 +79,79 @@ def _evolution(H: Hamiltonian, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor,
     P = derivatives(H, q, p, s)
     H_q, H_p, H_s = P.D1, P.D2, P.D3
     return H_p, -(H_q + p * H_s[..., None]), (p * H_p).sum(-1), P.L
+
+
+def fiber_derivative(
+    f: ScalarField,
+    q: Tensor,  # (..., n)
+    x: Tensor,  # (..., n)
+    s: Tensor,  # (...)
+) -> Tensor:
+    """f_x(q, x, s), shape (..., n): the momentum p = L_v of a Lagrangian, the velocity v = H_p of a Hamiltonian."""
+    return derivatives(f, q, x, s).D2
+
+
+def fiber_inverse(
+    f: ScalarField,
+    q: Tensor,  # (..., n)
+    y: Tensor,  # (..., n)
+    s: Tensor,  # (...)
+) -> Tensor:
+    """The x with f_x(q, x, s) = y, by Newton's method from y: v of a momentum (f = L), p of a velocity (f = H).
+
+    x is once differentiable with respect to q, y and s, by the implicit-function theorem. Raise InputError if a sample
+    does not converge; the message names the sample.
+    """
+    q, y = torch.broadcast_tensors(q, y)
+
+    def equation(x: Tensor) -> tuple[Tensor, Tensor]:
+        P = derivatives(f, q, x, s, order=2)
+        return P.D2 - y, P.D22
+
+    root = find_root(equation, y)
+    if not bool(root.converged.all()):
+        sample = tuple(int(i) for i in (~root.converged).nonzero()[0])
+        raise InputError(
+            f"Legendre transform: no x with f_x = {y[sample].tolist()} found at sample {sample} (after "
+            f"{root.iterations} Newton steps); check that a solution exists and that f_xx is not singular"
+        )
+    return root.with_slope(lambda x: fiber_derivative(f, q, x, s) - y)
+
+
+def legendre_dual(f: ScalarField) -> ScalarField:
+    """The Legendre transform f*(q, y, s) = x·y − f(q, x, s) with f_x = y: L ↦ H and H ↦ L.
+
+    The value is stationary in x. The first derivative of x therefore makes f* correct up to its third derivatives. f*
+    raises `InputError` where `fiber_inverse` does.
+    """
+
+    def dual(q: Tensor, y: Tensor, s: Tensor) -> Tensor:
+        x = fiber_inverse(f, q, y, s)
+        return (x * y).sum(-1) - f(q, x, s)
+
+    return dual
+
+
+def energy_on_section(H: Hamiltonian, F: Function, q: Tensor) -> tuple[Tensor, Tensor]:
+    """H∘γ and d(H∘γ) at q, shapes (...) and (..., n), for γ = j¹F."""
+    value, slope, _ = gradient(lambda q: H(*prolongation(F, q)), q)
+    return value, slope
+
+
+def projected_field(field: Field, F: Function, q: Tensor) -> Tensor:
+    """X^γ(q) = Tρ(X(γ(q))), shape (..., n): the motion on Q along the section."""
+    return field(*prolongation(F, q))[0]
+
+
+def relatedness_defect(field: Field, F: Function, q: Tensor) -> Tensor:
+    """Tγ(X^γ) − X∘γ at q, shape (..., 2n+1); the field is any (q, p, s) → (q̇, ṗ, ṡ).
+
+    The defect of X_H is (0, d(H∘γ), H∘γ), that of E_H is (0, d(H∘γ), 0).
+
+    Source: Theorem 1 of the paper, erratum E2.
+    """
+    value, F_q, F_qq = gradient(F, q, order=2)
+    X = field(q, F_q, value)
+    v = X[0]
+    lifted = join(v, (F_qq @ v[..., None])[..., 0], (F_q * v).sum(-1))
+    return lifted - join(*X)

@@ -26,9 +26,9 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.contact import Triple, jacobian
 from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
-from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
-from herglotz.theory.legendrian import contact_product_point
+from herglotz.theory.contact_manifolds import contact_product_point
 
 # A singular value below eps ** RANK_POWER times the largest counts as zero.
 RANK_POWER = 0.5

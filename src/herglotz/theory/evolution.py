@@ -20,10 +20,10 @@ from herglotz.errors import InputError
 from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import attached, find_root
 from herglotz.mechanics.scalar_fields import Hamiltonian, gradient, square_jacobian
-from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
+from herglotz.theory.contact_manifolds import sharp_bivector
 from herglotz.theory.continuous import contact_vector_field, evolution_vector_field
-from herglotz.theory.jacobi import sharp_bivector
 
 FIELDS = {"evolution": evolution_vector_field, "contact": contact_vector_field}
 
@@ -38,10 +38,7 @@ class EvolutionStepper(OneStepMethod):
     field
         "evolution" for E_H, which keeps H, or "contact" for X_H, along which H shrinks by the reported factor c.
 
-    Raises
-    ------
-    InputError
-        If `field` is unknown.
+    Raise InputError if `field` is unknown.
 
     Source: section 6 of `docs/mathematics.md`.
     """

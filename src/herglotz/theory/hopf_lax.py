@@ -9,8 +9,8 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.stepping.state import Status, step_sizes
-from herglotz.theory.boundary import Curve, checked, family_value
-from herglotz.theory.function_germ import Function, FunctionGerm
+from herglotz.theory.contact_manifolds import Function, FunctionGerm
+from herglotz.theory.lagrangian_dynamics import Curve, checked, family_value
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def hopf_lax(
     -------
     HopfLax
         Status SINGULAR where the second derivative in x is singular (A + cα = 0 for a quadratic S), or where the
-        inertia of W shows a crossed caustic (`theory.caustics`).
+        inertia of W shows a crossed caustic (`theory.lagrangian_dynamics`).
 
     Source: erratum E7.
     """

@@ -19,7 +19,7 @@ from torch import Tensor
 from herglotz.mechanics.contact import Triple, jacobian
 from herglotz.mechanics.partials import DiscreteLagrangian, value
 from herglotz.mechanics.scalar_fields import Hamiltonian, ScalarField, gradient
-from herglotz.theory.jacobi import jacobi_bracket
+from herglotz.theory.contact_manifolds import jacobi_bracket
 
 # g(ε, q): (...) and (..., n) → (..., n), with g(0, q) = q.
 Action = Callable[[Tensor, Tensor], Tensor]

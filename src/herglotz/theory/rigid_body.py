@@ -74,10 +74,7 @@ class RigidBodyStepper:
     gamma
         Damping rate γ, 1/s.
 
-    Raises
-    ------
-    InputError
-        If J is not symmetric and positive.
+    Raise InputError if J is not symmetric and positive.
 
     Source: section 6 of `docs/mathematics.md`.
     """

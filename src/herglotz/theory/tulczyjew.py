@@ -24,9 +24,8 @@ from torch import Tensor
 from herglotz.mechanics import momentum_minus, momentum_plus
 from herglotz.mechanics.contact import Triple, join, split
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
-from herglotz.theory.hamiltonian import LeftHamiltonian, RightHamiltonian
-from herglotz.theory.left import unforced
-from herglotz.theory.legendrian import contact_product_point
+from herglotz.theory.contact_manifolds import contact_product_point
+from herglotz.theory.hamiltonian_dynamics import LeftHamiltonian, RightHamiltonian, unforced
 
 
 @dataclass(frozen=True)

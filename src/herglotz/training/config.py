@@ -81,7 +81,7 @@ class FitConfig:
     coulomb
         Dry friction beside viscous friction, at the forced level.
     sticking
-        Set-valued dry friction, with which a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
+        Set-valued dry friction, with which a joint can stand still (`herglotz.stepping.newton`). Whole trajectories
         are fitted, from a start with smooth friction. None: if a search for named terms finds dry friction, and
         set-valued friction is as likely (`herglotz.training.search`).
     robust
@@ -102,7 +102,7 @@ class FitConfig:
     use_inputs
         Drive the model with the recorded inputs u (forced level); False leaves the inputs out of the fit.
     input_delay, actuator_lag
-        Delay of the inputs, and time constant of the actuator, in the data's unit of time (`herglotz.data.actuator`).
+        Delay of the inputs, and time constant of the actuator, in the data's unit of time (`herglotz.data.driving`).
         None: stated in the data, else the values that explain the accelerations best (`herglotz.training.hold`). 0: no
         delay, no lag.
     input_map
@@ -125,7 +125,7 @@ class FitConfig:
         Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
     frequencies
         Angular frequencies ν, in rad per unit of time, of a periodic force with learned amplitude and phase: cos νt and
-        sin νt become the inputs (`herglotz.data.waves`). For data without inputs.
+        sin νt become the inputs (`herglotz.data.input_terms`). For data without inputs.
     translations
         Symmetries of L_d, each a set of coordinates that move together: `"q1 + q2"`, or `"q1"` alone. No learned term
         depends on their common position. `run.symmetries()` finds them (`herglotz.models.translations`).

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import AT_THE_NOISE, precision, relative_spread
+from herglotz.data.noise import AT_THE_NOISE, precision, relative_spread
 from herglotz.data.splits import cuts_of, held_out_whole, leading
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import differences, estimate_baseline

@@ -18,10 +18,9 @@ from herglotz.models import ContactLagrangian
 from herglotz.models.action import ActionFlow, ActionPowers
 from herglotz.models.config import POWERS
 from herglotz.models.drag import parse_drag
-from herglotz.models.feature_grammar import Feature
-from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import Combination, baseline_is_named, sorted_features
-from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
+from herglotz.models.features import Feature
+from herglotz.models.terms import AffineDamping, FeatureKinetic, Kinetic, LinearDamping
 from herglotz.models.translations import across_in_words
 from herglotz.training.equation_numbers import Numbers
 from herglotz.training.equation_words import (

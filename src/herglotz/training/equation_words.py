@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from herglotz.models.drag import DragFeature
-from herglotz.models.feature_grammar import Feature, Product
+from herglotz.models.features import Feature, Product
 
 # Numbers outside this range are printed with a power of ten, because many zeros are hard to count.
 SMALL, LARGE = 1e-4, 1e7

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from herglotz.data.roughness import AT_THE_NOISE, SAMPLES
+from herglotz.data.noise import AT_THE_NOISE, SAMPLES
 from herglotz.data.units import size
 from herglotz.training.problems.grid import FIRST_SEGMENT
 

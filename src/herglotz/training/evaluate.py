@@ -13,7 +13,7 @@ from torch import Tensor
 
 import herglotz
 from herglotz.data import Trajectories
-from herglotz.data.spikes import spikes
+from herglotz.data.noise import spikes
 from herglotz.data.splits import held_out_whole, leading, leading_rows
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.config import FitConfig

@@ -25,7 +25,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.column_roles import is_set_point
 from herglotz.data.csv_columns import WANTED_VALUE
-from herglotz.data.roughness import precisions
+from herglotz.data.noise import precisions
 from herglotz.data.smoothing import slopes
 from herglotz.data.units import size
 from herglotz.least_squares import least_squares

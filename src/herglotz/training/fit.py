@@ -14,15 +14,12 @@ from typing import Any
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
-from herglotz.data.files import remove_leftovers
+from herglotz.data.files import locked, remove_leftovers
 from herglotz.data.gaps import complete
 from herglotz.data.holds import Arrival
-from herglotz.data.input_terms import with_input_terms
-from herglotz.data.lock import locked
+from herglotz.data.input_terms import with_input_terms, with_waves
 from herglotz.data.splits import trained_whole
-from herglotz.data.waves import with_waves
-from herglotz.errors import InputError, refuse
-from herglotz.telling import tell
+from herglotz.errors import InputError, refuse, tell
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig

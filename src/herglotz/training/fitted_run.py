@@ -12,10 +12,9 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.anything import as_trajectories
 from herglotz.data.holds import Arrival
-from herglotz.errors import refuse
+from herglotz.errors import refuse, tell
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
-from herglotz.telling import tell
 from herglotz.training.config import FitConfig
 
 

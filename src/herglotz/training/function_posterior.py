@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, jacrev
 
 from herglotz.models import ContactLagrangian
-from herglotz.models.phase import Phase
+from herglotz.models.terms import Phase
 from herglotz.training.arrowhead import dense
 from herglotz.training.cross_validation import foretold_errors
 from herglotz.training.dictionary import keys_of

@@ -1,6 +1,6 @@
 """How recorded inputs arrive, where neither the data nor the user say so: the hold, a delay and the actuator's lag.
 
-Each arrival (`herglotz.data.actuator`) makes other inputs of the steps. One linear problem compares them: accelerations
+Each arrival (`herglotz.data.driving`) makes other inputs of the steps. One linear problem compares them: accelerations
 by differences against `acceleration_terms`, dry friction and the forces of other joints. Differences amplify noise, so
 that the problem is turned back into one of positions over short windows, whose noise is white. An arrival is taken if
 it lowers the error by more than a tenth and beyond the spread of that gain over blocks of time: first a hold, then a
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.actuator import InputPieces, acting
+from herglotz.data.driving import InputPieces, acting
 from herglotz.data.holds import HOLDS, SAMPLES, Arrival
 from herglotz.data.smoothing import smoothed
 from herglotz.data.splits import liveliest_rows

@@ -36,9 +36,9 @@ from herglotz.codegen.trace import traced
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative
 from herglotz.models import Capabilities, ContactLagrangian, ModelConfig, numbers_of
-from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.equation import PartialsEquation
+from herglotz.stepping.newton import StickSlip, at_rest
 from herglotz.stepping.state import State
-from herglotz.stepping.stick_slip import StickSlip, at_rest
 from herglotz.training.dictionary import dictionary, keys_of
 from herglotz.training.parameter_vector import ParameterVector
 
@@ -231,13 +231,13 @@ class Functions:
         return PartialsEquation(at, state, h, 2, increments=True)  # pyright: ignore[reportArgumentType]
 
     def rest(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> tuple[Tensor, ...]:
-        """z, K and w/K with which the iteration for set-valued friction starts (`herglotz.stepping.stick_slip`)."""
+        """z, K and w/K with which the iteration for set-valued friction starts (`herglotz.stepping.newton`)."""
         return tuple(y.clone() for y in at_rest(self.equation(x, h, u, theta, sharpest)))
 
     def evaluate(
         self, x: Tensor, z: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor, *held: Tensor
     ) -> tuple[Tensor, ...]:
-        """F and J at the increment Δ = z; with set-valued friction at the z of `herglotz.stepping.stick_slip`."""
+        """F and J at the increment Δ = z; with set-valued friction at the z of `herglotz.stepping.newton`."""
         equation: Any = self.equation(x, h, u, theta, sharpest)
         point = (StickSlip(equation, *held) if held else equation)(z, True)
         return point.F.clone(), point.J.clone()

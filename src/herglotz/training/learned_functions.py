@@ -22,7 +22,7 @@ from herglotz.data.splits import leading
 from herglotz.errors import InputError, refuse
 from herglotz.models import ContactLagrangian, refuse_own
 from herglotz.models.terms import LinearDamping
-from herglotz.stepping.field import FieldOf
+from herglotz.stepping.explicit import FieldOf
 from herglotz.threads import one_thread
 from herglotz.training.function_posterior import SAMPLES, by_numbers, function_posterior, mass_at
 from herglotz.training.run import Run

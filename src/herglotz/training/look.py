@@ -13,9 +13,8 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS, Arrival
 from herglotz.data.input_terms import input_terms_of, with_input_terms
-from herglotz.data.roughness import roughness
+from herglotz.data.noise import roughness, spikes
 from herglotz.data.sensors import measured
-from herglotz.data.spikes import spikes
 from herglotz.data.windows import Triples
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian

@@ -24,12 +24,11 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.column_roles import is_of_others
-from herglotz.data.degrees import COUNTS
 from herglotz.data.gaps import MEANS
+from herglotz.data.noise import SAMPLES, precisions
 from herglotz.data.polar import LENGTH, with_hints
 from herglotz.data.rates import filled_inputs
-from herglotz.data.roughness import SAMPLES, precisions
-from herglotz.data.units import size
+from herglotz.data.units import COUNTS, size
 from herglotz.training.feedback import HALF
 from herglotz.training.past import left_by_the_past
 

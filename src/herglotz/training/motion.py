@@ -14,7 +14,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.driving import driven, even_times, input_recording
-from herglotz.data.waves import waves
+from herglotz.data.input_terms import waves
 from herglotz.errors import InputError, check_start
 from herglotz.stepping import State
 from herglotz.stepping.velocity import velocities

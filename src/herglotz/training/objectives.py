@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from herglotz.data.roughness import precision
+from herglotz.data.noise import precision
 from herglotz.models import ContactLagrangian
 from herglotz.training.distillation import taught
 from herglotz.training.first_states import states_of_pairs

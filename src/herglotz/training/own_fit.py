@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import roughness
-from herglotz.data.spikes import spikes
+from herglotz.data.noise import roughness, spikes
 from herglotz.errors import InputError, refuse
 from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.models import OwnLagrangian

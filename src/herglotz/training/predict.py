@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.actuator import acting
-from herglotz.data.input_terms import input_terms_of, with_input_terms
+from herglotz.data.driving import acting
+from herglotz.data.input_terms import input_terms_of, with_input_terms, with_waves
 from herglotz.data.sensors import measured
 from herglotz.data.splits import leading, leading_rows
-from herglotz.data.waves import with_waves
 from herglotz.errors import InputError, refuse
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.stepping.velocity import velocities

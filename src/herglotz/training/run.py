@@ -18,7 +18,7 @@ from herglotz.mechanics import Driven
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.stepping.continuous_equation import ContinuousEquation, FractionalStepper
-from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.rollout import OneStepMethod
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import with_input_terms
-from herglotz.data.roughness import part_of
+from herglotz.data.noise import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
 from herglotz.models.drag import input_forces

@@ -15,9 +15,8 @@ from torch import Tensor
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.units import common_unit
-from herglotz.errors import InputError, did_you_mean, refuse
+from herglotz.errors import InputError, did_you_mean, refuse, tell
 from herglotz.models import LEVELS
-from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten

@@ -13,12 +13,10 @@ from typing import Any, Literal, TypedDict
 import torch
 from torch import Tensor
 
-from herglotz.data.files import read_bytes, write_atomically
-from herglotz.data.seal import check_seal, sealed_zip
-from herglotz.errors import InputError
+from herglotz.data.files import check_seal, read_bytes, sealed_zip, write_atomically
+from herglotz.errors import InputError, tell
 from herglotz.progress import FINDING, LOOKING, STAGES, FitBar
 from herglotz.schema import check_entries
-from herglotz.telling import tell
 from herglotz.training.distributed import is_first
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, remind
 

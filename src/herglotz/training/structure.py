@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import precision, roughness
+from herglotz.data.noise import precision, roughness
 from herglotz.data.sensors import measured
 from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from herglotz.data.roughness import precision, spread
+from herglotz.data.noise import precision, spread
 from herglotz.models import ContactLagrangian
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
 from herglotz.training.first_states import first_states, states_of_pairs

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import input_terms_of
-from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, relative_spread
+from herglotz.data.noise import AT_THE_NOISE, coarse, precision, relative_spread
 from herglotz.data.smoothing import smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.spikes import spikes
+from herglotz.data.noise import spikes
 from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
 from herglotz.models import refuse_own

@@ -28,8 +28,8 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.noise import AT_THE_NOISE, coarse, precision, precisions
 from herglotz.data.polar import circles
-from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, precisions
 from herglotz.data.splits import enough
 from herglotz.data.units import common_unit
 from herglotz.stepping import Stepper, state_of

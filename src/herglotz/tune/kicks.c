@@ -1,4 +1,4 @@
-/* The loop over motions and steps around a header of kicks (`herglotz.tune.kick_header`).
+/* The loop over motions and steps around a header of kicks (`herglotz.tune.kick_composition`).
 
    states (batch, steps + 1): the start of each motion, then the state after every step; status (batch, steps). A motion
    ends before a step that is not finite. */

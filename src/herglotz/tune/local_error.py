@@ -20,19 +20,8 @@ def local_errors(stepper: OneStepMethod, out: Rollout, h: Tensor | float) -> Ten
     error of the step times 1 − 2^{−p}. The estimate takes two steps for each step of the rollout. Values for a model
     with a learned correction mean nothing, because a correction is right at its own step only.
 
-    Parameters
-    ----------
-    stepper
-        The stepper that made the rollout, without inputs.
-    out
-        The rollout, with every step kept.
-    h
-        Step of the rollout: a scalar, (K,) or (..., K).
-
-    Raises
-    ------
-    InputError
-        If h lists another number of steps than the rollout keeps.
+    The stepper made the rollout `out` without inputs, with every step kept, by the step h: a scalar, (K,) or (..., K).
+    Raise InputError if h lists another number of steps than the rollout keeps.
     """
     h, steps = check_h(h, out.q), out.status.shape[-1]
     if h.ndim and h.shape[-1] != steps:
@@ -50,19 +39,9 @@ def flag_unresolved(stepper: OneStepMethod, out: Rollout, h: Tensor | float, bou
     """Return the rollout with `Status.UNRESOLVED` at every converged step whose `local_errors` exceed a bound.
 
     The states stay as they are; `Rollout.ok` is then False for a motion that is finite and wrong, such as one that
-    crosses the pericentre of a thin ellipse in a single step. A half step that fails is unresolved too.
-
-    Parameters
-    ----------
-    stepper, out, h
-        As for `local_errors`; the same caution about learned corrections holds.
-    bound
-        Error of a step relative to its move, > 0.
-
-    Raises
-    ------
-    InputError
-        If the bound is not a finite number > 0, or `local_errors` refuses h.
+    crosses the pericentre of a thin ellipse in a single step. A half step that fails is unresolved too. `bound` > 0 is
+    the error of a step relative to its move; the other arguments are those of `local_errors`, with the same caution
+    about learned corrections. Raise InputError if the bound is not a finite number > 0, or `local_errors` refuses h.
     """
     if not 0 < bound < float("inf"):
         raise InputError(f"bound must be a finite number > 0, got {bound:g}")

@@ -1,5 +1,4 @@
 """Checks that a scene, a run, a file or any L_d is a contact integrator, and that a run predicts its data."""
 
 from herglotz.verify.report import Check as Check, Report as Report
-from herglotz.verify.symmetries import symmetries as symmetries
-from herglotz.verify.verifier import verify as verify
+from herglotz.verify.verifier import symmetries as symmetries, verify as verify

@@ -19,14 +19,58 @@ from herglotz.errors import InputError, did_you_mean
 from herglotz.export import DifferencedStepper, ExportedStepper, load_exported
 from herglotz.export.compare import draw
 from herglotz.export.differences import LinearisedStepper
-from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics import DiscreteLagrangian, momentum_minus, partials
 from herglotz.mechanics.contact import Flow
-from herglotz.models import capabilities
+from herglotz.models import ContactLagrangian, capabilities
 from herglotz.scenes import Scene, scene, scene_names
 from herglotz.stepping import OneStepMethod, Rollout, State, Step, Stepper
 from herglotz.stepping.state import check_batch
 from herglotz.training import Run, load_run
-from herglotz.verify.draw import drawn_states
+
+# Largest number of coordinates that is tried on a function.
+MAX_COORDINATES = 12
+
+
+def drawn_states(L_d: DiscreteLagrangian, h: float, samples: int, make: torch.Generator) -> State:
+    """Return (q0, p0, s0) with q0 and q̇ standard normal, s0 in [−1, 1], and p0 = −D1 L_d(q0, q0 + h q̇, s0)/c.
+
+    A learned model provides the sizes of q and q̇ and the number of coordinates. A function is tried with 1, 2, …
+    coordinates until it accepts the number, so a sum over coordinates is verified for one. Raise InputError if the
+    function accepts no number up to 12, or gives no finite momentum.
+    """
+    if isinstance(L_d, ContactLagrangian):
+        scale, speed = (torch.tensor(x, dtype=torch.float64) for x in (L_d.config.scale, L_d.config.speed))
+        dtype = next(L_d.parameters()).dtype
+        return _drawn(L_d, scale.to(dtype), speed.to(dtype), h, samples, make)
+    refused = ""
+    for n in range(1, MAX_COORDINATES + 1):
+        one = torch.ones(n, dtype=torch.float64)
+        try:
+            return _drawn(L_d, one, one, h, samples, make)
+        except (IndexError, RuntimeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            refused = str(error).splitlines()[0]
+    raise InputError(
+        f"no states could be drawn: up to {MAX_COORDINATES} coordinates the function fails ({refused}); "
+        "give (L_d, (q, p, s))"
+    )
+
+
+def _drawn(
+    L_d: DiscreteLagrangian, scale: Tensor, speed: Tensor, h: float, samples: int, make: torch.Generator
+) -> State:
+    shape = (samples, len(scale))
+    q, v = (torch.randn(shape, generator=make, dtype=torch.float64).to(scale) * size for size in (scale, speed))
+    s = (2 * torch.rand(samples, generator=make, dtype=torch.float64) - 1).to(scale) * (scale * speed).sum()
+    with torch.no_grad():
+        P = partials(L_d, q, q + h * v, s, h)
+    p = momentum_minus(P)
+    good = torch.isfinite(P.L) & torch.isfinite(p).all(-1)
+    if not bool(good.any()):
+        raise InputError("L_d has no finite momentum at q, q̇ of size 1; give states: (L_d, (q, p, s))")
+    return State(q[good], p[good], s[good])
+
 
 # Bounds on identities whose derivatives are central differences of order 8 (`DifferencedStepper`). A step has a
 # rounding error of 10–100 eps and an offset is 0.01 (float32: 0.1) of 1 + |x|, so a derivative has a rounding error of

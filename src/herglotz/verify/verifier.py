@@ -1,4 +1,4 @@
-"""`verify`: every identity of a contact integrator, measured on a scene, a run, a file or a discrete Lagrangian."""
+"""`verify`: every identity of a contact integrator, measured on any target; `symmetries`: those of its L_d."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Forces
-from herglotz.theory import TimeDependent
+from herglotz.stepping import State
+from herglotz.theory import Symmetries, TimeDependent, symmetries as of_lagrangian
+from herglotz.theory.symmetries import PRECISION
 from herglotz.threads import one_thread
-from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
+from herglotz.training import Run
+from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, in_time, left_hamilton_jacobi
 from herglotz.verify.data_checks import data_checks
-from herglotz.verify.derivative import derivative
-from herglotz.verify.dry_friction import forces, holding
-from herglotz.verify.explicit_time import in_time
 from herglotz.verify.legendre import (
     NO_H_MINUS,
     NO_H_PLUS,
+    forces,
     hamiltonians_exist,
+    holding,
     left_formalism,
     momentum_matching,
     regularity,
@@ -29,6 +31,7 @@ from herglotz.verify.sampled_rollout import (
     SampledRollout,
     contact,
     convergence,
+    derivative,
     positive_factor,
     rounded,
     sampled_rollout,
@@ -65,7 +68,7 @@ def verify(
     Hamilton–Jacobi equation. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
     scene with an exact L_d its closed-form flow, a run its data, and a time-dependent L_d (`theory.TimeDependent`),
     which steps at its own times, the form η + E dt. The step of an L_d with forces is not a contact map: DΦ̃ᵀη = cη −
-    F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. `herglotz.verify.dry_friction`
+    F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. `herglotz.verify.legendre`
     judges coordinates that set-valued friction holds.
 
     Parameters
@@ -198,3 +201,91 @@ def _exact_flow(known: Subject, w: SampledRollout, bound: float) -> Check:
     sizes = (float(x.abs().max()) for x in (w.q, w.p, w.s))
     value = max(worst((x - y).abs()) / size for x, y, size in zip(w.ends, flow, sizes, strict=True))
     return Check.at_most("exact_flow", "exact L_d: a step is the closed-form flow", value, bound)
+
+
+# Standard deviation of the offset added to p, relative to that of p.
+MOMENTUM_SPREAD = 0.3
+# J of a symmetry is constant within this many RMS errors of the free run.
+RMS_ERRORS = 3.0
+# Steps of a motion by default.
+STEPS = 40
+# Largest number of steps of a motion over the unseen part of a recording.
+MAX_UNSEEN_STEPS = 200
+
+
+@one_thread()
+def symmetries(
+    target: Any,
+    *,
+    h: float | None = None,
+    samples: int = 64,
+    steps: int | None = None,
+    seed: int = 0,
+    precision: float | None = None,
+) -> Symmetries:
+    """Find the affine point symmetries of a target, and the quantities J with J_{k+1} = c_k J_k.
+
+    Parameters
+    ----------
+    target, h, samples, seed
+        As for `herglotz.verify.verify`: a scene or its name, a run or its folder, an L_d with h, or (L_d, states).
+    steps
+        Steps of each motion; by default 40, for a run those of the unseen part, at most 200.
+    precision
+        Largest drift of a symmetry, by default 1e-9. For a run the default is three times the RMS error of the free run
+        over the unseen part, or the training part if nothing is unseen, relative to the RMS size of the motion, if that
+        is more than 1e-9.
+
+    Returns
+    -------
+    herglotz.theory.Symmetries
+        `print` names each symmetry.
+
+    Raise InputError if the target has no L_d, such as an exported file, or its motions cannot be stepped.
+    """
+    known = subject(target, h, samples, seed)
+    states = known.states
+    if known.L_d is None:
+        raise InputError(f"{known.name}: has no L_d to look into; give the run that was exported")
+    angles: tuple[bool, ...] = ()
+    names: tuple[str, ...] = ()
+    length = STEPS
+    if known.scene is not None:
+        angles, names = known.scene.angles, known.scene.coordinates
+    if known.run is not None:
+        angles, names = known.run.data.angles, known.run.data.names
+        length = _unseen_steps(known.run)
+        precision = precision or max(_precision(known.run), PRECISION[states.q.dtype])
+        states = _opened(states, torch.Generator().manual_seed(seed))
+    return of_lagrangian(
+        known.L_d,
+        states,
+        torch.tensor(known.h, dtype=states.q.dtype),
+        steps=length if steps is None else steps,
+        precision=precision,
+        angles=angles,
+        coordinates=names,
+    )
+
+
+def _opened(states: State, make: torch.Generator) -> State:
+    """The states with an offset of p: on the recorded motions alone J may have a single value."""
+    q, p, s = states
+    offset = torch.randn(p.shape, generator=make, dtype=torch.float64).to(p)
+    return State(q, p + MOMENTUM_SPREAD * p.std(0, correction=0) * offset, s)
+
+
+def _unseen_steps(run: Run) -> int:
+    """Model steps of the longest unseen part, at most `MAX_UNSEEN_STEPS`; `STEPS` if nothing is unseen."""
+    unseen = max(length - seen for length, seen in zip(run.data.lengths, run.train_lengths, strict=True))
+    return min(unseen * run.decided.substeps, MAX_UNSEEN_STEPS) or STEPS
+
+
+def _precision(run: Run) -> float:
+    """`RMS_ERRORS` errors of the free run, unseen or else training part, over the RMS size of the motion."""
+    errors = (run.metrics.get(name) for name in ("extrapolation_rms", "train_rms"))
+    error = next((x for x in errors if x is not None), None)
+    spread = run.metrics.get("spread")
+    if error is None or not spread:
+        raise InputError("the run does not say how precise it is; give precision=, the largest drift of a symmetry")
+    return RMS_ERRORS * error / spread

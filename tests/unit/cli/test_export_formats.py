@@ -17,7 +17,7 @@ import torch
 from herglotz.cli import main
 from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
-from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
+from herglotz.data.files import DIGITS, ONNX_ENTRY, sealed_onnx
 from herglotz.export import compare, export_run, load_exported
 from herglotz.export.load import _is_of, read_header
 from herglotz.export.metadata import KEY
@@ -189,7 +189,7 @@ def test_a_name_of_another_format_is_refused(form, name, tiny_run, tmp_path, cap
 def test_a_file_made_by_hand_is_one_message(tiny_onnx, tmp_path, capsys):
     # fails if an entry that cannot be is a traceback where it is used, and no word of file, key and remedy
     onnx = pytest.importorskip("onnx")
-    made = onnx.load_model_from_string(tiny_onnx.read_bytes()[: -SIZE - len(ONNX_ENTRY)])
+    made = onnx.load_model_from_string(tiny_onnx.read_bytes()[: -DIGITS - len(ONNX_ENTRY)])
     (said,) = (entry for entry in made.metadata_props if entry.key == KEY)
     said.value = json.dumps(json.loads(said.value) | {"columns": [["t", "time"]]})
     path = tmp_path / "made.onnx"
@@ -218,10 +218,10 @@ def test_files_around_the_header(form, tiny_run, tmp_path, capsys):
         (start,) = re.findall(r'name="q.theta"[^>]*start="([^"]*)"', description)
         assert float(start) == said["metadata"]["start"]["q"][0]
         few = ["--samples", "4", "--steps", "2", "--against", str(tiny_run)]
-        monkey = "herglotz.export.trusted.private_folder"
+        monkey = "herglotz.data.files.private_folder"
         with pytest.MonkeyPatch.context() as patch:  # a file that another user wrote, beside its run
             patch.setattr(monkey, lambda name: tmp_path / name)
-            patch.setattr("herglotz.export.trusted._written", set())
+            patch.setattr("herglotz.data.files._written", set())
             assert main(["rollout", str(out), "--steps", "5", "--out", str(tmp_path / "c.npz")]) == 2
             assert "opening it runs code" in capsys.readouterr().err
             patch.setattr("herglotz.export.compare", partial(compare, steps=20))

@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 
 from herglotz.cli import main
-from herglotz.report.html import as_html, as_markdown
-from herglotz.report.sections import Code, Document, Section, Slider, Table
+from herglotz.report.html import Code, Document, Section, Slider, Table, as_html, as_markdown
 from herglotz.training import load_run
 
 

@@ -13,8 +13,8 @@ import torch
 
 import herglotz
 import herglotz.cli
+import herglotz.cli.flags
 import herglotz.cli.plot
-import herglotz.cli.settings
 import herglotz.cli.simulate
 from herglotz.cli import main
 from herglotz.cli.parser import build_parser
@@ -69,7 +69,7 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 
 
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
-    own = herglotz.cli.settings
+    own = herglotz.cli.flags
     assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (own.LEVELS, own.OBJECTIVES, own.OPTIMISERS, own.DTYPES)
     assert (ROBUST, SUPERVISION, HOLDS) == (own.ROBUST, own.SUPERVISION, own.HOLDS)
     assert herglotz.cli.plot.FORMATS == FORMATS
@@ -92,9 +92,7 @@ def test_settings_of_another_run(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(other.to_dict()))
 
     def settings(*flags):
-        return herglotz.cli.settings.settings_of(
-            build_parser().parse_args(["fit", str(tmp_path), "--out", "b", *flags])
-        )
+        return herglotz.cli.flags.settings_of(build_parser().parse_args(["fit", str(tmp_path), "--out", "b", *flags]))
 
     assert settings() == FitConfig()
     assert settings("--config", str(tmp_path)) == other

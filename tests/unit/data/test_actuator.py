@@ -10,7 +10,7 @@ import torch
 import herglotz as hz
 from herglotz.cli import main
 from herglotz.data import Trajectories, load, save
-from herglotz.data.actuator import InputPieces, acting
+from herglotz.data.driving import InputPieces, acting
 from herglotz.data.holds import Arrival, interpolated_input
 from herglotz.errors import InputError
 from herglotz.training import FitConfig

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, as_trajectories, load
-from herglotz.data.degrees import is_in_degrees
+from herglotz.data.units import is_in_degrees
 from herglotz.errors import InputError
 
 T = np.arange(400) / 30

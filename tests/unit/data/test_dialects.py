@@ -6,7 +6,7 @@ import torch
 
 from herglotz.data import Trajectories, load, read_csv, save
 from herglotz.data.csv_columns import Wanted
-from herglotz.data.csv_dialect import cells_of
+from herglotz.data.csv_format import cells_of
 from herglotz.errors import InputError
 
 T = np.arange(6) * 0.5

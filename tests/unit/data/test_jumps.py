@@ -5,7 +5,7 @@ import pytest
 
 from herglotz.cli import main
 from herglotz.data import Trajectories, as_trajectories, load
-from herglotz.data.jumps import jumping
+from herglotz.data.readers import jumping
 from herglotz.errors import InputError
 
 T = np.arange(80) * 0.05

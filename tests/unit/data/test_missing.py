@@ -8,8 +8,8 @@ import torch
 
 from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.gaps import complete, with_missing
+from herglotz.data.noise import part_of, precisions
 from herglotz.data.polar import in_polar, pairs_of
-from herglotz.data.roughness import part_of, precisions
 from herglotz.errors import InputError
 
 T = torch.arange(60, dtype=torch.float64) / 10

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.data.roughness import roughness
+from herglotz.data.noise import roughness
 from herglotz.scenes import scene
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.seal import ONNX_ENTRY, SIZE, check_seal, sealed_bytes, sealed_onnx, sealed_text, sealed_zip
+from herglotz.data.files import DIGITS, ONNX_ENTRY, check_seal, sealed_bytes, sealed_onnx, sealed_text, sealed_zip
 from herglotz.data.smoothing import _quality, local_polynomials, smooth_triples
 from herglotz.data.splits import RUN, liveliest_rows
 from herglotz.errors import InputError
@@ -41,7 +41,7 @@ def test_the_liveliest_run_is_taken_whole():
 
 def test_the_length_of_the_seal_of_onnx():
     # fails if the message's length is not that of the bytes which follow it: another reader then sees no entry
-    assert ONNX_ENTRY[1] == len(ONNX_ENTRY) - 2 + SIZE
+    assert ONNX_ENTRY[1] == len(ONNX_ENTRY) - 2 + DIGITS
 
 
 def table_of(names, units, *columns):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.data.spikes import spikes
+from herglotz.data.noise import spikes
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 

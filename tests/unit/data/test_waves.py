@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.waves import waves, with_waves
+from herglotz.data.input_terms import waves, with_waves
 from herglotz.errors import InputError
 
 F64 = torch.float64

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from herglotz.data import files
 from herglotz.errors import InputError
-from herglotz.export import export_c, trusted
+from herglotz.export import export_c
 from herglotz.export.c_header import RUNTIME
 from herglotz.models import ContactLagrangian, ModelConfig
 from tests.compilers import CC, needs_compiler
@@ -53,11 +54,11 @@ def built(tmp_path, code, *flags):
 def test_another_process_of_the_same_user_knows_what_was_written(monkeypatch, tmp_path):
     # fails if the record of written files is lost with the process, or what stands in it is never looked up
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    trusted.write_trusted(tmp_path / "a.h", b"mine")
-    monkeypatch.setattr(trusted, "_written", set())  # as in another process
-    trusted.check_trusted(b"mine", "a.h", trust_code=False)
+    files.write_trusted(tmp_path / "a.h", b"mine")
+    monkeypatch.setattr(files, "_written", set())  # as in another process
+    files.check_trusted(b"mine", "a.h", trust_code=False)
     with pytest.raises(InputError, match=r"a\.h: opening it runs code that it holds"):
-        trusted.check_trusted(b"other", "a.h", trust_code=False)
+        files.check_trusted(b"other", "a.h", trust_code=False)
 
 
 def test_two_headers_live_in_one_program(tmp_path):

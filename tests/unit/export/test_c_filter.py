@@ -20,7 +20,7 @@ from herglotz.data import Trajectories
 from herglotz.data.gaps import with_missing
 from herglotz.errors import InputError
 from herglotz.export import export_c, noise_of
-from herglotz.export.noise import _parts
+from herglotz.export.filtering import _parts
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of
 from herglotz.stepping import State, Stepper

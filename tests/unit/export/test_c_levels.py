@@ -10,7 +10,7 @@ from export_models import randomise
 from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.models.mass import PositionKinetic
+from herglotz.models.terms import PositionKinetic
 from herglotz.stepping import State, Stepper
 from tests.compared import relative
 from tests.compilers import needs_compiler

@@ -14,7 +14,7 @@ from herglotz.codegen import c_compiler
 from herglotz.errors import InputError
 from herglotz.export import export_c, load_c
 from herglotz.export.c_header import RUNTIME, c_source, described, runtime
-from herglotz.export.c_stepper import compiled
+from herglotz.export.load import compiled
 from herglotz.export.lower.c_parameters import without_parameters
 from herglotz.export.metadata import describe
 from herglotz.export.parameters import described_parameters, parsed

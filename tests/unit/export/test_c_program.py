@@ -14,7 +14,7 @@ from herglotz.export import export_c, load_c
 from herglotz.export.c_header import c_source, described
 from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.models.mass import PositionKinetic
+from herglotz.models.terms import PositionKinetic
 from tests.lagrangians import random_model
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "c.md"

@@ -12,7 +12,7 @@ from herglotz.codegen.c_compiler import build
 from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.export.c_header import c_source, described
-from herglotz.export.c_stepper import compiled
+from herglotz.export.load import compiled
 from herglotz.export.metadata import describe
 from herglotz.export.parameters import described_parameters
 from herglotz.models import ContactLagrangian, ModelConfig

@@ -18,16 +18,15 @@ from export_models import randomise
 from herglotz.data import Trajectories
 from herglotz.export import ExportedStepper
 from herglotz.export.c_header import c_source, described
-from herglotz.export.c_stepper import compiled
 from herglotz.export.equation import Equations
 from herglotz.export.inline import inlined
+from herglotz.export.load import compiled
 from herglotz.export.lower.onnx import OUTPUTS, graph_of
 from herglotz.export.metadata import describe
 from herglotz.export.programs import programs_of, quiet
 from herglotz.models import LEVELS, ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
-from herglotz.models.feature_grammar import parse
-from herglotz.models.features import expand
+from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
 from herglotz.stepping import State, Stepper
 from herglotz.training.named_terms import candidates

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from herglotz.codegen.fuse import fused
+from herglotz.codegen.c_function import fused
 from herglotz.codegen.program import Program
 
 

@@ -12,7 +12,7 @@ import torch.export.pt2_archive._package
 from export_models import BOX, SMALL, model_of, states_of
 
 import herglotz.export.lower.pt2
-from herglotz.data.seal import sealed_zip
+from herglotz.data.files import sealed_zip
 from herglotz.errors import InputError
 from herglotz.export import compare, export_pt2, load_pt2, weights_digest
 from herglotz.export.metadata import FORMAT

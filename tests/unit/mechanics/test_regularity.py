@@ -5,9 +5,8 @@ import torch
 
 from herglotz.mechanics import partials
 from herglotz.mechanics.contact import contact_form
-from herglotz.mechanics.legendre import soft_threshold
+from herglotz.mechanics.legendre import left_hessian, regularity, soft_threshold
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.regularity import left_hessian, regularity
 from tests.compared import f64
 
 

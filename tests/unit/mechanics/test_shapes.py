@@ -5,8 +5,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import partials
-from herglotz.mechanics.functional import functional_partials
-from herglotz.mechanics.partials import value
+from herglotz.mechanics.partials import functional_partials, value
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
     PointSource,

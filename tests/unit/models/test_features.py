@@ -10,8 +10,7 @@ from hypothesis import given, strategies as st
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.models.feature_grammar import HIGHEST_POWER
-from herglotz.models.features import LIBRARIES, expand, parse
+from herglotz.models.features import HIGHEST_POWER, LIBRARIES, expand, parse
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training.problems.one_step import MANY, ResidualProblem

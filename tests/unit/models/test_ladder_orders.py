@@ -9,7 +9,7 @@ import torch
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import unit_increment
 from herglotz.models.jet import Jet
-from herglotz.models.phase import Phase
+from herglotz.models.terms import Phase
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from tests.lagrangians import randomise

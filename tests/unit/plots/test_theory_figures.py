@@ -13,9 +13,14 @@ from numpy.testing import assert_allclose as close
 from herglotz.cli import main
 from herglotz.errors import InputError
 from herglotz.plots import IDENTITIES, save_theory_figures
-from herglotz.plots.fan import point_fan, spread_fan
-from herglotz.plots.hamilton_jacobi import STEPS, plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.parachute import physical_fall
+from herglotz.plots.theory import (
+    STEPS,
+    plot_hamilton_jacobi_residual,
+    plot_momentum_vs_generating_function,
+    point_fan,
+    spread_fan,
+)
 from herglotz.scenes import scene
 from tests.lagrangians import verlet_pendulum as pendulum
 

@@ -6,8 +6,8 @@ import torch
 from herglotz.errors import InputError
 from herglotz.mechanics import autograd_partials, contact_defect, partials, step_derivative
 from herglotz.scenes import NumericallyExact, Reason, exact_discrete_lagrangian, herglotz_motion, scene, scene_names
-from herglotz.scenes.collocation import lobatto
-from herglotz.scenes.motion import constant_rate
+from herglotz.scenes.exact import lobatto
+from herglotz.scenes.reference import constant_rate
 from herglotz.stepping import State, Status, Stepper
 from tests.compared import f64
 from tests.lagrangians import scene_states

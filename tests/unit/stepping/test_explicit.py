@@ -7,8 +7,7 @@ import torch
 
 from herglotz.models import TERMS, ModelConfig, Term
 from herglotz.stepping import Status, Stepper
-from herglotz.stepping.explicit import leapfrog
-from herglotz.stepping.field import FieldOf
+from herglotz.stepping.explicit import FieldOf, leapfrog
 from tests.lagrangians import random_model, states_in_turn
 
 

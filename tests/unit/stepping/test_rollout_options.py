@@ -6,7 +6,7 @@ import torch
 from herglotz.errors import InputError
 from herglotz.models import ModelConfig
 from herglotz.stepping import State, Status, StepError, Stepper
-from herglotz.stepping.guess import EQUAL, Extrapolation, extrapolation_weights
+from herglotz.stepping.rollout import EQUAL, Extrapolation, extrapolation_weights
 from tests.lagrangians import random_model
 
 

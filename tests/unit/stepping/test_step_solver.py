@@ -8,8 +8,8 @@ import torch
 from herglotz.mechanics import autograd_partials, momentum_jacobian, momentum_residual, partials
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Solution, State, Status, Stepper, solve, solve_step
+from herglotz.stepping.equation import End, PartialsEquation
 from herglotz.stepping.newton import find_root, status_of
-from herglotz.stepping.partials_equation import End, PartialsEquation
 from tests import lagrangians
 from tests.lagrangians import states_in_turn
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.data.roughness import coarse
+from herglotz.data.noise import coarse
 from herglotz.scenes import scene
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline

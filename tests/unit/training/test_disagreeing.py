@@ -9,7 +9,7 @@ import torch
 
 from herglotz import fit
 from herglotz.data import Trajectories
-from herglotz.data.roughness import precision
+from herglotz.data.noise import precision
 from herglotz.training.config import FitConfig
 from herglotz.training.disagreeing import _bends, _followed
 from runge_kutta import step

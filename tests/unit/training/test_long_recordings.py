@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import part_of
+from herglotz.data.noise import part_of
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, ShootingProblem

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.data.roughness import precision
+from herglotz.data.noise import precision
 from herglotz.models.features import revolute
 from herglotz.scenes import scene
 from herglotz.training import fit

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.degrees import with_angles_in_degrees
 from herglotz.data.polar import in_polar, pairs_of
 from herglotz.data.rates import filled_inputs
+from herglotz.data.units import with_angles_in_degrees
 from herglotz.training import FitConfig, fit, verdict
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.errors_of_runs import Errors

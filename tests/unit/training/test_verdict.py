@@ -11,9 +11,9 @@ import torch
 
 from herglotz.cli.common import exit_code
 from herglotz.data import Trajectories, simulate
-from herglotz.data.degrees import COUNTS
-from herglotz.data.roughness import AT_THE_NOISE, precision
+from herglotz.data.noise import AT_THE_NOISE, precision
 from herglotz.data.splits import trained_whole
+from herglotz.data.units import COUNTS
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, objectives, verdict
 from herglotz.training.errors_of_runs import Errors

@@ -13,7 +13,7 @@ import torch
 from herglotz.cli import main
 from herglotz.cli.verify import other_metadata
 from herglotz.data import simulate
-from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
+from herglotz.data.files import DIGITS, ONNX_ENTRY, sealed_onnx
 from herglotz.errors import InputError
 from herglotz.export import load_c, load_exported, load_onnx, load_pt2
 from herglotz.export.metadata import check_metadata, describe, from_json
@@ -113,7 +113,7 @@ def test_line_ends_do_not_break_the_seal(files, tmp_path):
 
 def test_sealed_again_with_other_metadata(files, runs, tmp_path, capsys):
     # fails if `verify` takes the word of a file for its level: rows are left out, and the table says "verified"
-    content = files("onnx").read_bytes()[: -SIZE - len(ONNX_ENTRY)]
+    content = files("onnx").read_bytes()[: -DIGITS - len(ONNX_ENTRY)]
     assert sealed_onnx(content) == files("onnx").read_bytes()
     path = tmp_path / "model.onnx"
     path.write_bytes(sealed_onnx(content.replace(b'"level": "linear",', b'"level": "forced",')))

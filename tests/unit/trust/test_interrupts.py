@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from herglotz.cli import main
-from herglotz.data.lock import NAME, locked
+from herglotz.data.files import LOCK, locked
 from herglotz.errors import InputError
 
 HOLD = """
 import sys, time
-from herglotz.data.lock import locked
+from herglotz.data.files import locked
 with locked(sys.argv[1]):
     print("held", flush=True)
     time.sleep(600)
@@ -53,10 +53,10 @@ def test_a_second_writer_is_refused_and_a_dead_one_is_not(tmp_path):
         pass
     owner.kill()
     owner.communicate()
-    assert (tmp_path / NAME).exists()  # of a process that is no more
+    assert (tmp_path / LOCK).exists()  # of a process that is no more
     with locked(tmp_path), locked(tmp_path):  # `fit` locks again inside the command's lock
-        assert (tmp_path / NAME).read_text() == f"{os.getpid()}\n"
-    assert not (tmp_path / NAME).exists()
+        assert (tmp_path / LOCK).read_text() == f"{os.getpid()}\n"
+    assert not (tmp_path / LOCK).exists()
 
 
 def test_two_fits_in_one_folder(tmp_path, capsys):

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from herglotz.cli import main
-from herglotz.codegen import cache
-from herglotz.data.seal import sealed_text
+from herglotz.data import files as data_files
+from herglotz.data.files import sealed_text
 from herglotz.errors import InputError
-from herglotz.export import compile, compile_c, load_c, load_exported, trusted
+from herglotz.export import compile, compile_c, load_c, load_exported
 from tests.compilers import needs_compiler
 
 
@@ -19,7 +19,7 @@ def elsewhere(monkeypatch, tmp_path):
     """Call it, and the machine is another one: it has written nothing."""
 
     def move() -> None:
-        monkeypatch.setattr(trusted, "_written", set())
+        monkeypatch.setattr(data_files, "_written", set())
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "another"))
 
     return move
@@ -78,14 +78,14 @@ def test_an_onnx_file_needs_no_trust(files, elsewhere):
 def test_a_cache_that_others_can_write_to_is_not_used(model, tmp_path, monkeypatch):
     # fails if a library planted in a folder with 0777 is loaded; it stands there under the right name
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    folder = cache.private_folder("c")
+    folder = data_files.private_folder("c")
     assert folder == tmp_path / "herglotz" / "c"
     os.chmod(folder, 0o777)
-    assert cache.private_folder("c") != folder
+    assert data_files.private_folder("c") != folder
     compile_c(model)
     assert not list(folder.iterdir())
     os.chmod(folder, 0o700)
-    assert cache.private_folder("c") == folder
+    assert data_files.private_folder("c") == folder
 
 
 @needs_compiler
@@ -104,7 +104,7 @@ def test_half_a_library_is_compiled_again(model, tmp_path, monkeypatch):
 def test_one_temporary_folder_where_there_is_no_home(monkeypatch):
     # fails if every compilation leaves a folder behind
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/no")
-    assert cache.private_folder("c") == cache.private_folder("c")
+    assert data_files.private_folder("c") == data_files.private_folder("c")
 
 
 def test_an_internal_error_is_no_failed_check(monkeypatch, capsys):

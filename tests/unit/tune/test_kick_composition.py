@@ -15,8 +15,7 @@ from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
 from herglotz.tune import CompiledKicks, KickStepper, export_kicks_c, fit_kicks
 from herglotz.tune.distil import FlowProblem
-from herglotz.tune.kick_composition import _leapfrog, _misses
-from herglotz.tune.kick_header import kicks_c
+from herglotz.tune.kick_composition import _leapfrog, _misses, kicks_c
 from tests.compilers import needs_compiler
 
 H = 1.0

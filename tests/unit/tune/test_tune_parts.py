@@ -14,12 +14,11 @@ from herglotz.training import FitConfig, Run
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.recorded_range import box_of
 from herglotz.tune import Candidate, Setting, TuneConfig, distil, pareto, search, tune
-from herglotz.tune.config import allowed_failures
 from herglotz.tune.cost import Cost, Timed, measure_costs
 from herglotz.tune.distil import distillation, pairs_of, widened
 from herglotz.tune.local_error import flag_unresolved, local_errors
-from herglotz.tune.reference import JITTER, draw_starts, record
-from herglotz.tune.search import bound_of, choose
+from herglotz.tune.result import allowed_failures
+from herglotz.tune.search import JITTER, bound_of, choose, draw_starts, record
 
 H = 0.2
 FAST = TuneConfig(multiples=(1, 2), widths=(), artefacts=("eager",), tolerances=(None,), starts=60, rounds=1)

@@ -115,7 +115,7 @@ def test_motions_start_beside_the_recorded_ones():
     # fails if p is not spread, so that J is one number on one undamped motion, or spread far beyond what was recorded
     q, make = torch.zeros(4000, 2).double(), torch.Generator().manual_seed(0)
     p = torch.tensor([2.0, 0.1]).double() * torch.randn(4000, 2, generator=make, dtype=torch.float64)
-    opened = import_module("herglotz.verify.symmetries")._opened(State(q, p, q[:, 0]), make)
+    opened = import_module("herglotz.verify.verifier")._opened(State(q, p, q[:, 0]), make)
     ratio = (opened.p - p).std(0) / p.std(0)
     assert bool(((ratio > 0.27) & (ratio < 0.33)).all())
     assert bool((opened.q == q).all())

@@ -1,20 +1,53 @@
-"""Numbers of a model that are set at run time, in C: their structure, and the forces of inputs as functions of them."""
+"""Numbers in C: constants, and numbers of a model set at run time, with the forces of inputs that they determine."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from herglotz.codegen.c_function import as_scalars, whole
 from herglotz.codegen.trace import traced
-from herglotz.export.c_numbers import numbers, text_constant
 from herglotz.export.equation import Equations, dense, example
 from herglotz.export.lower.c import interpreted
 from herglotz.models import ContactLagrangian, refuse_own
 from herglotz.stepping.linearise import forward_slopes
+
+CONSTANT = re.compile(r"\bR\(([^()]*)\)")
+
+
+def number(value: float, dtype: str) -> str:
+    """One number as a C constant that a compiler reads back exactly."""
+    if dtype == "float64":
+        return _decimal(repr(float(value)))
+    return _decimal(f"{float(np.float32(value)):.9g}") + "f"
+
+
+def numbers(values: Iterable[float], dtype: str) -> str:
+    """A list of constants, several a line."""
+    words = [number(v, dtype) for v in values]
+    lines = [", ".join(words[k : k + 5]) for k in range(0, len(words), 5)]
+    return lines[0] if len(lines) == 1 else "\n  " + ",\n  ".join(lines)
+
+
+def written(text: str, dtype: str) -> str:
+    """The text with the constants of emitted functions, such as `R(0.5)`, written in the number type."""
+    return CONSTANT.sub(lambda m: number(float(m[1]), dtype), text)
+
+
+def text_constant(value: str) -> str:
+    """A C string constant, ASCII only."""
+    plain = {ord("\\"): "\\\\", ord('"'): '\\"', ord("?"): "\\?"}
+    escaped = (plain.get(b, chr(b) if 32 <= b < 127 else f"\\{b:03o}") for b in value.encode())
+    return '"' + "".join(escaped) + '"'
+
+
+def _decimal(digits: str) -> str:
+    return digits if any(mark in digits for mark in ".en") else digits + ".0"
+
 
 MARKED = re.compile(r"#if hz_P\b[^\n]*\n(?:.*?)(?:#else\n(.*?))?#endif /\* hz_P \*/\n", re.DOTALL)
 TOKENS = re.compile(r"hz_TAKES_THETA |hz_WITH_THETA\([^()]*\) | \+ hz_P\b")

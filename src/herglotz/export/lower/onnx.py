@@ -8,7 +8,7 @@ from typing import Any
 
 from torch.export import ExportedProgram
 
-from herglotz.data.seal import sealed_onnx
+from herglotz.data.files import sealed_onnx
 from herglotz.errors import InputError, refuse
 from herglotz.export.metadata import KEY, to_json
 from herglotz.export.programs import programs_of, quiet, writes

@@ -1,4 +1,4 @@
-/* The likelihood of a recording under the filter, for `herglotz.export.noise`: not part of what is exported. */
+/* The likelihood of a recording under the filter, for `herglotz.export.filtering`: not part of what is exported. */
 
 #include "stepper.h"
 

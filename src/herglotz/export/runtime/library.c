@@ -1,4 +1,4 @@
-/* Loops over samples around the header, for `herglotz.export.c_stepper`: not part of what is exported. */
+/* Loops over samples around the header, for `herglotz.export.load`: not part of what is exported. */
 
 #include "stepper.h"
 

@@ -8,9 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from herglotz.models.feature_kinetic import FeatureKinetic
-from herglotz.models.mass import PositionKinetic
-from herglotz.models.terms import Kinetic
+from herglotz.models.terms import FeatureKinetic, Kinetic, PositionKinetic
 from herglotz.training.parameter_vector import ParameterVector
 
 # Samples over which a mass is averaged.

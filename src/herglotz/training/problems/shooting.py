@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import AT_THE_NOISE, precisions
+from herglotz.data.noise import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper, state_of
 from herglotz.stepping.block_tridiagonal import eliminate

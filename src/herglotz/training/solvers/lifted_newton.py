@@ -189,7 +189,7 @@ def linear_steps(L_d: DiscreteLagrangian, x: Tensor, h: Tensor) -> tuple[Tensor,
 def _linear_inclusion(P: Partials, p0: Tensor, delta: Tensor) -> tuple[Tensor, Partials]:
     """The solution of the inclusion F(Δ) ∈ w Sgn(Δ), F linearised about `delta`, minus `delta`; and P there.
 
-    F is without dry friction, whose largest impulse is w. With z = Δ + λ/K as in `herglotz.stepping.stick_slip`, λ
+    F is without dry friction, whose largest impulse is w. With z = Δ + λ/K as in `herglotz.stepping.newton`, λ
     being the impulse of friction, G(z) = F(Δ) − K (z − Δ) = 0 is piecewise linear.
     """
     assert P.force is not None

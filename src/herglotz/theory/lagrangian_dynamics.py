@@ -1,9 +1,18 @@
-"""Discrete Lagrangian dynamics: curves on which the Herglotz action is stationary, and the discrete Cauchy problem.
+"""Discrete Lagrangian dynamics: the Herglotz action of a discrete curve, its stationary curves, and caustics.
 
-The ends of a curve are fixed, or its last point and an initial function S are given. Newton's method solves for all
-unknown points together. With δs_k as an unknown beside δq_k, the second variation couples neighbours only: the system
-is block tridiagonal with blocks of size n + 1. Block elimination is the Riccati recursion of the Hamilton–Jacobi
+The ends of a stationary curve are fixed, or its last point and an initial function S are given. Newton's method solves
+for all unknown points together. With δs_k as an unknown beside δq_k, the second variation couples neighbours only: the
+system is block tridiagonal with blocks of size n + 1. Block elimination is the Riccati recursion of the Hamilton–Jacobi
 equation, and a singular pivot is a caustic.
+
+At a caustic the map from the parameter of a family of solutions to q_N is singular. A family with S^k on Q is continued
+by S^{k+1}(y) = ext_x [S^k(x) + L_d(x, y, S^k(x))]. With p = dS^k(x),
+
+    W_k = D11 + p ⊗ D13 + D13 ⊗ p + D33 p ⊗ p + c d²S^k,    d²S^{k+1} = D22 − Jᵀ W_k⁻¹ J,    J = D12 + p ⊗ D23.
+
+The extremum is lost where the symmetric pivot W_k is singular, whether J is regular or not. A family has passed a
+caustic inside step k where the number of negative eigenvalues of W_k differs from that of the kinetic term. The
+eigenvalues of ∂q_{k+1}/∂q_k = −J⁻¹ W_k, J regular, decide nothing: with gyroscopic terms they may be complex.
 """
 
 from __future__ import annotations
@@ -14,15 +23,179 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
+from herglotz.errors import InputError
+from herglotz.mechanics import (
+    DiscreteLagrangian,
+    Partials,
+    momentum_jacobian,
+    momentum_minus,
+    momentum_plus,
+    partials,
+    step_derivative,
+)
+from herglotz.mechanics.legendre import least_singular_value, left_hessian, momentum_residual, scaled_margin
 from herglotz.mechanics.newton import Root, find_root
+from herglotz.mechanics.partials import value
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
 from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Rollout, State, Status, Step, StepError, status_of_root, step_sizes
 from herglotz.stepping.stepper import Stepper
-from herglotz.theory.action import curve_action, curve_partials
-from herglotz.theory.caustics import Opening, opening
-from herglotz.theory.function_germ import Function, FunctionGerm, germ
+from herglotz.theory.contact_manifolds import Function, FunctionGerm, germ
+from herglotz.theory.hamiltonian_dynamics import unforced
+
+
+@dataclass(frozen=True)
+class Action:
+    """The action variable s_k along a discrete curve, and the first variation of s_N."""
+
+    s: Tensor  # (..., N+1) s_0 … s_N
+    sigma: Tensor  # (..., N+1) σ_k = ∏_{j<k} c_j; ∂s_N/∂s_0 = σ_N
+    residual: Tensor  # (..., N−1, n) R_1 … R_{N−1}, the discrete Herglotz residuals
+    gradient: Tensor  # (..., N+1, n) ∂s_N/∂q_k
+
+
+def curve_action(
+    L_d: DiscreteLagrangian,
+    q: Tensor,  # (..., N+1, n)
+    s0: Tensor,  # (...)
+    h: Tensor | float,  # (), (N,) or (..., N)
+) -> Tensor:
+    """s_0 … s_N with s_{k+1} = s_k + L_d(q_k, q_{k+1}, s_k), shape (..., N+1).
+
+    Raise InputError if the curve has fewer than two points or h does not fit.  Source: discrete Cauchy problem of the
+    paper.
+    """
+    sizes = curve_steps(q, h)
+    s = [s0.expand(q.shape[:-2])]
+    for k in range(q.shape[-2] - 1):
+        s.append(s[-1] + value(L_d, q[..., k, :], q[..., k + 1, :], s[-1], sizes[..., k]))
+    return torch.stack(s, -1)
+
+
+def herglotz_action(L_d: DiscreteLagrangian, q: Tensor, s0: Tensor, h: Tensor | float) -> Action:
+    """The action s_N[q_0 … q_N; s_0] and its gradient in closed form.
+
+    q_k enters L_d(q_{k−1}, q_k) and L_d(q_k, q_{k+1}); all later steps depend on q_k through s alone. Hence
+
+        ∂s_N/∂q_k = (∏_{j>k} c_j) R_k,    R_k = D1L_d(q_k, q_{k+1}, s_k) + c_k D2L_d(q_{k−1}, q_k, s_{k−1})
+
+    with R_0 = D1L_d and, at the last point, ∂s_N/∂q_N = D2L_d = p_N. The gradients at interior points vanish exactly on
+    the solutions of the discrete Herglotz equations. Raise InputError if the curve has fewer than two points, h does
+    not fit, or L_d comes with forces.  Source: discrete Herglotz action and equations of the paper, indices by erratum
+    E3.
+    """
+    s = curve_action(L_d, q, s0, h)
+    P = curve_partials(L_d, q, s, h)
+    later = P.map(lambda x: x.narrow(P.L.ndim - 1, 1, s.shape[-1] - 2))
+    residual = momentum_residual(later, P.D2[..., :-1, :])
+    one = torch.ones_like(s[..., :1])
+    sigma = torch.cat([one, P.c.cumprod(-1)], -1)
+    # The product of the factors after k is not formed by division, because a factor c may be 0.
+    after = torch.cat([P.c[..., 1:].flip(-1).cumprod(-1).flip(-1), one], -1)
+    rows = torch.cat([P.D1[..., :1, :], residual], -2) * after[..., None]
+    return Action(s, sigma, residual, torch.cat([rows, P.D2[..., -1:, :]], -2))
+
+
+def curve_partials(L_d: DiscreteLagrangian, q: Tensor, s: Tensor, h: Tensor | float, order: int = 1) -> Partials:
+    """Partials of all N steps of a curve at once; every entry has a step axis, (..., N, *)."""
+    return unforced(partials(L_d, q[..., :-1, :], q[..., 1:, :], s[..., :-1], curve_steps(q, h), order))
+
+
+def curve_steps(q: Tensor, h: Tensor | float) -> Tensor:
+    """The sizes h of all steps of a curve, shape (..., N).
+
+    Raise InputError if the curve has fewer than two points or h is not positive or does not fit.
+    """
+    if q.ndim < 2 or q.shape[-2] < 2:
+        raise InputError(f"a discrete curve needs shape (..., N+1, n) with N >= 1, got {tuple(q.shape)}")
+    h = torch.as_tensor(h, dtype=q.dtype, device=q.device)
+    shape = (*q.shape[:-2], q.shape[-2] - 1)
+    try:
+        h = h.broadcast_to(shape)
+    except RuntimeError:
+        raise InputError(
+            f"a curve of {shape[-1]} steps needs h of shape (), (N,) or (..., N), got {tuple(h.shape)}"
+        ) from None
+    if not bool((h > 0).all()):
+        raise InputError(f"h must be > 0, got {float(h.min()):g}")
+    return h
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How far a family of solutions with n parameters has spread after N steps.
+
+    `final` is 0 at a caustic. It is the smallest singular value of Y_N = ∂q_N over the largest norm of any Y_k or,
+    where a J is singular, the smallest margin of any W_k. `crossed` is the first step inside which the family passes a
+    caustic, or −1. `slope` is ∂p_N/∂q_N = d²S^N.
+    """
+
+    final: Tensor  # (...)
+    crossed: Tensor  # (...)
+    slope: Tensor  # (..., n, n)
+
+
+def opening(
+    P: Partials,
+    p: Tensor,  # (..., N, n)
+    tangent: Tensor,  # (..., 2n+1, n)
+) -> Opening:
+    """Propagate the tangent vectors Y_k = ∂q_k and the pivots W_k of a family along its solution.
+
+    P are the second-order partials of the N steps, with entries (..., N, *), p the momenta p_0 … p_{N−1}, and `tangent`
+    the derivative of (q_0, p_0, s_0) by the parameter.
+
+    If p_0 is the parameter, Y_0 = 0 and a caustic is a conjugate point. If q_0 is the parameter, with p_0 = dS(q_0),
+    then Y_0 = 1 and a caustic is a point where W_k, the A + cα of the Riccati recursion, is singular.
+    """
+    n, point = p.shape[-1], not bool((tangent[..., : p.shape[-1], :] != 0).any())
+    J, D = momentum_jacobian(P, p), step_derivative(P, p)
+    A, kinetic = left_hessian(P, p), _negative_kinetic(J)
+    regular = (scaled_margin(J, J, P.D11, P.D22) > 1e3 * torch.finfo(p.dtype).eps).all(-1)
+    start = tangent[..., n : 2 * n, :]
+    # A point source has S¹ = L_d.
+    slope = P.D22[..., 0, :, :] if point else start
+    Y, current, margins = [tangent[..., :n, :]], tangent, []
+    crossed = first = torch.full_like(P.L[..., 0], -1, dtype=torch.long)
+    for k in range(p.shape[-2]):
+        current = D[..., k, :, :] @ current
+        Y.append(current[..., :n, :])
+        if k == 0 and point:
+            continue
+        bend = P.c[..., k, None, None] * slope
+        W = A[..., k, :, :] + bend
+        margins.append(scaled_margin(W, W, A[..., k, :, :], bend).nan_to_num(0.0))
+        count = _negative(W)
+        first = count if len(margins) == 1 else first
+        # A singular J does not determine the kinetic term; the inertia of the first pivot stands in for it.
+        passed = count != torch.where(regular, kinetic[..., k], first)
+        crossed = torch.where(passed & (crossed < 0), k, crossed)
+        slope = P.D22[..., k, :, :] - J[..., k, :, :].mT @ torch.linalg.solve_ex(W, J[..., k, :, :])[0]
+    largest = torch.stack([torch.linalg.matrix_norm(y, ord="fro") for y in Y], -1).amax(-1)
+    final = torch.nan_to_num(least_singular_value(Y[-1]) / largest, nan=0.0)
+    carried = torch.linalg.solve_ex(current[..., :n, :].mT, current[..., n : 2 * n, :].mT)[0]
+    slope = torch.where(regular[..., None, None], carried, slope)
+    if margins:
+        final = torch.where(regular, final, torch.stack(margins, -1).amin(-1))
+    return Opening(final, crossed, 0.5 * (slope + slope.mT))
+
+
+def _negative_kinetic(J: Tensor) -> Tensor:
+    """Number of negative eigenvalues of the kinetic term m/h, found from −J = m/h.
+
+    A strong magnetic field turns −J. Where the skew part of J exceeds its symmetric part, the latter says nothing about
+    the mass, and a positive kinetic term is assumed: the number is 0.
+    """
+    symmetric, skew = 0.5 * (J + J.mT), 0.5 * (J - J.mT)
+    turned = torch.linalg.matrix_norm(skew) > torch.linalg.matrix_norm(symmetric)
+    return torch.where(turned, 0, _negative(-symmetric))
+
+
+def _negative(W: Tensor) -> Tensor:
+    """Number of negative eigenvalues of a symmetric matrix; −1 where W is not finite, as after a caustic at a node."""
+    finite = torch.isfinite(W).all(-1).all(-1)
+    W = torch.where(finite[..., None, None], 0.5 * (W + W.mT), 0.0)
+    return torch.where(finite, (torch.linalg.eigvalsh(W) < 0).sum(-1), -1)
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,119 @@
-"""Gross errors in recorded positions: samples that no smooth motion explains, and readings of a sensor that stuck."""
+"""Estimates without a model: an upper bound on the noise of recordings, and gross errors in recorded positions.
+
+Gross errors are samples that no smooth motion explains, and readings of a sensor that stuck.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from herglotz.data.checks import offsets_of
+from herglotz.data.gaps import complete
+from herglotz.data.splits import SHOWN
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.window_polynomials import powers, pseudo_inverses
+from herglotz.data.windows import powers, pseudo_inverses
+
+# A polynomial of this degree is fitted to so many samples in a row.
+SAMPLES, DEGREE = SHOWN, 5
+# Degrees of `precision`. Noise leaves the same residual at each degree; coarsely sampled motion leaves less at higher
+# degrees.
+DEGREES = (3, 5, 7)
+# A residual is at the noise up to this factor times the precision: fitted states, and the estimate of the noise, leave
+# 10 to 30 % more.
+AT_THE_NOISE = 1.5
+# Windows, evenly spread: more do not change an RMS.
+MAX_WINDOWS = 4000
+
+
+def roughness(data: Trajectories, degree: int = DEGREE) -> float:
+    """Return the RMS residual of polynomials in time through nine samples in a row, in units of q over its balance.
+
+    Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Infinite if no trajectory has
+    nine samples. Steps may differ. Angles should be `unwrapped()`.
+    """
+    return float(_residuals(data, degree).square().mean().sqrt())
+
+
+def _residuals(data: Trajectories, degree: int) -> Tensor:
+    """`roughness` of every coordinate, (n,), by its own readings."""
+    q = data.q / data.balance
+    if data.observed is None:
+        return _of_readings(data.t, q, data.lengths, degree)
+    each = []
+    for x, known in zip(q.T, (data.observed > 0).T, strict=True):
+        lengths = [int(own.sum()) for own in known.split(data.lengths)]
+        each.append(_of_readings(data.t[known], x[known][:, None], lengths, degree))
+    return torch.cat(each)
+
+
+def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> Tensor:
+    """`roughness` of each column of q (N, k), read at times t (N,) of trajectories of these lengths, (k,)."""
+    firsts = [
+        torch.arange(first, first + length - SAMPLES + 1)
+        for first, length in zip(offsets_of(tuple(lengths)), lengths, strict=True)
+        if length >= SAMPLES
+    ]
+    if not firsts:
+        return torch.full((q.shape[1],), torch.inf, dtype=torch.float64)
+    rows = torch.cat(firsts)
+    rows = rows[:: -(-len(rows) // MAX_WINDOWS)].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device)
+    t, q = t[rows].double().cpu(), q[rows].double().cpu()
+    x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
+    inverses = pseudo_inverses(x, degree)
+    r = q - powers(x[: len(inverses)], degree) @ (inverses @ q)
+    return (r.square().mean((0, 1)) * SAMPLES / (SAMPLES - degree - 1)).sqrt()
+
+
+def precision(data: Trajectories) -> float:
+    """Standard deviation of the noise of q, estimated without a model; an upper bound for coarse data.
+
+    inf if no trajectory has nine samples.
+    """
+    return min(roughness(data, degree) for degree in DEGREES)
+
+
+def spread(data: Trajectories) -> float:
+    """Return the RMS of the positions about their means, in units of q."""
+    return float((data.q - data.q.mean(0)).square().mean().sqrt())
+
+
+def relative_spread(data: Trajectories) -> float:
+    """`spread` of the positions over their balance."""
+    return float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
+
+
+def coarse(data: Trajectories) -> bool:
+    """Whether `precision` is an error of the polynomials and not noise: the highest degree still halves the residual.
+
+    The residuals of white noise at the two highest degrees agree within a tenth.
+    """
+    *_, lower, highest = (roughness(data, degree) for degree in DEGREES)
+    return highest < lower / 2
+
+
+def precisions(data: Trajectories) -> Tensor:
+    """`precision` of every coordinate, (n,)."""
+    return torch.stack([_residuals(data, degree) for degree in DEGREES]).amin(0)
+
+
+def part_of(data: Trajectories, most: int) -> Trajectories:
+    """About `most` samples: every second, fourth … sample as long as polynomials follow the motion between them.
+
+    The result is cut to the runs of samples that move most. Data with no more than `most` samples stay unchanged.
+    Samples that lack positions are left out first: every m-th row may miss all rows of a slower sensor.
+    """
+    few = data if data.samples < 2 * most else complete(data)
+    while few.samples >= 2 * most and min(few.lengths) >= 2 * most / len(few) and not coarse(half := few.thinned(2)):
+        few = half
+    liveliest = few.liveliest(most)
+    return liveliest if liveliest.samples < few.samples / 2 else few
+
 
 # A sample is compared with the polynomial of degree 3 through four neighbours on either side.
-BESIDE, DEGREE = 4, 3
+BESIDE, SPIKE_DEGREE = 4, 3
 # A spike departs from that polynomial by more than all three of: so many times the RMS residual of the neighbours, so
 # many times the noise of the whole trajectory, and this part of the standard deviation of the motion (quantisation is
 # no gross error). tests/unit/data/test_spikes.py measures that no sample of smooth motion is a spike, with noise or
@@ -90,10 +194,10 @@ def _worst(t: Tensor, q: Tensor, size: Tensor, run: int) -> Tensor:
     inside = (place >= BESIDE) & (place < BESIDE + run)
     x = times - times[:, BESIDE : BESIDE + 1]
     x = x / x.abs().amax(1, keepdim=True)
-    c = pseudo_inverses(x[:, ~inside], DEGREE) @ values[:, ~inside]
-    r = powers(x, DEGREE) @ c - values
+    c = pseudo_inverses(x[:, ~inside], SPIKE_DEGREE) @ values[:, ~inside]
+    r = powers(x, SPIKE_DEGREE) @ c - values
     miss = r[:, inside].abs().amin(1)  # (W, n): the smallest departure in the run
-    local = (r[:, ~inside].square().sum(1) / (2 * BESIDE - DEGREE - 1)).sqrt()
+    local = (r[:, ~inside].square().sum(1) / (2 * BESIDE - SPIKE_DEGREE - 1)).sqrt()
     noise = 1.4826 * r[:, inside].abs().amax(1).median(0).values
     limit = torch.maximum(torch.maximum(LOCAL * local, NOISE * noise), size)
     if bool((noise > MAX_NOISE * size / SIZE).any()):
