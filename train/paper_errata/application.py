@@ -7,7 +7,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.mechanics import partials
-from herglotz.mechanics.scalar_fields import derivatives
+from herglotz.mechanics.partials import derivatives
 from herglotz.scenes import scene
 from herglotz.scenes.parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State

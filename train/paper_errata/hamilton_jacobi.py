@@ -7,7 +7,7 @@ from torch import Tensor
 
 from herglotz.mechanics import partials
 from herglotz.mechanics.contact import jacobian
-from herglotz.mechanics.scalar_fields import derivatives
+from herglotz.mechanics.partials import derivatives
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from herglotz.data import Trajectories
     from herglotz.data.holds import Arrival
     from herglotz.export import ExportedStepper
-    from herglotz.export.box import Box
+    from herglotz.export.step import Box
     from herglotz.stepping import Rollout, State, Stepper
     from herglotz.training.recorded_range import Beyond
 
@@ -228,7 +228,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     """
     import torch
 
-    from herglotz.export.box import Box, s_matters
+    from herglotz.export.step import Box, s_matters
     from herglotz.stepping import State
 
     if path.is_dir() or path.suffix.lower() not in endings():

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.export.box import Box, s_matters
 from herglotz.export.parameters import checked_values
+from herglotz.export.step import Box, s_matters
 from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
 from herglotz.stepping.events import Watch
 from herglotz.stepping.rollout import Plan, Track, without_lost_factors

@@ -1,4 +1,4 @@
-"""Derivatives of a discrete contact Lagrangian, through one door.
+"""Derivatives of a discrete contact Lagrangian, through one door; and of functions of (q, x, s).
 
 A discrete Lagrangian is any callable `L_d(q0, q1, s0, h) -> (...)`. If L_d has a method
 `partials(q0, q1, s0, h, order)`, as every learnable model has, the method supplies the derivatives; otherwise autograd
@@ -396,3 +396,44 @@ def _functional_forces(L_d: Forced, xs: tuple[Tensor, Tensor, Tensor], h: Tensor
     minus = F[..., :n], *(x.narrow(F.ndim - 1, 0, n) for x in by)
     plus = F[..., n:], *(x.narrow(F.ndim - 1, n, n) for x in by)
     return Forces(minus[0], plus[0], *minus[1:], *plus[1:])
+
+
+ScalarField = Callable[[Tensor, Tensor, Tensor], Tensor]
+Hamiltonian = ScalarField
+Lagrangian = ScalarField
+
+
+def derivatives(
+    f: ScalarField,
+    q: Tensor,  # (..., n)
+    x: Tensor,  # (..., n) p or v
+    s: Tensor,  # (...)
+    order: int = 1,
+) -> Partials:
+    """f(q, x, s) and its derivatives: D1 = f_q, D2 = f_x, D3 = f_s, D12 = f_qx and so on."""
+    return autograd_partials(lambda q, x, s, h: f(q, x, s), q, x, s, 0.0, order)  # noqa: ARG005
+
+
+def gradient(
+    F: Callable[[Tensor], Tensor],  # (..., m) → (...)
+    x: Tensor,  # (..., m)
+    order: int = 1,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """F, F_x and (order 2) F_xx with shapes (...), (..., m), (..., m, m)."""
+    P = autograd_partials(lambda x, _, s, h: F(x), x, x, x[..., 0], 0.0, order)  # noqa: ARG005
+    return P.L, P.D1, P.D11
+
+
+def square_jacobian(
+    # (..., m) → (..., k); f must treat the samples independently and accept one more leading dimension
+    f: Callable[[Tensor], Tensor],
+    x: Tensor,  # (..., m)
+    rows: int | None = None,  # () k, m by default
+) -> tuple[Tensor, Tensor]:
+    """f(x) and its Jacobian, as `contact.jacobian`, by one backward pass instead of k.
+
+    f is evaluated on k copies of x; the gradient of component i on copy i is row i of the Jacobian.
+    """
+    copies = x.expand(x.shape[-1] if rows is None else rows, *x.shape)
+    y, J, _ = gradient(lambda x: f(x).diagonal(dim1=0, dim2=-1).movedim(-1, 0), copies)
+    return y.movedim(0, -1), J.movedim(0, -2)

@@ -11,10 +11,9 @@ from torch import Tensor, nn
 from herglotz.errors import InputError
 from herglotz.mechanics import Forces, Partials
 from herglotz.models.action import ActionFlow, ActionPowers
-from herglotz.models.capabilities import Capabilities
+from herglotz.models.capabilities import Capabilities, DrivenLagrangian
 from herglotz.models.config import ModelConfig
 from herglotz.models.drag import Drag, parse_drag
-from herglotz.models.driven import DrivenLagrangian
 from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.friction import CoupledFriction, Friction
 from herglotz.models.jet import Jet, affine, coordinates

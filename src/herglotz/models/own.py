@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from herglotz.errors import InputError
 from herglotz.mechanics import ClosedForm, DiscreteLagrangian, Driven, Forced, Partials
 from herglotz.mechanics.partials import functional_partials
-from herglotz.models.capabilities import Capabilities
-from herglotz.models.driven import DrivenLagrangian
+from herglotz.models.capabilities import Capabilities, DrivenLagrangian
 
 # The terms of a user's L_d are unknown: every step iterates, and s may enter the motion.
 UNKNOWN = Capabilities(

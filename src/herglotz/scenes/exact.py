@@ -20,7 +20,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import Partials
 from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.scalar_fields import square_jacobian
+from herglotz.mechanics.partials import square_jacobian
 from herglotz.scenes.reference import Motion, lagrangian_motion
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step

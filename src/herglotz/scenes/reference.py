@@ -15,7 +15,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import join, split
-from herglotz.mechanics.scalar_fields import Lagrangian, derivatives
+from herglotz.mechanics.partials import Lagrangian, derivatives
 from herglotz.scenes.scene import State, StateFunction
 
 Balance = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]

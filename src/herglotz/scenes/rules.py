@@ -14,7 +14,7 @@ from torch import Tensor
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.newton import find_root, solve
-from herglotz.mechanics.scalar_fields import Lagrangian
+from herglotz.mechanics.partials import Lagrangian
 from herglotz.scenes.special import as_step
 
 # Ends the iteration of a scalar equation without a solution.

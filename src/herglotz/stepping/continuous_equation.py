@@ -26,8 +26,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import momentum_minus, momentum_plus, partials
 from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.partials import DiscreteLagrangian, Partials
-from herglotz.mechanics.scalar_fields import gradient
+from herglotz.mechanics.partials import DiscreteLagrangian, Partials, gradient
 from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.stepping.stepper import Stepper

@@ -28,7 +28,7 @@ from herglotz.mechanics import DiscreteLagrangian, Forces, Partials, momentum_ja
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus
 from herglotz.mechanics.newton import Point, attached
 from herglotz.models import ContactLagrangian
-from herglotz.models.driven import DrivenLagrangian
+from herglotz.models.capabilities import DrivenLagrangian
 from herglotz.stepping.equation import End
 from herglotz.stepping.newton import find_root, status_of
 from herglotz.stepping.state import State, Status

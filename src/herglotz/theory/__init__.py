@@ -5,13 +5,13 @@
     Discrete Lagrangian dynamics       lagrangian_dynamics
     Discrete Hamiltonian dynamics      hamiltonian_dynamics
     Discrete Hamilton–Jacobi theory    hamilton_jacobi, hopf_lax
-    The conclusions                    evolution, hj_on_qxr, degenerate, tulczyjew, explicit_time
+    The conclusions                    evolution, hj_on_qxr, degenerate, explicit_time
     Beyond the paper                   noether, symmetries, constrained, rigid_body
 
 `docs/paper.md` lists every equation of the paper with its function and its test.
 """
 
-from herglotz.mechanics.scalar_fields import derivatives as derivatives
+from herglotz.mechanics.partials import derivatives as derivatives
 from herglotz.stepping.continuous_equation import (
     ContinuousEquation as ContinuousEquation,
     FractionalStepper as FractionalStepper,
@@ -53,7 +53,13 @@ from herglotz.theory.continuous import (
 )
 from herglotz.theory.degenerate import (
     LegendrianStepper as LegendrianStepper,
+    TulczyjewTriple as TulczyjewTriple,
+    left_leg as left_leg,
+    left_leg_states as left_leg_states,
     legendrian_relation as legendrian_relation,
+    right_leg as right_leg,
+    right_leg_states as right_leg_states,
+    tulczyjew_triple as tulczyjew_triple,
 )
 from herglotz.theory.evolution import EvolutionStepper as EvolutionStepper, midpoint_gradient as midpoint_gradient
 from herglotz.theory.explicit_time import (
@@ -118,11 +124,3 @@ from herglotz.theory.rigid_body import (
     hat as hat,
 )
 from herglotz.theory.symmetries import Symmetries as Symmetries, symmetries as symmetries
-from herglotz.theory.tulczyjew import (
-    TulczyjewTriple as TulczyjewTriple,
-    left_leg as left_leg,
-    left_leg_states as left_leg_states,
-    right_leg as right_leg,
-    right_leg_states as right_leg_states,
-    tulczyjew_triple as tulczyjew_triple,
-)

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import Triple, contact_form, jacobian, join, split
-from herglotz.mechanics.scalar_fields import ScalarField, derivatives, gradient
+from herglotz.mechanics.partials import ScalarField, derivatives, gradient
 
 Field = Callable[[Tensor, Tensor, Tensor], Triple]
 

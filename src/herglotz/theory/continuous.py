@@ -23,7 +23,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import join
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.scalar_fields import Hamiltonian, Lagrangian, ScalarField, derivatives, gradient
+from herglotz.mechanics.partials import Hamiltonian, Lagrangian, ScalarField, derivatives, gradient
 from herglotz.theory.contact_manifolds import Field, Function, prolongation
 
 

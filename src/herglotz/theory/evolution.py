@@ -19,7 +19,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import attached, find_root
-from herglotz.mechanics.scalar_fields import Hamiltonian, gradient, square_jacobian
+from herglotz.mechanics.partials import Hamiltonian, gradient, square_jacobian
 from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 from herglotz.theory.contact_manifolds import sharp_bivector

@@ -27,8 +27,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import jacobian
-from herglotz.mechanics.partials import partials
-from herglotz.mechanics.scalar_fields import gradient
+from herglotz.mechanics.partials import gradient, partials
 from herglotz.stepping import Rollout, State, Stepper
 from herglotz.stepping.state import Step
 

@@ -17,8 +17,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus, momentum_residual
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.partials import DiscreteLagrangian, partials
-from herglotz.mechanics.scalar_fields import Hamiltonian, derivatives
+from herglotz.mechanics.partials import DiscreteLagrangian, Hamiltonian, derivatives, partials
 from herglotz.theory.continuous import contact_vector_field
 
 # p = γ(q, s), (..., n) and (...) → (..., n).

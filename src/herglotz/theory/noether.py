@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.contact import Triple, jacobian
-from herglotz.mechanics.partials import DiscreteLagrangian, value
-from herglotz.mechanics.scalar_fields import Hamiltonian, ScalarField, gradient
+from herglotz.mechanics.partials import DiscreteLagrangian, Hamiltonian, ScalarField, gradient, value
 from herglotz.theory.contact_manifolds import jacobi_bracket
 
 # g(ε, q): (...) and (..., n) → (..., n), with g(0, q) = q.

@@ -7,7 +7,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import join
-from herglotz.mechanics.scalar_fields import gradient
+from herglotz.mechanics.partials import gradient
 from herglotz.scenes import reference_flow, scene
 from herglotz.stepping import State, Status
 from herglotz.theory import (
