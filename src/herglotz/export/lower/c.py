@@ -85,7 +85,7 @@ class GivenPotential(nn.Module):
 
 
 class StepParts:
-    """The terms of a step, for `herglotz.export.lower.c`.
+    """The terms of a step, for `StepInC`.
 
     Where the step is explicit, the guess is the solution, and J is 0.
     """
@@ -98,7 +98,7 @@ class StepParts:
 
         The arguments are q, p (B, n), s, h (B,), V0 (B,) and V′ (B, n) at q0, a trial Δ = q1 − q0 and the exact Δ near
         the trial (B, n), V1 and V′ at q1, and u (B, m) where the model takes inputs. Where dry friction can hold a
-        coordinate, Δ stands for the z of `herglotz.stepping.newton`, and w/K is a last result.
+        coordinate, Δ stands for the z of `herglotz.stepping.newton.StickSlip`, and w/K is a last result.
         """
         (q, p, s, h, V0, slope0, delta, x, V1, slope1), u = arguments[:10], arguments[10:]
         ends = Field(V0, slope0), Field(V1, slope1)
