@@ -32,7 +32,7 @@ ALIKE: list[tuple[str, str, int, str, str]] = [
     ("mechanics/partials.py", "a, b, s = q0 * 1, q1 * 1, s0 * 1", 13, "/", "x / 1 is x * 1"),
     ("mechanics/partials.py", "a, b, s = q0 * 1, q1 * 1, s0 * 1", 21, "/", "x / 1 is x * 1"),
     ("mechanics/partials.py", "a, b, s = q0 * 1, q1 * 1, s0 * 1", 29, "/", "x / 1 is x * 1"),
-    ("export/step_parts.py", "return guess, point.F, point.J, dp, end.L + (end.p1 * (x - delta)).sum(-1), point.rest.D3", 71, "", "the last axis of (B, n) is the first after B"),
+    ("export/lower/c.py", "return guess, point.F, point.J, dp, end.L + (end.p1 * (x - delta)).sum(-1), point.rest.D3", 71, "", "the last axis of (B, n) is the first after B"),
     ("stepping/newton.py", "good = bool((done & torch.isfinite(residual + merit + L) & (c != 0)).all())", 44, "-", "the difference of numbers that are not finite is none either"),
     ("stepping/newton.py", "good = bool((done & torch.isfinite(residual + merit + L) & (c != 0)).all())", 52, "-", "the difference of numbers that are not finite is none either"),
 ]  # fmt: skip

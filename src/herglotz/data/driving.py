@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -28,12 +27,6 @@ from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.readers import load
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from herglotz.data.trajectories import Trajectories
-
 
 # Straight pieces of a polynomial between samples. At nine samples a period they miss the polynomial by a thousandth.
 PIECES_PER_STEP = 8

@@ -18,7 +18,7 @@ from herglotz.data.files import PathLike, sealed_text, write_trusted
 from herglotz.data.holds import Arrival
 from herglotz.errors import InputError
 from herglotz.export.equation import Equations
-from herglotz.export.lower.c import StepInC, as_lanes, model_source
+from herglotz.export.lower.c import StepInC, as_lanes, model_source, pushed
 from herglotz.export.lower.c_parameters import (
     constants as parameter_constants,
     inputs_constants,
@@ -32,7 +32,6 @@ from herglotz.export.lower.c_parameters import (
 from herglotz.export.metadata import EXTRAS, check_metadata, describe, from_json
 from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step import MAX_ITERATIONS, ROUNDING_EPSILONS
-from herglotz.export.step_parts import pushed
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "

@@ -58,7 +58,7 @@ class Terms:
 def step_equation(model: ContactLagrangian, bounds: int, *x: Tensor) -> tuple[Tensor, ...]:
     """A Newton step from a trial Δ and the end of the step there: −J⁻¹F, |J⁻¹cp0|, |F|, p1, L, c, J.
 
-    Where the arguments end with K and w/K (`bounds` is 2), Δ is the z of `herglotz.stepping.newton`.
+    Where the arguments end with K and w/K (`bounds` is 2), Δ is the z of `herglotz.stepping.newton.StickSlip`.
     """
     (q, p, s, h, delta), more, sticking = x[:5], x[5 : len(x) - bounds], x[len(x) - bounds :]
     form = terms = Terms(model, State(q, p, s), h, more)

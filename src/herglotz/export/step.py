@@ -11,7 +11,7 @@ The carry is q, p, s; then V and V′ at q where the model's terms are known; th
 continues them; then, in float32, the rounding errors of q and s (Kahan's sum; without it a digit is lost every ten
 steps). Vectors are (B, n), scalars of a sample (B,). Newton's unknown is Δ = q1 − q0, because the difference q1 − q0
 would lose the digits of a small step; where dry friction can hold a coordinate, the unknown is the z of
-`herglotz.stepping.newton`.
+`herglotz.stepping.newton.StickSlip`.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def begin(h: Tensor, trail: Tensor) -> Values:
 
 
 def begin_sticking(model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
-    """Newton's first carry in z, K and w/K: `herglotz.stepping.newton`."""
+    """Newton's first carry in z, K and w/K: `herglotz.stepping.newton.StickSlip`."""
     equation = Terms(model, State(q, p, s), h, u).equation
     assert isinstance(equation, PartialsEquation)
     z, *bounds = at_rest(equation)
@@ -219,7 +219,7 @@ def _appended(trail: Tensor, v: Tensor) -> Tensor:
 class StepGraphs(nn.Module):
     """The traced functions of a step, of a model that is not trained any more.
 
-    `box` and `h_range` are those that the model was fitted in, for the output `outside` (`herglotz.export.step`).
+    `box` and `h_range` are those that the model was fitted in, for the output `outside` (`Box`).
     """
 
     def __init__(

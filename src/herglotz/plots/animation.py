@@ -6,7 +6,6 @@ import base64
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,9 +18,7 @@ from herglotz.data.units import as_recorded
 from herglotz.errors import InputError
 from herglotz.plots.motion import DATA
 from herglotz.plots.style import DPI, INK, MODEL, MUTED, SHADE, UNSEEN, captions, new_figure, styled, with_unit
-
-if TYPE_CHECKING:
-    from herglotz.training import Run
+from herglotz.training import Run
 
 # Six seconds, in a file below 1 MB.
 FRAMES, FRAMES_PER_SECOND, COLOURS = 120, 20, 64

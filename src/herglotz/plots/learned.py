@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import product
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -24,11 +23,8 @@ from herglotz.plots.style import (
     styled,
     with_unit,
 )
+from herglotz.training import Bands, Laplace, Run
 from herglotz.training.learned_functions import LearnedFunction, learned_functions
-
-if TYPE_CHECKING:
-    from herglotz.training import Bands, Laplace, Run
-
 
 MAX_COLUMNS, POINTS = 3, 161
 # Functions are drawn beyond the data, on both sides by this part of the data's range.

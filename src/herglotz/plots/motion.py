@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,10 +16,8 @@ from herglotz.data.splits import leading
 from herglotz.data.units import as_recorded, common_unit, size
 from herglotz.errors import InputError
 from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, captions, label, new_figure, styled, with_unit
-
-if TYPE_CHECKING:
-    from herglotz.training import Run
-    from herglotz.training.predict import Prediction
+from herglotz.training import Run
+from herglotz.training.predict import Prediction
 
 MAX_PANELS, DATA = 4, "#B5B5B5"
 # The RMS is written if its part takes more than this part of the axis. The text itself takes 0.15 of the axis in a

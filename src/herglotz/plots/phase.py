@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,14 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from herglotz.models import ContactLagrangian
 from herglotz.plots.motion import momentum_unit, trained_mask
 from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, position_axis, styled, with_unit
 from herglotz.stepping import State, Stepper
+from herglotz.training import Run
 from herglotz.training.flow import motion
-
-if TYPE_CHECKING:
-    from herglotz.models import ContactLagrangian
-    from herglotz.training import Run
 
 # Starts of rollouts along each axis of a panel, and panels.
 LINES, MAX_PANELS = 13, 3

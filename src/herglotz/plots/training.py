@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from itertools import groupby
 from textwrap import fill
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,12 +15,9 @@ from matplotlib.ticker import MaxNLocator
 from herglotz.data.units import common_unit
 from herglotz.errors import InputError
 from herglotz.plots.style import INK, MODEL, MUTED, SUPPORT, UNSEEN, label, logarithmic, new_figure, styled, with_unit
+from herglotz.training import Run
 from herglotz.training.plan import Plan
-
-if TYPE_CHECKING:
-    from herglotz.training import Run
-    from herglotz.training.selection import Selection
-
+from herglotz.training.selection import Selection
 
 # Name of a stage, and the cost of every iteration.
 Stage = tuple[str, list[float]]

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from herglotz.data.units import common_unit
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, styled, with_unit
-
-if TYPE_CHECKING:
-    from herglotz.tune.result import Candidate, Tuning
+from herglotz.tune.result import Candidate, Tuning
 
 # The axis is logarithmic: an error of 0, that of the run's own setting, is drawn here.
 FLOOR = 1e-16

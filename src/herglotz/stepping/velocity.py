@@ -6,7 +6,7 @@ acts in F⁻ as a whole (`herglotz.models.friction`), so p lacks half an impulse
 
     p ∈ L_v(q, v, s) + (h/2) r(q, v) Sgn(v),
 
-with r the largest force. The inverse is an inclusion like a step, and `herglotz.stepping.newton` solves the
+with r the largest force. The inverse is an inclusion like a step, and `herglotz.stepping.newton.StickSlip` solves the
 inclusion: v = 0 where friction can hold p. For any other L_d, p is the mean of both discrete transforms of a step,
 
     p = ½ (FL⁻p + FL⁺p) of (q − hv/2, q + hv/2, s − L_d/2),

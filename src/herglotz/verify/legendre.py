@@ -6,7 +6,7 @@ stays at q1 = q0 for all states nearby: q1 does not depend on p0, so that M = �
 coordinates alone. The holding impulse balances the momentum, F⁻ = −D1 − c p0. Friction can supply the impulse if the
 part λ of dry friction is within c h (τ + ε).
 
-Source: `herglotz.stepping.newton`.
+Source: `herglotz.stepping.newton.StickSlip`.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def regularity(subject: Subject, w: SampledRollout) -> Check:
 
     Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. If det M has both
     signs among the samples, M is singular between the samples. M is restricted to sliding coordinates, because a step
-    does not depend on the momentum of a stuck coordinate (`herglotz.verify.legendre`).
+    does not depend on the momentum of a stuck coordinate.
     """
     with torch.no_grad():
         M, sizes, slides, note = _map_hessians(w) if subject.L_d is None else _hessians(subject, w)
