@@ -61,6 +61,15 @@ def test_a_term_without_a_rule_of_order_4_keeps_order_2():
     assert settings(trial, search.config)[0].order == 2
 
 
+@pytest.mark.parametrize("noise", [0.0, NOISE])
+def test_segments_of_exact_data_are_missed_by_the_rule_alone(noise):
+    # fails if the search of exact data is given up over segments, where the rule of order 2 is all that is missed
+    search = searched(simulate(scene("cart_pole"), trajectories=1, steps=100, h=0.02, noise=noise, seed=0))
+    missing = SimpleNamespace(fitter=there(search.begun).fitter, segments_at_the_noise=False)
+    search.begun = cast(Any, missing)
+    assert search.misses_segments == bool(noise)
+
+
 def test_a_cart_and_its_pole_are_found_in_noise():
     # fails if the search ends in masses that turn with their own angle, or keeps a mass or a spring that cart and pole
     # lack. The mass between them is 0.15/1.3 of both; the cart's unit is 500 times the pole's
