@@ -20,7 +20,7 @@ from herglotz.data.input_terms import SATURATIONS, all_input_terms, saturation
 from herglotz.data.smoothing import smoothed
 from herglotz.least_squares import least_squares
 from herglotz.models.drag import input_forces
-from herglotz.training.acceleration_terms import acceleration_terms, for_each
+from herglotz.training.baseline import acceleration_terms, for_each
 from herglotz.training.dictionary import by_motion
 from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.trials import Trial, Variant

@@ -177,3 +177,21 @@ def differences(data: Trajectories, drag: bool = False) -> Differences:
         half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
         columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)
     return Differences(t, v, a, columns, max_step)
+
+
+def acceleration_terms(data: Trajectories) -> Differences:
+    """The terms of `estimate_baseline`, and for each coordinate second harmonics or powers, and its own friction.
+
+    Angles have second harmonics, lengths the powers 2 and 3; friction is viscous and quadratic.
+    """
+    found = differences(data)
+    own = []
+    for q, w, angle in zip(found.triples.q1.T, found.v.T, data.angles, strict=True):
+        waves = [(2 * q).sin(), (2 * q).cos()] if angle else [q.square(), q**3]
+        own.append(torch.stack([*waves, w, w * w.abs()], -1))
+    return found._replace(columns=torch.cat([found.columns, for_each(torch.stack(own, 1))], -1))
+
+
+def for_each(own: Tensor) -> Tensor:
+    """Columns (T, n, k) of each coordinate in its own equation, with coefficients of its own, (T, n, n k)."""
+    return (torch.eye(own.shape[1]).to(own)[:, :, None] * own[:, None]).flatten(2)

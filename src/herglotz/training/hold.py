@@ -23,8 +23,7 @@ from herglotz.data.smoothing import smoothed
 from herglotz.data.splits import liveliest_rows
 from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
-from herglotz.training.acceleration_terms import acceleration_terms, for_each
-from herglotz.training.baseline import differences
+from herglotz.training.baseline import acceleration_terms, differences, for_each
 
 # Least mean over blocks of log(mean square without / with). Measured: 0.36 to 3.9 for delays of 0.4 and 2.3 steps that
 # noise of 1 % lets see, up to 0.16 for errors of the linear model itself.

@@ -18,6 +18,7 @@ from herglotz.errors import InputError, refuse
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import free_runs
@@ -27,6 +28,10 @@ from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
 from herglotz.training.sensor_zeros import zeros_of_one
 from herglotz.training.smoother import process_noise, smoothed_states
+from herglotz.training.stages import Stages
+from herglotz.training.task import Task
+from herglotz.training.trajectory_fit import fit_states
+from herglotz.training.verdict import STATE_ITERATIONS
 
 # Leading samples that the state is estimated from.
 WARMUP = 20
@@ -186,6 +191,23 @@ def predict(
     rows = [(data.trajectory == b).nonzero()[:, 0] for b in range(len(data))]
     beyond = farthest(quantities_outside(run.box, data, data.t[r], x.q[r], x.p[r]) for r in rows)
     return Prediction(data, x, warmup, every, most, outside, zeros, beyond, v)
+
+
+def missed_from_best_start(run: FittedRun, data: Trajectories) -> tuple[float, ...] | None:
+    """RMS misfit of each coordinate, in its units, by free runs whose start states are fitted to whole recordings.
+
+    A warm-up tells a velocity to about σ √12 / (T √K), K samples over a time T, and a free run carries the error on.
+    From no other start does the model miss less. `data` are those of a `Prediction`. None if the model
+    follows only parts of the recordings.
+    """
+    base = estimate_baseline(data, substeps=run.decided.substeps)
+    task = Task(data, base, replace(run.decided, iterations=STATE_ITERATIONS), Stages())
+    found = fit_states(task, run.model, run.metrics.get("sigma") or task.exact)
+    if found is None or found.problem.grid.segments > len(data):
+        return None
+    with torch.no_grad():
+        missed = (found.problem.misfit(found.path) * data.balance)[data.complete]
+    return tuple(missed.square().mean(0).sqrt().tolist())
 
 
 def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:

@@ -32,10 +32,20 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import clear, differing_zeros
-from herglotz.training.strengths import likeliest, needed
 from herglotz.training.task import build_model
-from herglotz.training.trials import ALIKE, FINER, ITERATIONS, MAX_MISFIT, Fitter, Trial, is_precise, moved
-from herglotz.training.variants import Variant
+from herglotz.training.trials import (
+    ALIKE,
+    FINER,
+    ITERATIONS,
+    MAX_MISFIT,
+    Fitter,
+    Trial,
+    Variant,
+    is_precise,
+    likeliest,
+    moved,
+    needed,
+)
 
 # Samples of the part that is searched, if there are more than twice as many.
 SAMPLES_OF_A_PART = 2000

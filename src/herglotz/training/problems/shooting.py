@@ -24,13 +24,12 @@ from herglotz.data.noise import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper, state_of
 from herglotz.stepping.block_tridiagonal import eliminate
-from herglotz.training.arrowhead import Arrowhead
+from herglotz.training.arrowhead import Arrowhead, Sums
 from herglotz.training.distributed import everywhere, world
 from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import SegmentGrid
-from herglotz.training.problems.interpolation import between_nodes, between_samples
+from herglotz.training.problems.grid import SegmentGrid, between_nodes, between_samples
 from herglotz.training.problems.joint_masses import JointMasses
 from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.problems.prior import Gaussian
@@ -42,7 +41,6 @@ from herglotz.training.solvers.lifted_newton import (
     solve_path,
     step_derivatives,
 )
-from herglotz.training.sums import Sums
 
 # Leading samples that determine the start of a free run: q and q̇ follow from three samples, forces do not.
 START_SAMPLES = 3
