@@ -1,7 +1,10 @@
-"""JᵀJ of multiple shooting: a border of parameters around block tridiagonal states of segments.
+"""JᵀJ of parameters and the states of trajectories: a border of parameters around block tridiagonal states.
 
 ⎡ C  Bᵀ ⎤     C (P, P): parameters
-⎣ B  T  ⎦     T: starts of segments, block tridiagonal; B (S, d, P): starts by parameters
+⎣ B  T  ⎦     T: states, block tridiagonal; B (S, d, P): states by parameters
+
+The S states are those at the starts of all segments (`problems.shooting`), or at all nodes (`problems.smoothing`).
+Eliminating the states, (C − Bᵀ T⁻¹ B) δθ = b_θ − Bᵀ T⁻¹ b_x, takes a time that grows with S, not with its cube.
 """
 
 from __future__ import annotations
@@ -13,6 +16,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from herglotz.stepping.block_tridiagonal import Blocks, eliminate
+from herglotz.training.distributed import everywhere, of_first
 from herglotz.training.problems.grid import SegmentGrid
 
 # (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None if T is not positive definite
@@ -26,7 +31,7 @@ class Arrowhead:
     corner: Tensor  # (P, P)
     border: Tensor  # (S, d, P)
     blocks: Tensor  # (S, d, d) diagonal of T
-    upper: Tensor  # (S, d, d) right of it; 0 behind the last segment of a trajectory
+    upper: Tensor  # (S, d, d) right of it; 0 behind the last state of a trajectory
     eliminate: Eliminate
 
     def __matmul__(self, v: Tensor) -> Tensor:
@@ -57,20 +62,36 @@ class Arrowhead:
         return A
 
     def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(matrix + diag(damping))⁻¹ b by eliminating the states first; None if there is no finite solution."""
-        P, (S, d) = len(self.corner), self.border.shape[:2]
-        blocks = self.blocks + torch.diag_embed(damping[P:].reshape(S, d))
-        solved = self.eliminate(blocks, self.upper, torch.cat([self.border, b[P:].reshape(S, d, 1)], -1))
-        if solved is None:
+        """(matrix + diag(damping))⁻¹ b; None if some process finds no finite solution."""
+        step = self._solved(b.double(), damping.double())
+        return of_first(step.to(b))[0] if everywhere(step is not None) and step is not None else None
+
+    def _solved(self, b: Tensor, damping: Tensor) -> Tensor | None:
+        """The solution by eliminating the states first, in float64."""
+        P, (S, d), border = len(self.corner), self.border.shape[:2], self.border.double()
+        blocks = self.blocks.double() + torch.diag_embed(damping[P:].reshape(S, d))
+        columns = torch.cat([border, b[P:].reshape(S, d, 1)], -1)
+        if (solved := self.eliminate(blocks, self.upper.double(), columns)) is None:
             return None
-        taken = self.border.flatten(0, 1).T @ solved.flatten(0, 1)
-        reduced = self.corner + torch.diag(damping[:P]) - taken[:, :P]
+        taken = border.flatten(0, 1).T @ solved.flatten(0, 1)
+        reduced = self.corner.double() + torch.diag(damping[:P]) - taken[:, :P]
         factor, info = torch.linalg.cholesky_ex((reduced + reduced.T) / 2)
         if int(info) != 0:
             return None
         top = torch.cholesky_solve((b[:P] - taken[:, P])[:, None], factor)[:, 0]
         step = torch.cat([top, (solved[..., -1] - solved[..., :-1] @ top).flatten()])
         return step if bool(torch.isfinite(step).all()) else None
+
+
+def eliminated(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
+    """T⁻¹ columns, (..., K, d, R), of each of several chains of K states; None if the result is not finite."""
+    x = eliminate(tridiagonal(diagonal, upper), columns)
+    return x if bool(torch.isfinite(x).all()) else None
+
+
+def tridiagonal(diagonal: Tensor, upper: Tensor) -> Blocks:
+    """The blocks of the symmetric matrix T of chains of K states, (..., K, d, d) each."""
+    return diagonal, upper, torch.cat([torch.zeros_like(upper[..., :1, :, :]), upper[..., :-1, :, :].mT], -3)
 
 
 def dense(A: Tensor | Any) -> Tensor:

@@ -23,8 +23,7 @@ from herglotz.data import Trajectories
 from herglotz.data.noise import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper, state_of
-from herglotz.stepping.block_tridiagonal import eliminate
-from herglotz.training.arrowhead import Arrowhead, Sums
+from herglotz.training.arrowhead import Arrowhead, Sums, eliminated
 from herglotz.training.distributed import everywhere, world
 from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
@@ -263,9 +262,7 @@ class ShootingProblem(StatesProblem):
         """T⁻¹ columns, (S, d, R), for a block tridiagonal matrix T; None if that fails."""
         if self.compiled is not None:
             return self.compiled.kernel.eliminate(diagonal, upper, columns)
-        lower = torch.cat([torch.zeros_like(upper[:1]), upper[:-1].mT])
-        x = eliminate((diagonal, upper, lower), columns)
-        return x if bool(torch.isfinite(x).all()) else None
+        return eliminated(diagonal, upper, columns)
 
     def states_at(self, path: Path, samples: Tensor, d: int | None = None) -> Tensor:
         """The fitted state (…, d) at recorded samples, where the segments of the next stage, with its own d, start.
