@@ -15,14 +15,14 @@ from herglotz.data.input_terms import input_terms_of, with_input_terms, with_wav
 from herglotz.data.sensors import measured
 from herglotz.data.splits import leading, leading_rows
 from herglotz.errors import InputError, refuse
-from herglotz.stepping import State, Stepper, state_of
+from herglotz.stepping import State, state_of
 from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.free_run import free_runs
-from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
+from herglotz.training.free_run import run_on
+from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
@@ -181,7 +181,9 @@ def predict(
     _check_lengths(data, warmup, every)
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)
-    grid = _free_run(run.stepper, data, states, warmup, high)
+    grid = run_on(run.stepper, data, states, (warmup,) * len(data), high)
+    # Every trajectory is longer than its warm-up.
+    assert grid is not None
     h = grid.h[inside := torch.arange(grid.longest) < grid.end[:, None]]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
@@ -357,13 +359,3 @@ def _smoothed(run: FittedRun, data: Trajectories) -> tuple[Tensor, float] | None
     settings: dict[str, Any] = {"sigma": _sigma(run), "freedom": freedom, "balance": run.data.balance.to(data.q)}
     found = smoothed_states(problem := SmoothingProblem(run.model, data, grid, process=process, **settings))
     return None if found is None else (problem.states(found[0]), found[1])
-
-
-def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:
-    """Fill in the states after the warm-up of every trajectory, stepped as one batch; return the grid of steps."""
-    rows = (~leading(data.lengths, (warmup - 1,) * len(data))).nonzero()[:, 0]
-    rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
-    grid = segment_grid(rest, rest.samples, max_step)
-    inputs = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
-    states[rows] = grid.at_samples(free_runs(stepper, rest, grid, states[rows[grid.start_sample]], inputs))
-    return grid
