@@ -123,7 +123,7 @@ class Sums(NamedTuple):
         This sets `slopes` too.
         """
         P, n = len(self.corner), r.shape[1]
-        rows, segment = Z.flatten(0, 1)[grid.node][:, :n] * by[..., None], grid.node // (grid.h.shape[1] + 1)
+        rows, segment = Z.flatten(0, 1)[grid.node][:, :n] * by[..., None], grid.segment
         for k in range(grid.segments):
             own, right = rows[segment == k].flatten(0, 1), r[segment == k].flatten()
             by_theta, by_state = own[:, :P], own[:, P:]

@@ -16,8 +16,9 @@ from dataclasses import replace
 from torch import Tensor
 
 from herglotz.models.config import POWERS
+from herglotz.models.drag import input_columns
 from herglotz.progress import MORE_TERMS, inside, part
-from herglotz.training.acting_inputs import columns_of, taken_terms
+from herglotz.training.acting_inputs import asked_terms, taken_terms
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
 from herglotz.training.trials import ITERATIONS, Trial, Variant
@@ -78,7 +79,7 @@ class Questions:
         that only made up for the hold leave. Terms make up so well for a wrong hold, u(t + τ) being u + τ u′, that no
         other may be found beside them: where there are rates, or the noise is not met, every hold is tried without.
         """
-        if self.best is None or not (terms := self.read.input_terms(self.best)):
+        if self.best is None or not (terms := asked_terms(self.read, self.best)):
             return
         recorded = self.wanted, self.read
         read = self.read.driven_by(terms)
@@ -103,7 +104,7 @@ class Questions:
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
         """Keep these terms of the inputs, the search of the part that has them, and its model."""
-        self.input_terms, self.wanted = columns_of(terms), wanted.driven_by(terms)
+        self.input_terms, self.wanted = input_columns(terms), wanted.driven_by(terms)
         self.read, self.best = read, found
 
     def functions(self) -> None:

@@ -121,7 +121,7 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
     for _ in range(DRIFT_FITS):
         problem = trial.problem.of(trial.problem.parameters.numbers, trial.problem.sigma, trial.prior)
         target = WithZeros(problem, shared=True, grow=t / t.max())
-        found = fitted(target, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
+        found = fitted(target, problem.unknowns(trial.theta, trial.path))
         if found is None or not bool(clear(found.z, found.deviations).any()):
             break
         rates, deviations = rates + found.z / t.max(), found.deviations / t.max()

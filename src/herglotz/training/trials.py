@@ -344,7 +344,7 @@ class Fitter:
         part = torch.cat([torch.arange(length) < round(FITTED_SHARE * length) for length in self.data.lengths])
         problem.used, problem.path = part.to(self.data.t.device), trial.path
         problem._weigh()
-        x = problem.pack(trial.theta, trial.path.x[:, 0, : problem.d])
+        x = problem.unknowns(trial.theta, trial.path)
         result = levenberg_marquardt(problem, x, max_iterations=2 * ITERATIONS, rtol=1e-3, patience=2, damping=NEAR)
         path = problem.solve(result.x) if math.isfinite(result.cost) else None
         return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
@@ -385,7 +385,7 @@ def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
     """RMS change of the motion of a trial, in units of q over the balance, by the step rule of another problem."""
     if problem.compiled is None:
         problem.guess_from(trial.problem, trial.path)
-    path = problem.solve(problem.pack(theta, trial.path.x[:, 0, : problem.d]))
+    path = problem.solve(problem.unknowns(theta, trial.path))
     if path is None:
         return math.inf
     return float((problem.misfit(path) - trial.problem.misfit(trial.path)).square().mean().sqrt())

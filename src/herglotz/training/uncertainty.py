@@ -98,8 +98,7 @@ class Laplace:
         self.prior = prior_of(run.model, self.base, departure)
         self.problem, self.path = self._solved(train, run.states.joined[list(data.offsets)], ~out, guess=states)
         self.theta = self.problem.parameters.get()
-        x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
-        A = dense(self.problem.normal_equations(x)[1])
+        A = dense(self.problem.normal_equations(self.problem.unknowns(self.theta, self.path))[1])
         errors = held_out_errors(self.problem, self.path, self.theta, A)
         self.inflation = inflation_of(errors, self.sigma)
         self.information = A.double()
@@ -138,7 +137,7 @@ class Laplace:
             raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")
         problem, P, d = found.problem, len(self.theta), self.problem.d
         start = found.path.x[:, 0]
-        A = dense(problem.normal_equations(problem.pack(self.theta, start[:, :d]))[1])
+        A = dense(problem.normal_equations(problem.unknowns(self.theta, found.path))[1])
         C, joint = self.covariance[:P, :P], []
         for own in torch.arange(P, len(A)).split(d):
             inverse = torch.linalg.pinv(A[own[:, None], own[None, :]].double(), hermitian=True)

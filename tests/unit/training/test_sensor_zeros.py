@@ -129,7 +129,7 @@ def test_what_is_left_of_a_drift_is_added_to_it(monkeypatch, noise, better):
     monkeypatch.setattr(sensor_zeros_module, "fitted", lambda *_: zeros.pop(0))
     monkeypatch.setattr(sensor_zeros_module, "WithZeros", lambda *_, **__: None)
     problem = SimpleNamespace(of=lambda *_: problem, parameters=SimpleNamespace(numbers=()), sigma=1.0, d=2)
-    problem.pack = lambda *_: None
+    problem.unknowns = lambda *_: None
     path = SimpleNamespace(x=torch.zeros(1, 1, 2))
 
     def model(at_the_noise, fits_better=True):

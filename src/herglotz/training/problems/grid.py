@@ -45,6 +45,11 @@ class SegmentGrid:
         """Model steps of the longest segment."""
         return self.h.shape[1]
 
+    @property
+    def segment(self) -> Tensor:
+        """The segment that observes each sample, (N,)."""
+        return self.node // (self.longest + 1)
+
     def times(self, data: Trajectories) -> Tensor:
         """Time of every node, (S, K + 1), with padding."""
         first = data.t[self.start_sample][:, None]

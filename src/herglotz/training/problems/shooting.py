@@ -148,6 +148,10 @@ class ShootingProblem(StatesProblem):
         """Flat unknowns from parameters (P,) and segment states (S, d)."""
         return torch.cat([theta, states.reshape(-1)])
 
+    def unknowns(self, theta: Tensor, path: Path) -> Tensor:
+        """Flat unknowns from parameters (P,) and the states in which the segments of a path start."""
+        return self.pack(theta, path.x[:, 0, : self.d])
+
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Inverse of `pack`."""
         return x[: self.P], x[self.P :].reshape(-1, self.d)

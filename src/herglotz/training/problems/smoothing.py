@@ -63,7 +63,7 @@ class SmoothingProblem(StatesProblem):
         S, K = grid.h.shape
         x = self.data.q.new_zeros(S, K + 1, self.d)
         for b in range(S):
-            rows = (grid.node // (K + 1) == b).nonzero()[:, 0]
+            rows = (grid.segment == b).nonzero()[:, 0]
             node = grid.node[rows] - b * (K + 1)
             t = torch.cat([grid.h.new_zeros(1), grid.h[b].cumsum(0)])
             every = torch.arange(K + 1, device=node.device).clamp_max(int(grid.end[b]))

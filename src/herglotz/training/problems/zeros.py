@@ -92,7 +92,7 @@ def by_zeros(
     fit = problem._missed_by(problem.path.x)
     by = problem.weight * problem.root_weights(fit) / problem.deviations  # (N, n) ∂r/∂z
     rows = rows * (by * grow[:, None])[..., None]
-    segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
+    segment = problem.grid.segment
     # Samples of a segment have the same zero.
     S, of = problem.grid.segments, torch.full((problem.grid.segments,), -1, device=which.device)
     of[segment] = which
