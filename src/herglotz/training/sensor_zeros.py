@@ -64,7 +64,7 @@ def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max
 def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...] | None:
     """The zeros (n,) from all of these parts; None if the model cannot follow some part."""
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
-    target = WithZeros(problem, torch.arange(problem.P), shared=True)
+    target = WithZeros(problem, shared=True, held=True)
     found = _fitted(target, problem.parameters.get(), data)
     return None if found is None else tuple(torch.where(clear(found.z, found.deviations), found.z, 0.0).tolist())
 

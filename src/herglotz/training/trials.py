@@ -155,11 +155,6 @@ class Trial:
         return HeldOut(self.problem, self.path, self.theta, waves=waves)
 
     @cached_property
-    def _determined(self) -> Tensor:
-        """Share of each parameter that the data determine, (P,); 1 without a prior."""
-        return self._held_out.told([range(self.problem.P)])[0]
-
-    @cached_property
     def score(self) -> Score:
         """Score over held-out blocks; computing the score records the model in `Fitter.compared`."""
         count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
@@ -203,12 +198,17 @@ class Trial:
         """Likeliest prior variance of each function, over the variance in the fitter (evidence, MacKay 1992)."""
         numbers, found = self.problem.parameters.numbers, {}
         place = {name: i for i, name in enumerate(numbers)}
+        places = {name: [place[x] for x in waves if x in place] for name, waves in self.fitter.functions.items()}
+        if not any(places.values()):
+            return {}
         weight = self.fitter.prior(numbers).weight
-        for name, waves in self.fitter.functions.items():
-            if at := [place[wave] for wave in waves if wave in place]:
-                determined = float(self._determined[at].sum())
-                found[name] = float((self.theta[at].square() * weight[at]).sum()) / max(determined, 1.0)
-        return {name: size for name, size in found.items() if size > 0}
+        # Share of each parameter that the data determine.
+        (share,) = self._held_out.told([range(self.problem.P)])
+        for name, at in places.items():
+            size = float((self.theta[at].square() * weight[at]).sum()) / max(float(share[at].sum()), 1.0)
+            if size > 0:
+                found[name] = size
+        return found
 
 
 class Fitter:

@@ -136,11 +136,11 @@ class SmoothingProblem(StatesProblem):
         """JᵀJ from the blocks of all nodes of S trajectories, (S, M, d, ·); the trajectories are eliminated at once."""
         S = self.grid.segments
 
-        def at_once(*blocks: Tensor) -> Tensor | None:
-            found = eliminated(*(x.unflatten(0, (S, -1)) for x in blocks))
+        def at_once(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
+            found = eliminated(*(x.unflatten(0, (S, -1)) for x in (diagonal, upper, columns)))
             return None if found is None else found.flatten(0, 1)
 
-        return Arrowhead(corner, *(x.flatten(0, 1) for x in (border, diagonal, upper)), at_once)
+        return Arrowhead(corner, border.flatten(0, 1), diagonal.flatten(0, 1), upper.flatten(0, 1), at_once)
 
     def variances(self, x: Tensor) -> Tensor:
         """Variances of the states at the samples for known parameters, (N, d)."""
