@@ -330,11 +330,10 @@ class Fitter:
             else:
                 problem.guess_from(before.problem, before.path)
         x, damping = problem.pack(theta, states), NEAR if before is not None and before.length == length else FAR_OFF
-        result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
-        path = problem.solve(result.x) if math.isfinite(result.cost) else None
+        x, path = _minimised(problem, x, most, damping)
         if path is None:
             return None
-        found = dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
+        found = dict(zip(names, problem.unpack(x)[0].tolist(), strict=True))
         return Trial(self, taken, self.start | found, problem, path, scales)
 
     def free_run_score(self, trial: Trial) -> Score | None:
@@ -345,8 +344,7 @@ class Fitter:
         problem.used, problem.path = part.to(self.data.t.device), trial.path
         problem._weigh()
         x = problem.unknowns(trial.theta, trial.path)
-        result = levenberg_marquardt(problem, x, max_iterations=2 * ITERATIONS, rtol=1e-3, patience=2, damping=NEAR)
-        path = problem.solve(result.x) if math.isfinite(result.cost) else None
+        _, path = _minimised(problem, x, 2 * ITERATIONS, NEAR)
         return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
@@ -368,6 +366,12 @@ class Fitter:
         """The model over whole trajectories at once or, if it does not follow these closely, as `grow`."""
         whole = self.fit(trial.taken, trial.values, self.lengths[-1], trial)
         return whole if whole is not None and whole.near else self.grow(trial)
+
+
+def _minimised(problem: ShootingProblem, x: Tensor, most: int, damping: float) -> tuple[Tensor, Path | None]:
+    """The unknowns after a fit from x in at most so many iterations, and their path; None if none is found."""
+    result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
+    return result.x, problem.solve(result.x) if math.isfinite(result.cost) else None
 
 
 def is_precise(data: Trajectories) -> bool:
