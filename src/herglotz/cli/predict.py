@@ -76,8 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     import_torch()
 
     from herglotz.training import load_run
-    from herglotz.training.best_start import missed_from_best_start
     from herglotz.training.fitted_run import as_recorded
+    from herglotz.training.predict import missed_from_best_start
     from herglotz.training.recorded_range import warning
 
     result = load_run(arguments.source)

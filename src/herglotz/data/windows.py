@@ -36,6 +36,11 @@ class Triples:
     def __len__(self) -> int:
         return len(self.index)
 
+    @property
+    def v(self) -> Tensor:
+        """Velocities by differences of q2 and q0, (T, n)."""
+        return (self.q2 - self.q0) / (self.h0 + self.h1)[:, None]
+
     def spread_out(self, most: int) -> Triples:
         """Return at most `most` windows, evenly spread."""
         if len(self) <= most:

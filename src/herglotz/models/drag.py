@@ -257,6 +257,11 @@ def input_forces(texts: Iterable[str]) -> tuple[str, ...]:
     return tuple(text for text in texts if re.fullmatch(_DRIVEN, text))
 
 
+def input_columns(terms: Iterable[str]) -> tuple[str, ...]:
+    """Return those of these terms of inputs that are functions of the inputs alone, further columns of u."""
+    return tuple(term for term in terms if not re.fullmatch(_DRIVEN, term))
+
+
 def _power(x: Tensor, k: int) -> Tensor:
     """x^k by multiplication: the forward derivative of `pow` takes the logarithm of negative numbers."""
     out = torch.ones_like(x)

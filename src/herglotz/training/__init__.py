@@ -3,7 +3,6 @@
 from herglotz.training.choose import choose as choose
 from herglotz.training.config import FitConfig as FitConfig
 from herglotz.training.fit import fit as fit
-from herglotz.training.identifiability import traded as traded
 from herglotz.training.learned_functions import (
     LearnedFunction as LearnedFunction,
     learned_functions as learned_functions,
@@ -27,4 +26,5 @@ from herglotz.training.uncertainty import (
     Laplace as Laplace,
     ensemble_bands as ensemble_bands,
     laplace as laplace,
+    traded as traded,
 )

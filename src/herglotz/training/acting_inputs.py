@@ -8,9 +8,8 @@ that were taken is fitted at other levels; the level with the least misfit is ta
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -19,10 +18,11 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import SATURATIONS, all_input_terms, saturation
 from herglotz.data.smoothing import smoothed
 from herglotz.least_squares import least_squares
-from herglotz.models.drag import input_forces
-from herglotz.training.acceleration_terms import acceleration_terms, for_each
+from herglotz.models.drag import input_columns, input_forces
+from herglotz.training.baseline import acceleration_terms, for_each
 from herglotz.training.dictionary import by_motion
 from herglotz.training.offers import INPUTS, ZEROS
+from herglotz.training.search import Search
 from herglotz.training.trials import Trial, Variant
 
 # Levels of an input that are tried, and the least level over the largest value of the input.
@@ -31,17 +31,6 @@ LEVELS, LOWEST = 24, 0.05
 AROUND = 1.5
 # Golden sections: 16 leave 0.05 % of that range.
 SECTIONS, GOLDEN = 16, (5**0.5 - 1) / 2
-
-
-class Driven(Protocol):
-    """A `herglotz.training.search.Search`."""
-
-    data: Trajectories
-    order: int
-
-    def driven_by(self, terms: Sequence[str]) -> Any:
-        """The same of data whose inputs act by these terms as well."""
-        ...
 
 
 def offered_terms(data: Trajectories) -> tuple[str, ...]:
@@ -63,12 +52,6 @@ def offered_terms(data: Trajectories) -> tuple[str, ...]:
     return (*plain, *terms, *by_motion(data.angles, range(1, len(data.input_labels) + 1)))
 
 
-def columns_of(terms: Iterable[str]) -> tuple[str, ...]:
-    """Those of these terms that are further columns of u, and no forces that depend on the motion."""
-    terms = tuple(terms)
-    return tuple(term for term in terms if term not in input_forces(terms))
-
-
 def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
     """Mean square of accelerations (T, n) after a fit of columns (T, n, k) and `more` (T,) of each coordinate."""
     A = torch.cat([columns, for_each(more[:, None, None].expand(-1, a.shape[1], 1))], -1).flatten(0, 1)
@@ -77,12 +60,12 @@ def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
     return float((A / size @ least_squares(A / size, y) - y).square().mean())
 
 
-def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
+def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
     """The terms of the inputs that a model takes if all are offered; () if the model is no better than the trial.
 
-    Each level counts as one more number of the model.
+    Each level counts as one more number of the model. A trial at the noise lacks no terms.
     """
-    every = offered_terms(search.data)
+    every = () if trial.at_the_noise or not search.config.find_input_terms else offered_terms(search.data)
     if not every:
         return ()
     found = _with(search, every, trial)
@@ -94,13 +77,13 @@ def asked_terms(search: Driven, trial: Trial) -> tuple[str, ...]:
     return taken if found.gain(trial, sum(map(bool, map(saturation, taken)))) > 0 else ()
 
 
-def _with(search: Driven, terms: Sequence[str], trial: Trial) -> Trial | None:
+def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:
     """A model with these terms of the inputs among its offers.
 
     The terms join a trial that is near the data, or else the simplest model over ever longer segments.
     """
     other = search.driven_by(terms)
-    if trial.near and (same := other.again(beside(trial, len(columns_of(terms))))) is not None:
+    if trial.near and (same := other.again(beside(trial, len(input_columns(terms))))) is not None:
         return other.settled(other.finer(same), swapped=True)
     fitter = other.fitter(Variant(search.order))
     return other.climbed(fitter, fitter.simple, {})
@@ -123,7 +106,7 @@ def beside(trial: Trial, more: int) -> Trial:
 
 def taken_terms(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     """Those terms of `every` that a model has taken; the last inputs of its data are those that are columns."""
-    columns, own = len(found.fitter.data.input_labels), columns_of(every)
+    columns, own = len(found.fitter.data.input_labels), input_columns(every)
     # The only gain of a model has no number.
     gains = (int(name.partition("[")[2].rstrip("]") or 0) % columns for name in found.taken if name.startswith(INPUTS))
     recorded, forces = columns - len(own), set(input_forces(every)) & found.taken
@@ -131,7 +114,7 @@ def taken_terms(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     return tuple(term for term in every if term in taken)
 
 
-def _sharpened(search: Driven, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
+def _sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     """The terms; those that a model has taken have the levels at which the model misses the data least."""
     terms = list(every)
     for term in taken_terms(found, every):

@@ -1,17 +1,24 @@
-"""JᵀJ of multiple shooting: a border of parameters around block tridiagonal states of segments.
+"""JᵀJ of parameters and the states of trajectories: a border of parameters around block tridiagonal states.
 
 ⎡ C  Bᵀ ⎤     C (P, P): parameters
-⎣ B  T  ⎦     T: starts of segments, block tridiagonal; B (S, d, P): starts by parameters
+⎣ B  T  ⎦     T: states, block tridiagonal; B (S, d, P): states by parameters
+
+The S states are those at the starts of all segments (`problems.shooting`), or at all nodes (`problems.smoothing`).
+Eliminating the states, (C − Bᵀ T⁻¹ B) δθ = b_θ − Bᵀ T⁻¹ b_x, takes a time that grows with S, not with its cube.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from herglotz.stepping.block_tridiagonal import Blocks, eliminate
+from herglotz.training.distributed import everywhere, of_first
+from herglotz.training.problems.grid import SegmentGrid
 
 # (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None if T is not positive definite
 Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
@@ -24,7 +31,7 @@ class Arrowhead:
     corner: Tensor  # (P, P)
     border: Tensor  # (S, d, P)
     blocks: Tensor  # (S, d, d) diagonal of T
-    upper: Tensor  # (S, d, d) right of it; 0 behind the last segment of a trajectory
+    upper: Tensor  # (S, d, d) right of it; 0 behind the last state of a trajectory
     eliminate: Eliminate
 
     def __matmul__(self, v: Tensor) -> Tensor:
@@ -55,14 +62,19 @@ class Arrowhead:
         return A
 
     def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(matrix + diag(damping))⁻¹ b by eliminating the states first; None if there is no finite solution."""
-        P, (S, d) = len(self.corner), self.border.shape[:2]
-        blocks = self.blocks + torch.diag_embed(damping[P:].reshape(S, d))
-        solved = self.eliminate(blocks, self.upper, torch.cat([self.border, b[P:].reshape(S, d, 1)], -1))
-        if solved is None:
+        """(matrix + diag(damping))⁻¹ b; None if some process finds no finite solution."""
+        step = self._solved(b.double(), damping.double())
+        return of_first(step.to(b))[0] if everywhere(step is not None) and step is not None else None
+
+    def _solved(self, b: Tensor, damping: Tensor) -> Tensor | None:
+        """The solution by eliminating the states first, in float64."""
+        P, (S, d), border = len(self.corner), self.border.shape[:2], self.border.double()
+        blocks = self.blocks.double() + torch.diag_embed(damping[P:].reshape(S, d))
+        columns = torch.cat([border, b[P:].reshape(S, d, 1)], -1)
+        if (solved := self.eliminate(blocks, self.upper.double(), columns)) is None:
             return None
-        taken = self.border.flatten(0, 1).T @ solved.flatten(0, 1)
-        reduced = self.corner + torch.diag(damping[:P]) - taken[:, :P]
+        taken = border.flatten(0, 1).T @ solved.flatten(0, 1)
+        reduced = self.corner.double() + torch.diag(damping[:P]) - taken[:, :P]
         factor, info = torch.linalg.cholesky_ex((reduced + reduced.T) / 2)
         if int(info) != 0:
             return None
@@ -71,6 +83,79 @@ class Arrowhead:
         return step if bool(torch.isfinite(step).all()) else None
 
 
+def eliminated(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
+    """T⁻¹ columns, (..., K, d, R), of each of several chains of K states; None if the result is not finite."""
+    x = eliminate(tridiagonal(diagonal, upper), columns)
+    return x if bool(torch.isfinite(x).all()) else None
+
+
+def tridiagonal(diagonal: Tensor, upper: Tensor) -> Blocks:
+    """The blocks of the symmetric matrix T of chains of K states, (..., K, d, d) each."""
+    return diagonal, upper, torch.cat([torch.zeros_like(upper[..., :1, :, :]), upper[..., :-1, :, :].mT], -3)
+
+
 def dense(A: Tensor | Any) -> Tensor:
     """JᵀJ as a tensor, from a tensor or from an object with `dense`."""
     return A if isinstance(A, Tensor) else A.dense()
+
+
+class Sums(NamedTuple):
+    """JᵀJ and Jᵀr of the data in blocks, and the derivatives `slopes` of the ends of segments."""
+
+    corner: Tensor  # (P, P)
+    border: Tensor  # (S, d, P)
+    blocks: Tensor  # (S, d, d)
+    by_theta: Tensor  # (P,) Jᵀr
+    by_state: Tensor  # (S, d)
+    slopes: Tensor  # (S, d, P + d)
+
+    @classmethod
+    def zeros(cls, P: int, S: int, d: int, like: Tensor) -> Sums:
+        """Sums of no rows."""
+        slopes = like.new_zeros(S, d, P + d)
+        slopes[..., P:] = torch.eye(d, dtype=like.dtype, device=like.device)
+        zero = like.new_zeros
+        return cls(zero(P, P), zero(S, d, P), zero(S, d, d), zero(P), zero(S, d), slopes)
+
+    def add_samples(self, grid: SegmentGrid, Z: Tensor, by: Tensor, r: Tensor) -> None:
+        """Add the rows by · ∂q of the samples, with residuals r (N, n), from derivatives Z (S, K+1, d, P + d) at nodes.
+
+        This sets `slopes` too.
+        """
+        P, n = len(self.corner), r.shape[1]
+        rows, segment = Z.flatten(0, 1)[grid.node][:, :n] * by[..., None], grid.segment
+        for k in range(grid.segments):
+            own, right = rows[segment == k].flatten(0, 1), r[segment == k].flatten()
+            by_theta, by_state = own[:, :P], own[:, P:]
+            self.corner.addmm_(by_theta.T, by_theta)
+            self.by_theta.addmv_(by_theta.T, right)
+            self.border[k] += by_state.T @ by_theta
+            self.blocks[k] += by_state.T @ by_state
+            self.by_state[k] += by_state.T @ right
+        self.slopes.copy_(Z[torch.arange(grid.segments, device=Z.device), grid.end])
+
+    def add_joints(self, to: Tensor, by: Tensor, r: Tensor, own: Tensor | None = None) -> Tensor:
+        """Add the rows by · ∂(end of the segment before − start) of the segments `to`, with residuals r, (J, d) each.
+
+        Residuals of momenta are over the masses; `own` (J, n, P) is minus their derivative through the masses.
+        Return the coupling of the start of each segment with the next, (S, d, d).
+        """
+        upper = torch.zeros_like(self.blocks)
+        if not len(to):
+            return upper
+        P, rows = len(self.corner), self.slopes[to - 1] * by[..., None]
+        by_theta, before = rows[..., :P], rows[..., P:]
+        if own is not None:
+            n = own.shape[1]
+            by_theta = torch.cat([by_theta[:, :n], by_theta[:, n : 2 * n] - own, by_theta[:, 2 * n :]], 1)
+        self.corner.addmm_(by_theta.flatten(0, 1).T, by_theta.flatten(0, 1))
+        self.by_theta.addmv_(by_theta.flatten(0, 1).T, r.flatten())
+        self.blocks[to - 1] += before.mT @ before
+        self.border[to - 1] += before.mT @ by_theta
+        self.by_state[to - 1] += (before.mT @ r[..., None])[..., 0]
+        # The derivative by the start of the segment itself is −by.
+        self.blocks[to] += torch.diag_embed(by.square())
+        self.border[to] -= by[..., None] * by_theta
+        self.by_state[to] -= by * r
+        upper[to - 1] = -before.mT * by[:, None, :]
+        return upper

@@ -79,15 +79,16 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     squares (`problems.robust`), and samples with gross errors do not count for scale and speed. Trajectory fitting
     takes `substeps` model steps per recorded step. Raise InputError if a coordinate does not move.
     """
-    t, v, a, columns, max_step = differences(data, drag)
+    found = differences(data, drag)
+    t, v, a, max_step = found.triples, found.v, found.a, found.max_step
     n, m = data.dof, 0 if data.u is None else data.u.shape[1]
-    q, rows, right = data.q, columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
-    found = robust_fit(rows, right) if outliers else least_squares(rows, right)
+    q, (rows, right) = data.q, found.equations
+    fitted = robust_fit(rows, right) if outliers else least_squares(rows, right)
     if outliers:
-        r = rows @ found - right
+        r = rows @ fitted - right
         good = (r.abs().reshape(a.shape).amax(1) <= GROSS * scale_of(r)).to(q.device)
         q, v = t.q1[good], v[good]
-    x = found[:, 0].tolist()
+    x = fitted[:, 0].tolist()
     # The scale of a rotating angle is half a turn.
     scale = [min(x, math.pi) if angle else x for x, angle in zip(q.abs().amax(0).tolist(), data.angles, strict=True)]
     speed = [float(s) for s in v.abs().amax(0)]
@@ -134,12 +135,13 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
     Two conditions: accelerations jump from sample to sample (a smooth motion has h|a| < |v| down to six samples a
     period), and least squares miss the bulk by more than rounding and three times as far as Student's t.
     """
-    t, v, a, columns, _ = differences(data, drag)
+    found = differences(data, drag)
+    t, v, a = found.triples, found.v, found.a
     size = float(a.square().mean().sqrt())
     jumps = float((a * (t.h0 + t.h1)[:, None] / 2).square().mean().sqrt()) > float(v.square().mean().sqrt())
     if not jumps:
         return False
-    rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
+    rows, right = found.equations
     plain = scale_of(rows @ least_squares(rows, right) - right)
     robust = scale_of(rows @ robust_fit(rows, right) - right)
     return plain > max(PULLED * robust, NEGLIGIBLE * size)
@@ -154,6 +156,11 @@ class Differences(NamedTuple):
     columns: Tensor  # (T, n, k)
     max_step: float
 
+    @property
+    def equations(self) -> tuple[Tensor, Tensor]:
+        """One row for each acceleration: columns (T · n, k) and accelerations (T · n, 1), on the CPU."""
+        return self.columns.flatten(0, 1).cpu(), self.a.reshape(-1, 1).cpu()
+
 
 def differences(data: Trajectories, drag: bool = False) -> Differences:
     """Velocities, accelerations, and the columns of `estimate_baseline`; longer steps than `max_step` are gaps."""
@@ -162,9 +169,8 @@ def differences(data: Trajectories, drag: bool = False) -> Differences:
     if len(t) == 0:
         raise InputError(f"{data.source or 'data'}: no three samples in a row without a gap; record at equal steps")
     h0, h1 = t.h0[:, None], t.h1[:, None]
-    v = (t.q2 - t.q0) / (h0 + h1)
     a = 2 * ((t.q2 - t.q1) / h1 - (t.q1 - t.q0) / h0) / (h0 + h1)
-    n, u = data.dof, data.inputs_of_steps()
+    n, v, u = data.dof, t.v, data.inputs_of_steps()
     m = 0 if u is None else u.shape[1]
     columns = a.new_zeros(len(t), n, 2 * n + 1 + n * m)
     for i, angle in enumerate(data.angles):
@@ -177,3 +183,21 @@ def differences(data: Trajectories, drag: bool = False) -> Differences:
         half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
         columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)
     return Differences(t, v, a, columns, max_step)
+
+
+def acceleration_terms(data: Trajectories) -> Differences:
+    """The terms of `estimate_baseline`, and for each coordinate second harmonics or powers, and its own friction.
+
+    Angles have second harmonics, lengths the powers 2 and 3; friction is viscous and quadratic.
+    """
+    found = differences(data)
+    own = []
+    for q, w, angle in zip(found.triples.q1.T, found.v.T, data.angles, strict=True):
+        waves = [(2 * q).sin(), (2 * q).cos()] if angle else [q.square(), q**3]
+        own.append(torch.stack([*waves, w, w * w.abs()], -1))
+    return found._replace(columns=torch.cat([found.columns, for_each(torch.stack(own, 1))], -1))
+
+
+def for_each(own: Tensor) -> Tensor:
+    """Columns (T, n, k) of each coordinate in its own equation, with coefficients of its own, (T, n, n k)."""
+    return (torch.eye(own.shape[1]).to(own)[:, :, None] * own[:, None]).flatten(2)

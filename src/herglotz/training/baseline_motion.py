@@ -58,7 +58,7 @@ class BaselineMotion:
 
     def _states(self, i: int, recorded: Triples) -> tuple[Tensor, Tensor]:
         """Return positions and velocities of coordinate i with at most `BEYOND` times the energy of the data."""
-        q, v = recorded.q1[:, i], _slopes(recorded)[:, i]
+        q, v = recorded.q1[:, i], recorded.v[:, i]
         low, high = float(q.min()), float(q.max())
         middle, half = (low + high) / 2, (high - low) / 2 * BEYOND**2
         half = min(half, math.pi) if self.angles[i] else half
@@ -127,7 +127,7 @@ def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> Bas
     parameters = t.q0.new_tensor([base.stiffness, base.tilt, (base.rate,) * n])
     fastest = max(max(v / x for v, x in zip(base.speed, base.scale, strict=True)), max(map(abs, base.stiffness)) ** 0.5)
     substeps = math.ceil(float(torch.maximum(t.h0, t.h1).max()) * fastest / MAX_PHASE)
-    v, best = _slopes(t), None
+    v, best = t.v, None
     for k in range(MAX_ITERATIONS):
         motion = BaselineMotion(angles, parameters, substeps)
         r, columns, v_of = motion.linearised(t, v)
@@ -141,7 +141,3 @@ def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> Bas
         step = torch.stack([x[:n], x[n : 2 * n], x[2 * n].expand(n)])
         parameters, v = parameters + step, v_of(step)
     return best if best is not None and best.error <= worst else None
-
-
-def _slopes(t: Triples) -> Tensor:
-    return (t.q2 - t.q0) / (t.h0 + t.h1)[:, None]

@@ -9,7 +9,7 @@ from herglotz.data.units import common_unit, size
 from herglotz.training.config import FitConfig
 from herglotz.training.look import Look
 from herglotz.training.one_step_fit import NOISE_OF_R
-from herglotz.training.plan import Plan
+from herglotz.training.plan import FORCES, SETTINGS, Plan
 from herglotz.training.task import NOISY
 
 # Random initialisations of a single layer: some end with a hundred times the error of others.
@@ -78,23 +78,22 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     c, base, probe = seen.settings, seen.base, seen.probe
     objective, why = choose_objective(seen, user_settings)
     one_step, covered = objective in ("residual", "raw"), seen.baseline_motion is not None
-    named = seen.found is not None and seen.found.sigma is not None
+    # Named terms that follow whole trajectories.
+    found = None if seen.found is None or seen.found.sigma is None else seen.found
+    named = found is not None
     exact = "covered" if covered else "correction"
     network = "none" if named else "plain" if objective == "raw" else exact if one_step else "potential"
     restarts = c.restarts or (RESTARTS if covered else 1)
     continues = one_step and probe is not None and restarts == 1
     sigma = None if one_step or probe is None or not probe.enough else probe.rms / NOISE_OF_R
-    sigma = seen.found.sigma if named and seen.found is not None else sigma
+    sigma = sigma if found is None else found.sigma
     return Plan(
-        level=c.level, objective=objective, network=network, order=c.order, features=c.features, drag=c.drag,
-        substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
-        forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
-                "alike": c.alike},
-        absent=c.absent, turning=seen.turning, spreads=dict(base.spreads),
+        **{name: getattr(c, name) for name in SETTINGS}, objective=objective, network=network,
+        hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
+        forces={name: bool(getattr(c, name)) for name in FORCES}, turning=seen.turning, spreads=dict(base.spreads),
         start={"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,), **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
-        longest=seen.found.length if named and seen.found is not None else 0,
-        departures=c.departures, dissipation=c.dissipation,
+        longest=0 if found is None else found.length,
         input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros, drifts=seen.drifts,
         reasons=_reasons(seen, user_settings, named, objective) | {
             "objective": why,

@@ -73,7 +73,7 @@ def data_rows(problem: ShootingProblem, path: Path, theta: Tensor) -> tuple[Tens
     r = problem.misfit(path) / problem.sigma
     by = problem.weight * problem.root_weights(problem.weight * r)
     Z = problem.slopes_at_samples(theta, path) * (by / problem.deviations)[..., None]
-    segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
+    segment = problem.grid.segment
     J = Z.new_zeros(len(Z), problem.n, problem.P + problem.grid.segments * problem.d)
     J[..., : problem.P] = Z[..., : problem.P]
     for i in range(problem.d):

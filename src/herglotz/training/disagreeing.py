@@ -114,10 +114,10 @@ def _agree(seen: Look, noise: float) -> bool:
 
 def _least_alike(seen: Look) -> int:
     """The recording whose accelerations are farthest from the linear model that Student's t fits to those of all."""
-    t, _, a, columns, _ = differences(seen.data)
-    rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
-    missed = (rows @ robust_fit(rows, right) - right).reshape(a.shape)
-    of = seen.data.trajectory[t.index].cpu()
+    found = differences(seen.data)
+    rows, right = found.equations
+    missed = (rows @ robust_fit(rows, right) - right).reshape(found.a.shape)
+    of = seen.data.trajectory[found.triples.index].cpu()
     return max(range(len(seen.data)), key=lambda b: scale_of(missed[of == b]) if bool((of == b).any()) else 0.0)
 
 

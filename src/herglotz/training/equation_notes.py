@@ -16,8 +16,7 @@ from herglotz.training.equation_terms import is_formula, newtonian
 from herglotz.training.equation_words import plain
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.free_run import free_runs
-from herglotz.training.problems.grid import segment_grid, step_inputs
+from herglotz.training.free_run import run_on
 
 # Digits of the zero and the scale of a sensor.
 DIGITS = 7
@@ -155,8 +154,6 @@ def longest_step(run: FittedRun) -> float:
 
 def free_run(run: FittedRun, max_step: float) -> Tensor:
     """Positions of free runs of all recordings from their first states, with steps up to `max_step`, (N, n)."""
-    data = run.data.unwrapped()
-    grid = segment_grid(data, data.samples, max_step)
-    start = run.states.joined[grid.start_sample].detach()
-    nodes = free_runs(run.stepper, data, grid, start, step_inputs(run.model, data, grid))
-    return grid.at_samples(nodes[..., : data.dof]).detach()
+    data, states = run.data.unwrapped(), run.states.joined.detach().clone()
+    run_on(run.stepper, data, states, (1,) * len(data), max_step)
+    return states[:, : data.dof].detach()

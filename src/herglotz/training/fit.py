@@ -29,7 +29,6 @@ from herglotz.training.equation import equation_of
 from herglotz.training.equation_notes import notes_of
 from herglotz.training.equation_numbers import Joint
 from herglotz.training.evaluate import evaluate
-from herglotz.training.identifiability import joint_of
 from herglotz.training.look import look, on_a_line
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.own_fit import fit_own
@@ -40,7 +39,7 @@ from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages
 from herglotz.training.summary import left_out_of, outlying_of
 from herglotz.training.tensorboard import log_result, tensorboard_log
-from herglotz.training.uncertainty import laplace
+from herglotz.training.uncertainty import joint_of, laplace
 
 # Multiple of the σ of exact data. Smaller changes of the data are rounding.
 ROUNDING = 3.0

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from herglotz.models import ContactLagrangian
+from herglotz.training.arrowhead import Sums
 from herglotz.training.kernel import Placed, kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
-from herglotz.training.sums import Sums
 
 # Largest size of the rows of J of a piece, in bytes.
 CHUNK_BYTES = 64 * 2**20

@@ -47,17 +47,23 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     # A search has no kernel of order 4, and uses short steps of order 2 instead.
     if is_precise(data) and data.dof > 1 and data.u is None and variant.substeps > 1 and not dry:
         fourth = replace(of, order=4, substeps=1)
-        own = started(base, data, values, fourth)
-        grid = segment_grid(data, trial.length, own.model_step)
-        try:
-            model = build_model(own, fourth, "none")
-        except InputError:
-            # Some terms have no rule of order 4, among them products of three velocities.
-            return of, started(base, data, values, of)
-        problem = ShootingProblem(model, data, grid, sigma=trial.problem.sigma)
-        if moved(trial, problem, problem.parameters.get()) <= FINER * max(trial.rms, fitter.floor / ALIKE):
+        if (own := _start_of_order_4(trial, fourth, base, values)) is not None:
             return fourth, own
     return of, started(base, data, values, of)
+
+
+def _start_of_order_4(trial: Trial, fourth: FitConfig, base: Baseline, values: dict) -> Baseline | None:
+    """The baseline of a model of order 4; None if its motion is not that of the trial, or a term has no such rule."""
+    data, base = trial.problem.data, started(base, trial.problem.data, values, fourth)
+    try:
+        model = build_model(base, fourth, "none")
+    # Some terms have no rule of order 4, among them products of three velocities.
+    except InputError:
+        return None
+    grid = segment_grid(data, trial.length, base.model_step)
+    problem = ShootingProblem(model, data, grid, sigma=trial.problem.sigma)
+    change = moved(trial, problem, problem.parameters.get())
+    return base if change <= FINER * max(trial.rms, trial.fitter.floor / ALIKE) else None
 
 
 def _spreads(trial: Trial) -> dict[str, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import torch
@@ -25,20 +27,34 @@ def states_everywhere(
 ) -> tuple[State, str]:
     """States at every sample: fitted ones, then a free run from the last fitted state; and "ok" or the failure."""
     out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
-    out[leading(data.lengths, train_lengths)] = fitted.states
-    before = [k - 1 if k < length else length for k, length in zip(train_lengths, data.lengths, strict=True)]
-    rows = (~leading(data.lengths, before)).nonzero()[:, 0].to(out.device)
-    if not len(rows):
-        return state_of(out), "ok"
-    rest = data.rows(rows, tuple(length - k for k, length in zip(before, data.lengths, strict=True) if k < length))
-    grid = segment_grid(rest, rest.samples, max_step)
-    inputs = None if step_inputs(fitted.model, rest) is None else data.inputs_of_steps(rows[grid.row], grid.part)
-    out[rows] = grid.at_samples(free_runs(Stepper(fitted.model), rest, grid, out[rows[grid.start_sample]], inputs))
-    lost = rest.trajectory[~torch.isfinite(out[rows]).all(-1)]
+    trained = leading(data.lengths, train_lengths).to(out.device)
+    out[trained] = fitted.states
+    run_on(Stepper(fitted.model), data, out, train_lengths, max_step)
+    lost = data.trajectory[~trained & ~torch.isfinite(out).all(-1)]
     if not len(lost):
         return state_of(out), "ok"
-    start = float(rest.t[rest.offsets[int(lost[-1])]])
+    b = int(lost[-1])
+    start = float(data.t[data.offsets[b] + train_lengths[b] - 1])
     return state_of(out), f"a step failed after t = {start:g}; nothing is predicted beyond it"
+
+
+def run_on(
+    stepper: Stepper, data: Trajectories, states: Tensor, known: Sequence[int], max_step: float
+) -> SegmentGrid | None:
+    """Fill in `states` (N, 2n+1) by a free run from the last of the `known` leading samples of each trajectory.
+
+    NaN from a failed step on. Return the grid of the model steps; None if all samples are known.
+    """
+    before = [k - 1 if k < length else length for k, length in zip(known, data.lengths, strict=True)]
+    rows = (~leading(data.lengths, before)).nonzero()[:, 0].to(states.device)
+    if not len(rows):
+        return None
+    rest = data.rows(rows, tuple(length - k for k, length in zip(before, data.lengths, strict=True) if k < length))
+    grid = segment_grid(rest, rest.samples, max_step)
+    # A hold may take the inputs of earlier samples into account.
+    u = step_inputs(cast(ContactLagrangian, stepper.L_d), data, replace(grid, row=rows[grid.row]))
+    states[rows] = grid.at_samples(free_runs(stepper, rest, grid, states[rows[grid.start_sample]], u))
+    return grid
 
 
 def free_runs(stepper: Stepper, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None) -> Tensor:

@@ -8,9 +8,7 @@ from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.search import Search
-from herglotz.training.strengths import likeliest
-from herglotz.training.trials import ITERATIONS, Fitter, Trial
-from herglotz.training.variants import Variant
+from herglotz.training.trials import ITERATIONS, Fitter, Trial, Variant, likeliest
 
 
 @inside()

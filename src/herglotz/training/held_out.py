@@ -51,7 +51,7 @@ class HeldOut:
         slopes = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
         order = torch.tensor([*range(P), P + problem.d, *range(P, P + problem.d)], device=r.device)
         rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d) of numbers, residual, start
-        segment = problem.grid.node // (problem.grid.h.shape[1] + 1)
+        segment = problem.grid.segment
         piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
         grams = _grams(rows * by, of, len(piece))  # (Q, P + 1 + d, P + 1 + d)
         whole = grams.new_zeros(problem.grid.segments, *grams.shape[1:]).index_add_(0, piece[:, 0], grams)

@@ -23,8 +23,7 @@ from herglotz.data.smoothing import smoothed
 from herglotz.data.splits import liveliest_rows
 from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
-from herglotz.training.acceleration_terms import acceleration_terms, for_each
-from herglotz.training.baseline import differences
+from herglotz.training.baseline import acceleration_terms, differences, for_each
 
 # Least mean over blocks of log(mean square without / with). Measured: 0.36 to 3.9 for delays of 0.4 and 2.3 steps that
 # noise of 1 % lets see, up to 0.16 for errors of the linear model itself.
@@ -226,7 +225,7 @@ def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
     White noise n of positions makes noise D n of accelerations, D being second differences; Σ = D Dᵀ. The noise of the
     terms, left out there, grows with time: of a spring ω² it is ω² L^{3/2} h^{1/2} / √3 as large after a time L.
     """
-    omega2 = float((t.q2 - t.q0).div((t.h0 + t.h1)[:, None]).square().mean(0).div(t.q1.var(0)).max())
+    omega2 = float(t.v.square().mean(0).div(t.q1.var(0)).max())
     h = data.typical_step
     longest = max(3, round((3**0.5 / (omega2 * h**0.5)) ** (2 / 3) / h)) if omega2 > 0 else 3
     runs = torch.arange(len(t)).tensor_split((t.index.diff() != 1).nonzero()[:, 0] + 1)

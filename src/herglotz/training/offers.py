@@ -91,7 +91,8 @@ def standing(offers: Iterable[Offer], taken: Collection[str]) -> frozenset[str]:
 
 def without_offers(model: ContactLagrangian, offers: list[Offer]) -> None:
     """Set the amplitudes of these offers to 0 in the model, in place."""
-    entries = dict(zip(ParameterVector(model).numbers, ParameterVector(model).entries, strict=True))
+    vector = ParameterVector(model)
+    entries = dict(zip(vector.numbers, vector.entries, strict=True))
     with torch.no_grad():
         for parameter, i in (entries[name] for offer in offers for name in offer.amplitudes):
             model.get_parameter(parameter).view(-1)[i] = 0.0

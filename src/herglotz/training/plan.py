@@ -17,6 +17,8 @@ from herglotz.training.trades import listed
 COLUMNS = 80
 # Starting values of the baseline; all other names in `Plan.start` are parameters of the model.
 STARTS = ("stiffness", "tilt", "rate")
+# Settings of a fit that a plan holds under the same name, beside the objective.
+SETTINGS = ("level", "order", "features", "departures", "drag", "substeps", "absent", "dissipation")
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,8 @@ class Plan:
     def applied(self, settings: FitConfig) -> FitConfig:
         """The settings with the decisions of this plan."""
         return replace(
-            settings, level=self.level, objective=self.objective, order=self.order, features=self.features,
-            departures=self.departures, drag=self.drag, substeps=self.substeps, absent=self.absent,
-            dissipation=self.dissipation, **self.forces,
-        )  # fmt: skip
+            settings, objective=self.objective, **{name: getattr(self, name) for name in SETTINGS}, **self.forces
+        )
 
     def started(self, base: Baseline) -> Baseline:
         """The baseline with this plan's starting values."""

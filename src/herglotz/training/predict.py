@@ -15,18 +15,23 @@ from herglotz.data.input_terms import input_terms_of, with_input_terms, with_wav
 from herglotz.data.sensors import measured
 from herglotz.data.splits import leading, leading_rows
 from herglotz.errors import InputError, refuse
-from herglotz.stepping import State, Stepper, state_of
+from herglotz.stepping import State, state_of
 from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.free_run import free_runs
-from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
+from herglotz.training.free_run import run_on
+from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
 from herglotz.training.sensor_zeros import zeros_of_one
 from herglotz.training.smoother import process_noise, smoothed_states
+from herglotz.training.stages import Stages
+from herglotz.training.task import Task
+from herglotz.training.trajectory_fit import fit_states
+from herglotz.training.verdict import STATE_ITERATIONS
 
 # Leading samples that the state is estimated from.
 WARMUP = 20
@@ -176,7 +181,9 @@ def predict(
     _check_lengths(data, warmup, every)
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)
-    grid = _free_run(run.stepper, data, states, warmup, high)
+    grid = run_on(run.stepper, data, states, (warmup,) * len(data), high)
+    # Every trajectory is longer than its warm-up.
+    assert grid is not None
     h = grid.h[inside := torch.arange(grid.longest) < grid.end[:, None]]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
@@ -186,6 +193,23 @@ def predict(
     rows = [(data.trajectory == b).nonzero()[:, 0] for b in range(len(data))]
     beyond = farthest(quantities_outside(run.box, data, data.t[r], x.q[r], x.p[r]) for r in rows)
     return Prediction(data, x, warmup, every, most, outside, zeros, beyond, v)
+
+
+def missed_from_best_start(run: FittedRun, data: Trajectories) -> tuple[float, ...] | None:
+    """RMS misfit of each coordinate, in its units, by free runs whose start states are fitted to whole recordings.
+
+    A warm-up tells a velocity to about σ √12 / (T √K), K samples over a time T, and a free run carries the error on.
+    From no other start does the model miss less. `data` are those of a `Prediction`. None if the model
+    follows only parts of the recordings.
+    """
+    base = estimate_baseline(data, substeps=run.decided.substeps)
+    task = Task(data, base, replace(run.decided, iterations=STATE_ITERATIONS), Stages())
+    found = fit_states(task, run.model, run.metrics.get("sigma") or task.exact)
+    if found is None or found.problem.grid.segments > len(data):
+        return None
+    with torch.no_grad():
+        missed = (found.problem.misfit(found.path) * data.balance)[data.complete]
+    return tuple(missed.square().mean(0).sqrt().tolist())
 
 
 def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:
@@ -335,13 +359,3 @@ def _smoothed(run: FittedRun, data: Trajectories) -> tuple[Tensor, float] | None
     settings: dict[str, Any] = {"sigma": _sigma(run), "freedom": freedom, "balance": run.data.balance.to(data.q)}
     found = smoothed_states(problem := SmoothingProblem(run.model, data, grid, process=process, **settings))
     return None if found is None else (problem.states(found[0]), found[1])
-
-
-def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:
-    """Fill in the states after the warm-up of every trajectory, stepped as one batch; return the grid of steps."""
-    rows = (~leading(data.lengths, (warmup - 1,) * len(data))).nonzero()[:, 0]
-    rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
-    grid = segment_grid(rest, rest.samples, max_step)
-    inputs = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
-    states[rows] = grid.at_samples(free_runs(stepper, rest, grid, states[rows[grid.start_sample]], inputs))
-    return grid

@@ -11,7 +11,8 @@ from herglotz.models.terms import LinearDamping
 from herglotz.training.equation_numbers import Joint, Numbers
 from herglotz.training.fitted_run import FittedRun
 
-CLEARLY = 2.0  # standard deviations by which its work is more than 0
+# Standard deviations by which the work of friction exceeds 0.
+CLEARLY = 2.0
 PUSHES = (
     "Friction pushes: over the training part it gives the motion more energy than it takes, as where motion drives "
     "itself; else another force is missing"

@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 
 from herglotz.training.equation_words import unit_of
-from herglotz.training.identifiability import PHYSICAL
 from herglotz.training.run import Run
 from herglotz.training.trades import WORDS
-from herglotz.training.uncertainty import Laplace
+from herglotz.training.uncertainty import PHYSICAL, Laplace
 
 INPUT_MAP = "friction.input_map"
 # Each parameter's unit is this power of the coordinate's unit over that of time; the first coordinate's mass is 1.

@@ -15,11 +15,13 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from herglotz.training.acting_inputs import columns_of, taken_terms
-from herglotz.training.dissipation import with_dissipation
+from herglotz.models.config import POWERS
+from herglotz.models.drag import input_columns
+from herglotz.progress import MORE_TERMS, inside, part
+from herglotz.training.acting_inputs import asked_terms, taken_terms
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
-from herglotz.training.trials import Trial
+from herglotz.training.trials import ITERATIONS, Trial, Variant
 
 
 class Questions:
@@ -77,7 +79,7 @@ class Questions:
         that only made up for the hold leave. Terms make up so well for a wrong hold, u(t + τ) being u + τ u′, that no
         other may be found beside them: where there are rates, or the noise is not met, every hold is tried without.
         """
-        if self.best is None or not (terms := self.read.input_terms(self.best)):
+        if self.best is None or not (terms := asked_terms(self.read, self.best)):
             return
         recorded = self.wanted, self.read
         read = self.read.driven_by(terms)
@@ -102,7 +104,7 @@ class Questions:
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
         """Keep these terms of the inputs, the search of the part that has them, and its model."""
-        self.input_terms, self.wanted = columns_of(terms), wanted.driven_by(terms)
+        self.input_terms, self.wanted = input_columns(terms), wanted.driven_by(terms)
         self.read, self.best = read, found
 
     def functions(self) -> None:
@@ -127,3 +129,25 @@ def _searched(search: Search) -> Trial | None:
     """The model of a search, with damping that depends on s if that is better."""
     found = search.run()
     return found and with_dissipation(search, found)
+
+
+@inside()
+def with_dissipation(search: Search, best: Trial) -> Trial:
+    """A model whose damping depends on s, where held-out time asks for it.
+
+    A search is worth its time where s² makes a better model of this one, or this one follows nothing for long. One
+    starts with s²: where s and its coefficient are 0, the motion changes with neither.
+    """
+    if best.at_the_noise or search.config.translations or search.config.sticking:
+        return best
+    part(MORE_TERMS)
+    fitter, lowest = search.fitter(Variant(2, dissipation=tuple(POWERS))), next(iter(POWERS))
+    asked = fitter.fit(best.taken | {lowest}, best.values, best.length, best, 2 * ITERATIONS)
+    if best.whole and (asked is None or not asked.replaces(best)):
+        return best
+    for taken in (fitter.simple, fitter.simple | {lowest}):
+        if (other := search.climbed(fitter, taken, {})) is not None:
+            best = search.better(best, other) or best
+            if other.at_the_noise:
+                break
+    return best

@@ -18,10 +18,9 @@ from herglotz.data.input_terms import with_input_terms
 from herglotz.data.noise import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
-from herglotz.models.drag import input_forces
+from herglotz.models.drag import input_columns, input_forces
 from herglotz.models.features import spherical
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
-from herglotz.training.acting_inputs import asked_terms, columns_of
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.friction_search import with_sticking, without_injecting_friction
@@ -32,10 +31,20 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import clear, differing_zeros
-from herglotz.training.strengths import likeliest, needed
 from herglotz.training.task import build_model
-from herglotz.training.trials import ALIKE, FINER, ITERATIONS, MAX_MISFIT, Fitter, Trial, is_precise, moved
-from herglotz.training.variants import Variant
+from herglotz.training.trials import (
+    ALIKE,
+    FINER,
+    ITERATIONS,
+    MAX_MISFIT,
+    Fitter,
+    Trial,
+    Variant,
+    is_precise,
+    likeliest,
+    moved,
+    needed,
+)
 
 # Samples of the part that is searched, if there are more than twice as many.
 SAMPLES_OF_A_PART = 2000
@@ -299,7 +308,7 @@ class Search:
             return None
         names = trial.problem.parameters.numbers
         problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
-        return differing_zeros(problem, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
+        return differing_zeros(problem, problem.unknowns(trial.theta, trial.path))
 
     def with_zeros(self, best: Trial | None, accepted: bool = False) -> Zeroed:
         """The search of the readings less the zeros, and the model there, if the score is better with zeros.
@@ -339,12 +348,8 @@ class Search:
     def driven_by(self, terms: Sequence[str]) -> Search:
         """The search of data whose inputs also act by these terms: columns of u, and forces of the position."""
         forces = input_forces(terms)
-        data = with_input_terms(self.data, columns_of(terms))
+        data = with_input_terms(self.data, input_columns(terms))
         base = estimate_baseline(data, outliers=self.freedom is not None)
         other = Search(data, base, replace(self.config, drag=forces), outliers=self.freedom is not None)
         other.order = self.order
         return other
-
-    def input_terms(self, trial: Trial) -> tuple[str, ...]:
-        """The terms of the inputs that a model takes if all are offered (`asked_terms`); () if that is no better."""
-        return asked_terms(self, trial) if self.config.find_input_terms and not trial.at_the_noise else ()

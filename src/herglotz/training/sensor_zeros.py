@@ -11,7 +11,7 @@ Drifts are fitted in the same way with the whole dictionary, one rate d for each
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,14 +36,6 @@ SIGNIFICANT = 5.0
 STRIDES = (1, 2, 4, 8)
 
 
-class FoundZeros(NamedTuple):
-    """Zeros of the sensors as fitted, their standard deviations, and the RMS misfit over the balance."""
-
-    z: Tensor  # (count,)
-    deviations: Tensor  # (count,)
-    rms: float
-
-
 def clear(z: Tensor, deviations: Tensor) -> Tensor:
     """True for zeros that differ significantly from 0, of the shape of z."""
     return z.abs() > SIGNIFICANT * deviations
@@ -64,20 +56,18 @@ def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max
 def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...] | None:
     """The zeros (n,) from all of these parts; None if the model cannot follow some part."""
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
-    target = WithZeros(problem, torch.arange(problem.P), shared=True)
-    found = _fitted(target, problem.parameters.get(), data)
-    return None if found is None else tuple(torch.where(clear(found.z, found.deviations), found.z, 0.0).tolist())
+    problem.guess_from_states(states_of_pairs(model, data))
+    theta = problem.parameters.get()
+    x = problem.pack(theta, first_states(problem, theta, data))
+    found = fitted(WithZeros(problem, shared=True, held=True), x)
+    return None if found is None else tuple(torch.where(clear(*found), found[0], 0.0).tolist())
 
 
-def _fitted(target: WithZeros, theta: Tensor, begin: Trajectories) -> FoundZeros | None:
-    """The zeros, fitted from 0 with these parameters and with start states from `begin`; None if the fit fails."""
-    problem = target.problem
-    problem.guess_from_states(states_of_pairs(problem.parameters.model, begin))
-    return fitted(target, problem.pack(theta, first_states(problem, theta, begin)))
+def fitted(target: WithZeros, x: Tensor) -> tuple[Tensor, Tensor] | None:
+    """The zeros (count,), fitted from 0 with all other unknowns starting at x, and their standard deviations.
 
-
-def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
-    """The zeros, fitted from 0 with all other unknowns starting at x; None if the fit fails."""
+    None if the fit fails.
+    """
     problem, x = target.problem, torch.cat([x, x.new_zeros(target.count)])
     result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
     if not math.isfinite(result.cost):
@@ -85,9 +75,9 @@ def fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
     _, A, _ = target.normal_equations(result.x)
     A = dense(A)
     assert problem.path is not None
-    rms = _rms(problem.misfit(problem.path)[problem.data.complete])
+    rms = float(problem.misfit(problem.path)[problem.data.complete].square().mean().sqrt())
     variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-target.count :] * (rms / problem.sigma) ** 2
-    return FoundZeros(result.x[-target.count :], variance.clamp_min(0).sqrt(), rms)
+    return result.x[-target.count :], variance.clamp_min(0).sqrt()
 
 
 def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -100,7 +90,7 @@ def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor
         return None
     rows = [b for b in range(len(problem.data)) if b != reference_of(problem.data)]
     z, deviations = (x.new_zeros(len(problem.data), problem.n) for _ in range(2))
-    z[rows], deviations[rows] = (y.reshape(-1, problem.n) for y in (found.z, found.deviations))
+    z[rows], deviations[rows] = (y.reshape(-1, problem.n) for y in found)
     return z, deviations
 
 
@@ -121,10 +111,10 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
     for _ in range(DRIFT_FITS):
         problem = trial.problem.of(trial.problem.parameters.numbers, trial.problem.sigma, trial.prior)
         target = WithZeros(problem, shared=True, grow=t / t.max())
-        found = fitted(target, problem.pack(trial.theta, trial.path.x[:, 0, : problem.d]))
-        if found is None or not bool(clear(found.z, found.deviations).any()):
+        found = fitted(target, problem.unknowns(trial.theta, trial.path))
+        if found is None or not bool(clear(*found).any()):
             break
-        rates, deviations = rates + found.z / t.max(), found.deviations / t.max()
+        rates, deviations = rates + found[0] / t.max(), found[1] / t.max()
         trial = search.of(measured(search.data, drifts=rates.tolist())).again(trial)
         if trial is None:
             return None
@@ -141,7 +131,3 @@ def sure(z: Tensor, deviations: Tensor) -> str:
     """Fitted values as text, x ± deviation; values with a deviation of 0 were not fitted and are left out."""
     each = zip(z.flatten().tolist(), deviations.flatten().tolist(), strict=True)
     return ", ".join(f"{x:.4g} ± {d:.2g}" for x, d in each if d)
-
-
-def _rms(x: Tensor) -> float:
-    return float(x.square().mean().sqrt())

@@ -14,7 +14,6 @@ from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, state_of
-from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
 from herglotz.training.first_states import first_states
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
@@ -68,8 +67,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     x, _ = solved
     found = problem.states(x)
     std = torch.zeros_like(found)
-    _, matrix, _ = problem.normal_equations(x, held=True)
-    std[:, : problem.d] = problem.grid.at_samples(diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt())
+    std[:, : problem.d] = problem.variances(x).clamp_min(0).sqrt()
     return Smoothed(*(state_of(y) for y in (found, std)))
 
 

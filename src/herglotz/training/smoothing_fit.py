@@ -17,7 +17,6 @@ from torch import Tensor
 
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper, state_of
-from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
 from herglotz.training.config import FitConfig
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
@@ -117,10 +116,9 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     the noise of the steps the rest: σ² = Σ r² / (N·n − tr H) and w² = Σ e² / (tr H − S·d), as in MacKay (1992).
     """
     problem = fit.problem
-    misfit, (_, matrix, _) = problem.misfit(fit.x), problem.normal_equations(fit.x, held=True)
+    misfit = problem.misfit(fit.x)
     used = problem.root_weights(misfit / problem.sigma).square()
-    variances = problem.grid.at_samples(diagonal_of_inverse(matrix.blocks))[:, : problem.n]
-    taken = float((variances / problem.deviations.square()).sum())
+    taken = float((problem.variances(fit.x)[:, : problem.n] / problem.deviations.square()).sum())
     free = misfit.numel() - taken
     starts = problem.grid.segments * problem.d
     sigma = math.sqrt(float((used * misfit.square()).sum()) / max(free, 0.1 * misfit.numel()))

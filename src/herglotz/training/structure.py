@@ -27,7 +27,6 @@ from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
 from herglotz.training.baseline import Baseline
-from herglotz.training.compared_models import compared_models
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.distributed import of_first
@@ -46,7 +45,7 @@ from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
 from herglotz.training.trades import listed
-from herglotz.training.trials import Trial
+from herglotz.training.trials import Trial, compared_models
 
 # Most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n².
 MOST = 3

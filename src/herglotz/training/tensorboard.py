@@ -10,7 +10,8 @@ from typing import Any
 
 from herglotz.errors import InputError
 
-SECONDS = 5  # after which TensorBoard can read what was logged
+# Seconds after which TensorBoard can read what was logged.
+SECONDS = 5
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
-from herglotz.training.functions import prior_spreads, terms_with
+from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
 from herglotz.training.named_terms import DRY, candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import ALWAYS, offers_of, without_offers
@@ -36,7 +37,6 @@ from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import EXACT, build_model, with_sticking
 from herglotz.training.trajectory_fit import FAR_OFF, FOLLOWED, LOST, NEAR
-from herglotz.training.variants import Compared, Variant
 
 # Iterations of a fit; a trial that needs more starts too far from its optimum.
 ITERATIONS = 15
@@ -52,6 +52,38 @@ FINER = 0.3
 ALIKE = 10.0
 # Noise, as a share of the spread of the data, below which a rule of order 4 is worth its time.
 ORDER_4_NOISE = 1e-3
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Order and steps of the rule, kind of dry friction, and the dictionary of a model.
+
+    `functions` are bands of learned functions beside the named terms. `dissipation` are powers of s in L. `kept` are
+    named terms that stay offers although functions can replace them.
+    """
+
+    order: int
+    substeps: int = 1
+    sticking: bool = False
+    functions: tuple[Band, ...] = ()
+    dissipation: tuple[str, ...] = ()
+    kept: frozenset[str] = frozenset()
+
+    def crossing(self, ratio: float) -> Variant:
+        """The variant with model steps of about the same length for recorded steps that are `ratio` times as long."""
+        return replace(self, substeps=max(1, round(ratio * self.substeps)))
+
+
+class Compared(NamedTuple):
+    """A scored model: segments of `length` recorded steps, number of parameters, RMS error, and offers.
+
+    `held_out` is the error over held-out blocks, in units of q over the balance.
+    """
+
+    length: int
+    numbers: int
+    held_out: float
+    taken: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -123,11 +155,6 @@ class Trial:
         return HeldOut(self.problem, self.path, self.theta, waves=waves)
 
     @cached_property
-    def _determined(self) -> Tensor:
-        """Share of each parameter that the data determine, (P,); 1 without a prior."""
-        return self._held_out.told([range(self.problem.P)])[0]
-
-    @cached_property
     def score(self) -> Score:
         """Score over held-out blocks; computing the score records the model in `Fitter.compared`."""
         count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
@@ -171,12 +198,17 @@ class Trial:
         """Likeliest prior variance of each function, over the variance in the fitter (evidence, MacKay 1992)."""
         numbers, found = self.problem.parameters.numbers, {}
         place = {name: i for i, name in enumerate(numbers)}
+        places = {name: [place[x] for x in waves if x in place] for name, waves in self.fitter.functions.items()}
+        if not any(places.values()):
+            return {}
         weight = self.fitter.prior(numbers).weight
-        for name, waves in self.fitter.functions.items():
-            if at := [place[wave] for wave in waves if wave in place]:
-                determined = float(self._determined[at].sum())
-                found[name] = float((self.theta[at].square() * weight[at]).sum()) / max(determined, 1.0)
-        return {name: size for name, size in found.items() if size > 0}
+        # Share of each parameter that the data determine.
+        (share,) = self._held_out.told([range(self.problem.P)])
+        for name, at in places.items():
+            size = float((self.theta[at].square() * weight[at]).sum()) / max(float(share[at].sum()), 1.0)
+            if size > 0:
+                found[name] = size
+        return found
 
 
 class Fitter:
@@ -298,11 +330,10 @@ class Fitter:
             else:
                 problem.guess_from(before.problem, before.path)
         x, damping = problem.pack(theta, states), NEAR if before is not None and before.length == length else FAR_OFF
-        result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
-        path = problem.solve(result.x) if math.isfinite(result.cost) else None
+        x, path = _minimised(problem, x, most, damping)
         if path is None:
             return None
-        found = dict(zip(names, problem.unpack(result.x)[0].tolist(), strict=True))
+        found = dict(zip(names, problem.unpack(x)[0].tolist(), strict=True))
         return Trial(self, taken, self.start | found, problem, path, scales)
 
     def free_run_score(self, trial: Trial) -> Score | None:
@@ -312,9 +343,8 @@ class Fitter:
         part = torch.cat([torch.arange(length) < round(FITTED_SHARE * length) for length in self.data.lengths])
         problem.used, problem.path = part.to(self.data.t.device), trial.path
         problem._weigh()
-        x = problem.pack(trial.theta, trial.path.x[:, 0, : problem.d])
-        result = levenberg_marquardt(problem, x, max_iterations=2 * ITERATIONS, rtol=1e-3, patience=2, damping=NEAR)
-        path = problem.solve(result.x) if math.isfinite(result.cost) else None
+        x = problem.unknowns(trial.theta, trial.path)
+        _, path = _minimised(problem, x, 2 * ITERATIONS, NEAR)
         return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
@@ -338,6 +368,12 @@ class Fitter:
         return whole if whole is not None and whole.near else self.grow(trial)
 
 
+def _minimised(problem: ShootingProblem, x: Tensor, most: int, damping: float) -> tuple[Tensor, Path | None]:
+    """The unknowns after a fit from x in at most so many iterations, and their path; None if none is found."""
+    result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
+    return result.x, problem.solve(result.x) if math.isfinite(result.cost) else None
+
+
 def is_precise(data: Trajectories) -> bool:
     """True if a rule of order 4 is worth its time: few samples a period, or little noise."""
     return coarse(data) or precision(data) < ORDER_4_NOISE * relative_spread(data)
@@ -353,7 +389,57 @@ def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
     """RMS change of the motion of a trial, in units of q over the balance, by the step rule of another problem."""
     if problem.compiled is None:
         problem.guess_from(trial.problem, trial.path)
-    path = problem.solve(problem.pack(theta, trial.path.x[:, 0, : problem.d]))
+    path = problem.solve(problem.unknowns(theta, trial.path))
     if path is None:
         return math.inf
     return float((problem.misfit(path) - trial.problem.misfit(trial.path)).square().mean().sqrt())
+
+
+def likeliest(trial: Trial, most: int) -> Trial:
+    """The model refitted with the likeliest prior variances of its bands (`Trial.likeliest_scales`).
+
+    Each refit has at most `most` iterations. Refits end when the held-out log-loss falls by less than the price of one
+    parameter. A refit with a larger log-loss is dropped. A model without functions is returned as it is.
+    """
+    gain = math.inf
+    while trial.likeliest_scales and gain > trial.score.price_of_a_number:
+        other = trial.fitter.fit(trial.taken, trial.values, trial.length, trial, most)
+        if other is None or not (gain := float((trial.score.losses - other.score.losses).sum())) > 0:
+            break
+        trial = other
+    return trial
+
+
+def needed(trial: Trial, most: int) -> Trial:
+    """The model without the bands that are not worth their price; each removal is fitted, the weakest band first.
+
+    `Moves.leaving` removes bands too, but by the linearised motion alone.
+    """
+    # The row law 1 noisy of `benchmarks/judge.py` needs this loop: 6.1 times the noise, and 61 without it.
+    for name in sorted(trial.likeliest_scales, key=trial.likeliest_scales.__getitem__):
+        other = trial.fitter.fit(trial.taken - {name}, trial.values, trial.length, trial, most)
+        if other is not None and not trial.replaces(other):
+            trial = likeliest(other, most)
+    return trial
+
+
+def compared_models(fitters: Iterable[Fitter], trial: Trial) -> list[dict[str, Any]]:
+    """The models that were scored over segments of the length of a trial, and the trial itself, by their size."""
+    rows: dict[frozenset[str], Compared] = {}
+    for fitter in fitters:
+        for row in fitter.compared:
+            before = rows.get(row.taken)
+            better = math.isfinite(row.held_out) and (before is None or row.held_out < before.held_out)
+            if row.length == trial.length and better:
+                rows[row.taken] = row
+    rows[trial.taken] = Compared(trial.length, trial.problem.P, trial.score.rms, trial.taken)
+    order = [offer.name for offer in (*trial.fitter.offers, *trial.fitter.loads)]
+    return [
+        {
+            "numbers": row.numbers,
+            "held_out": row.held_out,
+            "offers": [name for name in order if name in row.taken],
+            "taken": row.taken == trial.taken,
+        }
+        for row in sorted(rows.values(), key=lambda row: (row.numbers, row.held_out))
+    ]

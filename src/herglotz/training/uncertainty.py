@@ -18,12 +18,13 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.noise import spikes
 from herglotz.data.splits import leading_rows
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.models import refuse_own
 from herglotz.threads import one_thread
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
+from herglotz.training.equation_numbers import Joint
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
@@ -33,7 +34,12 @@ from herglotz.training.run import Run
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
+from herglotz.training.trades import Trade, combinations
 from herglotz.training.trajectory_fit import fit_states
+
+# Parameters with a name in mechanics, by the start of their names.
+PHYSICAL = ("kinetic.log", "kinetic.off", "potential.stiffness", "potential.tilt", "damping.rate", "damping.drag",
+            "friction.")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -92,8 +98,7 @@ class Laplace:
         self.prior = prior_of(run.model, self.base, departure)
         self.problem, self.path = self._solved(train, run.states.joined[list(data.offsets)], ~out, guess=states)
         self.theta = self.problem.parameters.get()
-        x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
-        A = dense(self.problem.normal_equations(x)[1])
+        A = dense(self.problem.normal_equations(self.problem.unknowns(self.theta, self.path))[1])
         errors = held_out_errors(self.problem, self.path, self.theta, A)
         self.inflation = inflation_of(errors, self.sigma)
         self.information = A.double()
@@ -132,7 +137,7 @@ class Laplace:
             raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")
         problem, P, d = found.problem, len(self.theta), self.problem.d
         start = found.path.x[:, 0]
-        A = dense(problem.normal_equations(problem.pack(self.theta, start[:, :d]))[1])
+        A = dense(problem.normal_equations(problem.unknowns(self.theta, found.path))[1])
         C, joint = self.covariance[:P, :P], []
         for own in torch.arange(P, len(A)).split(d):
             inverse = torch.linalg.pinv(A[own[:, None], own[None, :]].double(), hermitian=True)
@@ -226,6 +231,45 @@ def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: 
     q, std = torch.stack([b.q for b in bands]), torch.stack([b.std for b in bands])
     sigma = torch.stack([b.sigma for b in bands]).square().mean(0).sqrt()
     return Bands(q.mean(0), (std.square().mean(0) + q.var(0)).sqrt(), sigma)
+
+
+def traded(posterior: Laplace) -> list[Trade]:
+    """The combinations of physical parameters that the data of a fit do not determine, the worst first; [] if none."""
+    names = posterior.problem.parameters.numbers
+    rows = torch.tensor([i for i, name in enumerate(names) if name.startswith(PHYSICAL)], dtype=torch.long)
+    M = information_of(posterior, rows)
+    return combinations(M, posterior.information.diagonal()[rows], [names[i] for i in rows.tolist()])
+
+
+def information_of(posterior: Laplace, rows: Tensor) -> Tensor:
+    """The information M (K, K) of the data on the parameters at the places `rows` (K,).
+
+    With A = JᵀJ of the fit, prior included, φ these parameters and r all other unknowns, M is the Schur complement
+    A_φφ − A_φr A_rr⁻¹ A_rφ minus the prior of φ.
+    """
+    A = posterior.information
+    rest = torch.ones(len(A), dtype=torch.bool)
+    rest[rows] = False
+    rest = rest.nonzero()[:, 0]
+    _, prior, _ = posterior.prior.normal_equations(posterior.theta)
+    inverse = torch.linalg.pinv(A[rest[:, None], rest], hermitian=True)
+    M = A[rows[:, None], rows] - A[rows[:, None], rest] @ inverse @ A[rest[:, None], rows]
+    return M - prior.double()[rows[:, None], rows]
+
+
+def joint_of(posterior: Laplace, least: float) -> Joint:
+    """The joint posterior of all numbers, on the CPU, if positions are precise only to `least`, in units of q.
+
+    Raise InputError if a change of some number by its rounding error in float64 moves the motion by more than the
+    misfit: the motion is too unstable for the first-order posterior.
+    """
+    P, sigma = len(posterior.theta), posterior.sigma
+    rounding = max(1.0, least / (sigma * posterior.inflation)) ** 2
+    alone = posterior.information.diagonal()[:P].clamp_min(1e-300).rsqrt() * max(1.0, least / sigma)
+    lost = alone < torch.finfo(torch.float64).eps * posterior.theta.abs().to(alone)
+    refuse({"rounding errors of the model's numbers change its motion by more than the misfit": bool(lost.any())})
+    every = posterior.covariance[:P, :P] * rounding, alone, information_of(posterior, torch.arange(P))
+    return Joint(*(x.cpu() for x in every))
 
 
 def determined(effective: float, every: int) -> str:

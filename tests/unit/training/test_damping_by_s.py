@@ -12,7 +12,7 @@ from printed_check import compared
 from herglotz.data import Trajectories, simulate
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.dissipation import with_dissipation
+from herglotz.training.questions import with_dissipation
 from herglotz.training.search import Search
 from tests import runge_kutta
 

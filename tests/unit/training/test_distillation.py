@@ -11,8 +11,7 @@ import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.training import FitConfig, distillation
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.problems.one_step import OneStep, ResidualProblem
-from herglotz.training.problems.recorded_action import action
+from herglotz.training.problems.one_step import OneStep, ResidualProblem, action
 from herglotz.training.stages import Stages
 from herglotz.training.structure import Structure
 from herglotz.training.task import Task

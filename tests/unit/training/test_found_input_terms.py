@@ -15,7 +15,7 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import saturation
 from herglotz.models import ModelConfig
 from herglotz.training import questions
-from herglotz.training.acting_inputs import beside, offered_terms, taken_terms
+from herglotz.training.acting_inputs import asked_terms, beside, offered_terms, taken_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import by_motion, dictionary
@@ -88,7 +88,7 @@ def test_the_level_at_which_an_input_saturates_is_found():
     assert offered[0][1] == pytest.approx(0.6, rel=0.15)
     first = search.first
     assert first is not None
-    (term,) = search.input_terms(first)
+    (term,) = asked_terms(search, first)
     found = saturation(term)
     assert found is not None
     assert (found[0], found[2]) == ("sat", "u")
@@ -223,6 +223,7 @@ def test_terms_that_stood_for_a_hold_leave(monkeypatch, left):
     # fails if terms stay whose gains were errors of a hold that is no longer the hold, or columns of u and forces of
     # the position are taken for one another
     monkeypatch.setattr(questions, "with_dissipation", lambda _, found: found)
+    monkeypatch.setattr(questions, "asked_terms", lambda search, best: search.input_terms(best))
     asked: Any = object.__new__(questions.Questions)
     asked.wanted = asked.read = Asked(Trajectories.of(*np.ones((2, 9)).cumsum(1), u=np.ones(9), hold="zero"), left=left)
     asked.holds, asked.hold, asked.input_terms, asked.best = ("smooth",), "", (), asked.wanted.run()
@@ -284,4 +285,4 @@ def test_nothing_is_looked_for_where_that_is_said():
     data = driven(CASES["u^2"], sway)
     config = FitConfig(find_input_terms=False).resolved(data)
     missed: Any = SimpleNamespace(at_the_noise=False)
-    assert Search(data, estimate_baseline(data), config).input_terms(missed) == ()
+    assert asked_terms(Search(data, estimate_baseline(data), config), missed) == ()

@@ -9,14 +9,13 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper, state_of
 from herglotz.training import flow
-from herglotz.training.arrowhead import dense
+from herglotz.training.arrowhead import Sums, dense
 from herglotz.training.dictionary import dictionary, keys_of
 from herglotz.training.flow import motion
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.sums import Sums
 
 PENDULUM = ModelConfig(angles=(True,), level="forced", stiffness=(0.0,), alike=True, potential_width=0, damping_width=0,
                        features=("cos(q1)", "sin(2q1)"), drag=("|v1| v1",))  # fmt: skip

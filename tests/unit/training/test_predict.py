@@ -14,10 +14,9 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
-from herglotz.training.best_start import missed_from_best_start
 from herglotz.training.free_run import near_data
 from herglotz.training.kernel import kernel_of
-from herglotz.training.predict import predict
+from herglotz.training.predict import missed_from_best_start, predict
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.recorded_range import MARGIN
 from herglotz.training.smoother import process_noise
@@ -358,7 +357,7 @@ def test_a_model_that_follows_only_parts_has_no_best_start(monkeypatch):
     model = model_of("conservative")
     run, data, grid = run_of(model), recording(model), SimpleNamespace(segments=5)
     found = SimpleNamespace(problem=SimpleNamespace(grid=grid))
-    monkeypatch.setattr("herglotz.training.best_start.fit_states", lambda *_: found)
+    monkeypatch.setattr(predict_module, "fit_states", lambda *_: found)
     assert missed_from_best_start(run, data) is None
 
 

@@ -21,8 +21,8 @@ from herglotz.training.equation import equation_of
 from herglotz.training.equation_notes import _is_lost, notes_of
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.feedback import acting_inputs
-from herglotz.training.identifiability import joint_of
 from herglotz.training.recorded_range import box_of
+from herglotz.training.uncertainty import joint_of
 
 NOISE, H = 1e-3, 0.02
 TWICE = 3**0.5  # of the misfit: a motion that is so far from the model's is twice as far from the data

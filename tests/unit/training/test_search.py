@@ -339,7 +339,7 @@ def test_held_out_residuals_are_those_of_fits_without_the_blocks():
         problem = whole.problem.of(names, whole.problem.sigma, fitter.prior(names))
         problem.used = ~out
         problem._weigh()
-        x = problem.pack(whole.theta, whole.path.x[:, 0, : problem.d])
+        x = problem.unknowns(whole.theta, whole.path)
         for _ in range(6):
             _, A, b = problem.normal_equations(x)
             x = x - torch.linalg.solve(A.dense(), b)

@@ -18,7 +18,7 @@ from herglotz.training.predict import predict
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import FoundZeros, drifts, zeros_of_one
+from herglotz.training.sensor_zeros import drifts, zeros_of_one
 from herglotz.training.stages import Stages
 from herglotz.training.structure import kept_structure
 from herglotz.training.task import build_model
@@ -125,11 +125,11 @@ def test_a_sensor_that_drifts_is_found_out():
 @pytest.mark.parametrize(("noise", "better"), [(True, True), (False, True), (True, False)])
 def test_what_is_left_of_a_drift_is_added_to_it(monkeypatch, noise, better):
     # fails if a second fit replaces the rate of the first, or a drift is believed that leaves a misfit or is no better
-    zeros = [FoundZeros(torch.tensor([x]), torch.tensor([0.01]), 0.1) for x in (0.6, 0.3, 0.0)]
+    zeros = [(torch.tensor([x]), torch.tensor([0.01])) for x in (0.6, 0.3, 0.0)]
     monkeypatch.setattr(sensor_zeros_module, "fitted", lambda *_: zeros.pop(0))
     monkeypatch.setattr(sensor_zeros_module, "WithZeros", lambda *_, **__: None)
     problem = SimpleNamespace(of=lambda *_: problem, parameters=SimpleNamespace(numbers=()), sigma=1.0, d=2)
-    problem.pack = lambda *_: None
+    problem.unknowns = lambda *_: None
     path = SimpleNamespace(x=torch.zeros(1, 1, 2))
 
     def model(at_the_noise, fits_better=True):

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from herglotz.training.strengths import likeliest, needed
+from herglotz.training.trials import likeliest, needed
 
 
 class Fits:

@@ -23,14 +23,12 @@ from herglotz.data import Trajectories
 from herglotz.data.noise import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper, state_of
-from herglotz.stepping.block_tridiagonal import eliminate
-from herglotz.training.arrowhead import Arrowhead
+from herglotz.training.arrowhead import Arrowhead, Sums, eliminated
 from herglotz.training.distributed import everywhere, world
 from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import SegmentGrid
-from herglotz.training.problems.interpolation import between_nodes, between_samples
+from herglotz.training.problems.grid import SegmentGrid, between_nodes, between_samples
 from herglotz.training.problems.joint_masses import JointMasses
 from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.problems.prior import Gaussian
@@ -42,7 +40,6 @@ from herglotz.training.solvers.lifted_newton import (
     solve_path,
     step_derivatives,
 )
-from herglotz.training.sums import Sums
 
 # Leading samples that determine the start of a free run: q and q̇ follow from three samples, forces do not.
 START_SAMPLES = 3
@@ -150,6 +147,10 @@ class ShootingProblem(StatesProblem):
     def pack(self, theta: Tensor, states: Tensor) -> Tensor:
         """Flat unknowns from parameters (P,) and segment states (S, d)."""
         return torch.cat([theta, states.reshape(-1)])
+
+    def unknowns(self, theta: Tensor, path: Path) -> Tensor:
+        """Flat unknowns from parameters (P,) and the states in which the segments of a path start."""
+        return self.pack(theta, path.x[:, 0, : self.d])
 
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Inverse of `pack`."""
@@ -265,9 +266,7 @@ class ShootingProblem(StatesProblem):
         """T⁻¹ columns, (S, d, R), for a block tridiagonal matrix T; None if that fails."""
         if self.compiled is not None:
             return self.compiled.kernel.eliminate(diagonal, upper, columns)
-        lower = torch.cat([torch.zeros_like(upper[:1]), upper[:-1].mT])
-        x = eliminate((diagonal, upper, lower), columns)
-        return x if bool(torch.isfinite(x).all()) else None
+        return eliminated(diagonal, upper, columns)
 
     def states_at(self, path: Path, samples: Tensor, d: int | None = None) -> Tensor:
         """The fitted state (…, d) at recorded samples, where the segments of the next stage, with its own d, start.

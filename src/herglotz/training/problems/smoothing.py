@@ -20,10 +20,11 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.mechanics import legendre_minus, partials
 from herglotz.models import ContactLagrangian
+from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
+from herglotz.training.arrowhead import Arrowhead, eliminated, tridiagonal
 from herglotz.training.distributed import everywhere, of_first
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.least_squares import StatesProblem
-from herglotz.training.solvers.bordered import Bordered
 from herglotz.training.solvers.lifted_newton import all_steps, parameter_derivatives
 
 # Damping of the first step of Levenberg–Marquardt: the stiff steps, not the data, make the diagonal.
@@ -62,7 +63,7 @@ class SmoothingProblem(StatesProblem):
         S, K = grid.h.shape
         x = self.data.q.new_zeros(S, K + 1, self.d)
         for b in range(S):
-            rows = (grid.node // (K + 1) == b).nonzero()[:, 0]
+            rows = (grid.segment == b).nonzero()[:, 0]
             node = grid.node[rows] - b * (K + 1)
             t = torch.cat([grid.h.new_zeros(1), grid.h[b].cumsum(0)])
             every = torch.arange(K + 1, device=node.device).clamp_max(int(grid.end[b]))
@@ -90,15 +91,15 @@ class SmoothingProblem(StatesProblem):
         fit, defect = self._residuals(states, stepped[0])
         return self.loss(fit, defect) + self._anchor(states).square().sum() / 2 + self.prior_cost(theta)
 
-    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Bordered, Tensor]:
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Arrowhead, Tensor]:
         """(cost, JᵀJ, Jᵀr). `held`: of the states alone, θ as it is."""
         theta, states = self.unpack(x)
         stepped, (S, M, d), P = self._stepped(x), states.shape, 0 if held else self.P
-        diagonal, upper, lower = x.new_zeros(3, S, M, d, d)
+        diagonal, upper = x.new_zeros(2, S, M, d, d)
         border, gradient = x.new_zeros(S, M, d, P), x.new_zeros(S, M, d)
         if not everywhere(stepped is not None) or stepped is None:
             unknown = x.new_zeros(P + gradient.numel())
-            return x.new_full((), torch.inf), Bordered(x.new_zeros(P, P), border, (diagonal, upper, lower)), unknown
+            return x.new_full((), torch.inf), self._matrix(x.new_zeros(P, P), border, diagonal, upper), unknown
         y, A = stepped[0], stepped[1][..., :d, :d]
         fit, defect = self._residuals(states, y)
         by_fit = self.seen * self.root_weights(fit) / self.deviations  # (S, M, n)
@@ -110,7 +111,7 @@ class SmoothingProblem(StatesProblem):
         diagonal[:, 1:] += torch.diag_embed(weight[..., 0])
         # Padding stays where it is.
         diagonal += torch.diag_embed((1 - self.inside).expand(-1, -1, d))
-        upper[:, :-1], lower[:, 1:] = -WA.mT, -WA
+        upper[:, :-1] = -WA.mT
         gradient[..., : self.n] = by_fit * self.root_weights(fit) * fit
         gradient[:, :-1] += (A.mT @ weighted[..., None])[..., 0]
         gradient[:, 1:] -= weighted
@@ -128,8 +129,24 @@ class SmoothingProblem(StatesProblem):
         cost = self.loss(fit, defect) + self._anchor(states).square().sum() / 2 + of_prior[0]
         corner = torch.einsum("skdp,skdr->pr", B, WB) + of_prior[1]
         top = torch.einsum("skdp,skd->p", B, weighted) + of_prior[2]
-        corner, border, diagonal, upper, lower = of_first(corner, border, diagonal, upper, lower)
-        return cost, Bordered(corner, border, (diagonal, upper, lower)), torch.cat([top, gradient.flatten()])
+        matrix = self._matrix(*of_first(corner, border, diagonal, upper))
+        return cost, matrix, torch.cat([top, gradient.flatten()])
+
+    def _matrix(self, corner: Tensor, border: Tensor, diagonal: Tensor, upper: Tensor) -> Arrowhead:
+        """JᵀJ from the blocks of all nodes of S trajectories, (S, M, d, ·); the trajectories are eliminated at once."""
+        S = self.grid.segments
+
+        def at_once(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
+            found = eliminated(*(x.unflatten(0, (S, -1)) for x in (diagonal, upper, columns)))
+            return None if found is None else found.flatten(0, 1)
+
+        return Arrowhead(corner, border.flatten(0, 1), diagonal.flatten(0, 1), upper.flatten(0, 1), at_once)
+
+    def variances(self, x: Tensor) -> Tensor:
+        """Variances of the states at the samples for known parameters, (N, d)."""
+        _, matrix, _ = self.normal_equations(x, held=True)
+        diagonal, upper = (y.unflatten(0, (self.grid.segments, -1)) for y in (matrix.blocks, matrix.upper))
+        return self.grid.at_samples(diagonal_of_inverse(tridiagonal(diagonal, upper)))
 
     def misfit(self, x: Tensor) -> Tensor:
         """Q − q_data over the balance of the coordinates at every sample, (N, n)."""
