@@ -29,7 +29,7 @@ from herglotz.export.lower.c_parameters import (
     without_parameters,
     written,
 )
-from herglotz.export.metadata import EXTRAS, check_metadata, describe, from_json
+from herglotz.export.metadata import EXTRAS, check_metadata, describe, from_json, input_labels
 from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step import MAX_ITERATIONS, ROUNDING_EPSILONS
 from herglotz.models import ContactLagrangian
@@ -58,9 +58,9 @@ TOP = """\
    int main(void) {{
      hz_state x = hz_start;  // or your own: hz_init_qv makes a state of a position and a velocity
      hz_real left;
-     int k, status = 0;
+{own_u}     int k, status = 0;
      for (k = 0; k < 100 && !(status & 15); k++) {{
-       status = hz_step(&x, hz_h, {no_u}&left);
+       status = hz_step(&x, hz_h, {u}&left);
        printf("%d %g %g\\n", k, (double)x.q[0], (double)left);
      }}
      if (status & 15)  // the state is the last good one
@@ -216,6 +216,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
         "METADATA": comment,
         "FILE": re.sub(r"[^A-Za-z0-9_.-]", "_", file),
         "UNITS": ", ".join(map(text_constant, entries["units"] or [""] * entries["dof"])),
+        "INPUTS": _in_comment(", ".join(f"{name} [{unit or '-'}]" for name, unit in input_labels(entries))),
     }
     # A user's texts are put in last, so that no replacement above changes them.
     return re.sub(r"@(\w+)@", lambda m: last.get(m[1], m[0]), text)
@@ -303,13 +304,29 @@ def _arrival(entries: Mapping[str, Any]) -> str:
     return f"   Inputs u act late: give each step the mean over it of u_f,\n   {formula}.\n\n"
 
 
+def _own_inputs(entries: Mapping[str, Any]) -> str:
+    """The line of the example that sets the caller's inputs, here to the middle of the fitted range; "" without any."""
+    if not entries["inputs"]:
+        return ""
+    ends = (entries.get(name) or entries["input_zero"] for name in ("input_low", "input_high"))
+    middle = [float(f"{(low + high) / 2:.3g}") for low, high in zip(*ends, strict=True)]
+    values = numbers(middle, entries["dtype"])
+    return f"     hz_real u[hz_M] = {{{values}}};  // your inputs, set for each step: @INPUTS@\n"
+
+
+def _in_comment(text: str) -> str:
+    """A text without characters that could end a comment of C, or go on with it on the next line."""
+    return re.sub(r"[^A-Za-z0-9_.,()\[\] -]", "_", text)
+
+
 def _top(model: ContactLagrangian, entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
     """The comment at the top, the include guard, and sizes and kinds for the preprocessor."""
     inputs = entries["inputs"]
     return TOP.format(
         version=entries["herglotz_version"],
         file="@FILE@",
-        no_u="0, " * ((inputs > 0) + ("parameters" in entries)),
+        own_u=_own_inputs(entries),
+        u="u, " * (inputs > 0) + "0, " * ("parameters" in entries),
         arrival=_arrival(entries),
         mark=MARK,
         comment="@METADATA@",

@@ -23,6 +23,7 @@ from herglotz.data.files import PathLike, sealed_text, sealed_zip, write_trusted
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, read_metadata, runtime
 from herglotz.export.lower.c_parameters import numbers
+from herglotz.export.metadata import input_labels
 from herglotz.models import ContactLagrangian
 
 # The suffix of the header's own prefix: the header has a NAME_step, and CasADi calls another NAME_step.
@@ -113,16 +114,14 @@ class Variable(NamedTuple):
 
 def variables(entries: Mapping[str, Any]) -> list[Variable]:
     """Time, the inputs, q, p and s, in the order of the value references in the C file."""
-    n, m = entries["dof"], entries["inputs"]
+    n = entries["dof"]
     names = entries.get("names") or [f"q{i + 1}" for i in range(n)]
     units = entries.get("units") or [""] * n
-    inputs = [(name, unit) for name, role, unit in entries.get("columns") or () if role == "input"]
-    inputs = inputs if len(inputs) == m else [(f"u{j + 1}", "") for j in range(m)]
     start = entries.get("start") or {"q": [0.0] * n, "p": [0.0] * n, "s": 0.0}
     found = [Variable("time", "independent", entries.get("time_unit", "s"), None, "time")]
     found += [
         Variable(f"u.{name}", "input", unit, zero, "input, held over a communication step")
-        for (name, unit), zero in zip(inputs, entries["input_zero"], strict=True)
+        for (name, unit), zero in zip(input_labels(entries), entries["input_zero"], strict=True)
     ]
     found += [Variable(f"q.{names[i]}", "output", units[i], start["q"][i], "coordinate") for i in range(n)]
     found += [Variable(f"p.{names[i]}", "output", "", start["p"][i], "momentum, D2 L_d") for i in range(n)]

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypedDict
 import torch
 
 import herglotz
+from herglotz.data.column_table import INPUT_TERM
 from herglotz.data.files import PathLike
 from herglotz.data.holds import Arrival, check_arrival
 from herglotz.errors import InputError, refuse
@@ -152,6 +153,12 @@ def describe(
         given = ", ".join(f"{x:g}" for x in span)
         raise InputError(f"h_range must be (low, high) with 0 < low <= h = {h:g} <= high, got [{given}]")
     return entries
+
+
+def input_labels(entries: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and unit of each input, as in the table that was fitted; u1, u2, ..., without a unit, if none is known."""
+    found = [(name, unit) for name, role, unit in entries.get("columns") or () if role in ("input", INPUT_TERM)]
+    return found if len(found) == entries["inputs"] else [(f"u{j + 1}", "") for j in range(entries["inputs"])]
 
 
 def _input_zero(model: ContactLagrangian) -> list[float]:

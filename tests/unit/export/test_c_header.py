@@ -141,6 +141,29 @@ def test_the_example_in_the_comment_runs(tmp_path, start):
     assert torch.allclose(printed, expected, rtol=1e-5, atol=1e-9)  # %g prints six digits
 
 
+@needs_compiler
+def test_the_example_gives_a_step_inputs_of_the_caller(tmp_path):
+    # fails if the example of a model with inputs passes none, or the name of an input ends the comment
+    size, acting = (1.0,), {"inputs": 2, "input_map": (3.0, -1.0)}
+    model = ContactLagrangian(ModelConfig((True,), "forced", size, size, size, (0.0,), potential_width=0, **acting))
+    columns = [("motor */ x", "input", "N m"), ("hz_load", "input", "")]
+    metadata = {"columns": columns, "input_low": [0.1, 0.0], "input_high": [0.3, 1.0]}
+    path = export_c(model, tmp_path / "stepper.h", h=0.1, name="arm", metadata=metadata)
+    comment = path.read_text().split("*/")[0]
+    code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
+    assert "arm_real u[arm_M] = {0.2, 0.5};  // your inputs, set for each step: motor __ x [N m], hz_load [-]" in code
+    (tmp_path / "example.c").write_text(code)
+    command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
+    state = State(*(torch.zeros(1, *shape, dtype=torch.float64) for shape in ((1,), (1,), ())))
+    u = torch.tensor([0.2, 0.5], dtype=torch.float64).expand(1, 100, 2)
+    expected = Stepper(model).rollout(*state, h=0.1, steps=100, inputs=u).q[0, 1:, 0]
+    printed = torch.tensor([float(line.split()[1]) for line in done.stdout.splitlines()], dtype=torch.float64)
+    assert torch.allclose(printed, expected, rtol=1e-5, atol=1e-9)
+
+
 def test_a_start_of_another_size_is_refused(tmp_path):  # fails if the header holds a state of too few numbers
     start = {"q": [0.4], "p": [0.1], "s": 0.0}
     with pytest.raises(InputError, match=r"start cannot be .* with dof 2; export"):
