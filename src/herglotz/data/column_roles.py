@@ -148,6 +148,12 @@ def is_set_point(name: str, unit: str) -> bool:
     return is_goal(words) and not is_effort(words, unit)
 
 
+def is_recorded_effort(name: str, unit: str) -> bool:
+    """Whether an input is a force, a voltage or a current that acts, and not one that is commanded."""
+    words = words_of(name)
+    return not is_goal(words) and is_effort(words, unit)
+
+
 def is_timed(words: frozenset[str]) -> bool:
     """Whether a word of a name, longer than a letter, is that of a time: `elapsed_time`."""
     return any(len(word) > 1 and ROLES["time"].fullmatch(word) for word in words)

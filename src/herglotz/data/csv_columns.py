@@ -13,9 +13,8 @@ from herglotz.data.column_roles import (
     READING,
     ROLES,
     Guess,
-    is_effort,
-    is_goal,
     is_of_others,
+    is_recorded_effort,
     is_set_point,
     is_timed,
     is_usual,
@@ -34,8 +33,6 @@ AS_SHOWN = {
 }  # fmt: skip
 # Names that a warning lists.
 MAX_LISTED = 5
-# Part of the warning of set points beside a recorded force, by which the warning is found among notes.
-WANTED_VALUE = "what a controller wants"
 Names = str | Sequence[str]
 
 
@@ -252,16 +249,15 @@ def _accelerations_of_others(found: Columns, guesses: Sequence[Guess], wanted: W
 
 def _of_controllers(found: Columns, inputs: Sequence[int]) -> list[str]:
     """A warning if both the set points of a controller, in the unit of a position, and its output are inputs."""
-    words = {i: words_of(found.names[i]) for i in inputs}
     wants = [found.names[i] for i in inputs if is_set_point(found.names[i], found.units[i])]
-    does = [found.names[i] for i in inputs if not is_goal(words[i]) and is_effort(words[i], found.units[i])]
+    does = [found.names[i] for i in inputs if is_recorded_effort(found.names[i], found.units[i])]
     if not wants or not does:
         return []
     goals, efforts = (", ".join(names[:MAX_LISTED]) for names in (wants, does))
     drop = shlex.quote(",".join(wants[:MAX_LISTED]))
     say, act = ("says" if len(wants) == 1 else "say"), ("does" if len(does) == 1 else "do")
     return [
-        f"warning: {goals} {say} {WANTED_VALUE}, and {efforts} {act} it: a model of both may have the "
+        f"warning: {goals} {say} what a controller wants, and {efforts} {act} it: a model of both may have the "
         f"controller's law in the place of the machine's; --drop {drop} leaves the machine's"
     ]
 

@@ -23,8 +23,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.column_roles import is_set_point
-from herglotz.data.csv_columns import WANTED_VALUE
+from herglotz.data.column_roles import is_recorded_effort, is_set_point
 from herglotz.data.noise import precisions
 from herglotz.data.smoothing import slopes
 from herglotz.data.units import size
@@ -89,7 +88,7 @@ def reason_of_idle_inputs(
 def reason_of_set_points(model: ContactLagrangian, data: Trajectories) -> str:
     """That a set point acts in the model, although a force was recorded, with a remedy; "" if that is not so."""
     names = acting_set_points(model, data)
-    if not names or not any(WANTED_VALUE in note for note in data.notes):
+    if not names or not any(is_recorded_effort(*label) for label in data.input_labels):
         return ""
     place = "in the equation, in the place of the machine's"
     remedy = f"--drop {shlex.quote(','.join(names))}, which leaves the forces that were recorded"

@@ -9,7 +9,6 @@ import torch
 
 from herglotz.cli.common import exit_code
 from herglotz.data import Trajectories
-from herglotz.data.csv_columns import WANTED_VALUE
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
 from herglotz.training import fit
@@ -125,25 +124,26 @@ def test_a_law_of_machine_and_controller_is_no_fit():
 
 def test_a_set_point_has_no_force_of_its_own():
     # fails if a cart "fits to the noise" by the law of its controller, because its force was recorded with noise; if a
-    # set point without a recorded force refuses the fit; or if an input that is no set point is taken for one
+    # set point without a recorded force refuses the fit; if an input that is no set point is taken for one; or if the
+    # refusal depends on a note, which a user who names the inputs does not get
     one = (1.0,)
     config = ModelConfig(
         (False,), "forced", one, one, (9.0,), (0.0,), potential_width=0, inputs=2, input_map=(9.0, 0.0), rate=0.1
     )
     model, u = ContactLagrangian(config), torch.zeros(20, 2, dtype=torch.float64)
     data = Trajectories.of(torch.arange(20, dtype=torch.float64), u[:, :1], u=u)
-    columns = (("goal x", "input", "m"), ("force", "input", "N"))
-    data, note = replace(data, columns=columns), f"warning: goal x says {WANTED_VALUE}"
-    told, states = replace(data, notes=(note,)), torch.zeros(20, 3, dtype=torch.float64)
-    assert reason_of_set_points(model, told) == (
+    goal, states = ("goal x", "input", "m"), torch.zeros(20, 3, dtype=torch.float64)
+    forced = replace(data, columns=(goal, ("force", "input", "N")))
+    assert reason_of_set_points(model, forced) == (
         "goal x acts in the model, and a set point acts through a controller alone: its law is in the equation, in the "
         "place of the machine's. Try --drop 'goal x', which leaves the forces that were recorded"
     )
-    assert reason_of_set_points(model, data) == ""
-    assert caveat_of_inputs(model, data, states).endswith("its law is a part of the equation")
+    unforced = replace(data, columns=(goal, ("goal force", "input", "N")))
+    assert reason_of_set_points(model, unforced) == ""
+    assert caveat_of_inputs(model, unforced, states).endswith("its law is a part of the equation")
     idle = ContactLagrangian(replace(config, input_map=(0.0, 9.0)))
-    assert reason_of_set_points(idle, told) == ""
-    assert acting_set_points(idle, told) == []
+    assert reason_of_set_points(idle, forced) == ""
+    assert acting_set_points(idle, forced) == []
     # fails if a model without inputs is asked for its map: an internal error where friction alone is learned
     free = ContactLagrangian(replace(config, inputs=0, input_map=()))
     assert reason_of_set_points(free, replace(data, u=None, columns=())) == ""
