@@ -30,8 +30,8 @@ from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
 
 MEANING = {
-    "fits to the noise": "The error of free runs of the model is not larger than the noise of the data, in held-out "
-    "time too. Within the range of the data you can trust the model.",
+    "fits to the noise": "The error of free runs of the model is not larger than the noise of the data, or than a "
+    "ten-thousandth of their spread, in held-out time too. Within the range of the data you can trust the model.",
     "fits, worse": "The model follows the data, but its error is larger than the noise of the data: a term is missing. "
     "Use the model where this error is acceptable.",
     "does not fit": "The model does not follow the data. Do not use the model; the sentence below says what to try.",

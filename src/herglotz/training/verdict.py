@@ -225,8 +225,14 @@ def in_words(
         return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    said = f"{FITS}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors)
+    said = f"{_fits(errors)}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors)
     return ". ".join(filter(None, (said, shown(True) if missed else caveat)))
+
+
+def _fits(errors: Errors) -> str:
+    """That the errors are at the limit, which is the share of the spread in place of the noise if that is said."""
+    beyond = math.isfinite(errors.noise) and errors.worst > AT_THE_NOISE * errors.noise
+    return f"{FITS}, or to {EXACT_ENOUGH:g} of the spread" if beyond else FITS
 
 
 def _unseen_motion(errors: Errors) -> str:

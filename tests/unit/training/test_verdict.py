@@ -109,6 +109,10 @@ def test_a_precision_that_is_not_known_is_said_to_be_unknown():
     assert worse.startswith(
         "fits, worse than the noise, for which its misfit of the training data stands, by a factor of 3:"
     )
+    # fails if a wheel that is missed by 80 counts, over a spread of a million, is said to fit to the noise of a third
+    counts = Errors(0.3, 0.3, 80.0, noise=0.29, spread=1e6)
+    assert in_words(counts, KNOWN, GOOD).startswith("fits to the noise, or to 0.0001 of the spread: ")
+    assert in_words(replace(counts, free=0.4), KNOWN, GOOD).startswith("fits to the noise: ")
     # fails if a precision of exact data is told as what is asked of a fit to them
     exact = str(replace(unknown, noise=2e-9))
     assert "the data's precision is 2e-09 m (errors below 0.0001 m count as none)" in exact
