@@ -8,10 +8,11 @@ looked for:
 * inputs that were recorded more often than the motion, and changed within its steps;
 * an acceleration of something else, a crane's trolley, that was left aside;
 * an input that was recorded more slowly than the motion and filled in: its steps act at times between rows;
-* kicks, as of blows and end stops: a twentieth of the samples has more than half of the sum of squares, in several
-  places with little before and after each;
+* kicks, as of blows and end stops, in the residual or in the motion itself: a twentieth of the samples has more than
+  half of the sum of squares, in several places with little before and after each;
 * the past: the lacking accelerations differ where positions, velocities and inputs of two times are alike, so that no
-  function of these gives the accelerations; or the past of the motion explains half of what these do not (`past`).
+  function of these gives the accelerations; or the past of the motion explains half of what these do not (`past`);
+* the time, if it explains half of what the state does not, and more than the past.
 """
 
 from __future__ import annotations
@@ -94,19 +95,28 @@ def reason_of(
     state += [] if data.u is None else [at(data.u)]
     x, middle = torch.cat(state, 1), at.rows[:, SAMPLES // 2]
     hidden = float(noise.square().mean())
-    if (row := _kick(data, miss, owner)) is not None:
-        unit = "" if data.time_unit == "1" else data.time_unit
-        when = f"t = {size(float(data.t[row]), unit)} of trajectory {int(data.trajectory[row])}"
-        return (
-            f"What is missed comes in kicks, the hardest at {when}. Try what strikes as an input (--inputs), or "
-            "recordings that are cut there"
-        )
+    # Terms of a model make up for an end stop, and leave no kicks: the recorded motion itself has them.
+    kicked = (("What is missed comes in kicks", miss, owner), ("The recorded velocity jumps", data.q, data.trajectory))
+    for what, signal, run in kicked:
+        if (row := _kick(data, signal, run)) is not None:
+            unit = "" if data.time_unit == "1" else data.time_unit
+            when = f"t = {size(float(data.t[row]), unit)} of trajectory {int(data.trajectory[row])}"
+            return (
+                f"{what}, the hardest at {when}, as by blows and end stops. Try what strikes as an input (--inputs), "
+                "or recordings that are cut there"
+            )
     # Measured where a force is missing: of 75 recordings with a memory 52 are told, 34 of them by neighbours alone; of
     # 50 without one 8 are, 7 of them by neighbours alone.
-    if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle):
-        by_state, by_past = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
-        if not (by_state > OTHER * (1 - hidden) and by_past < HALF * by_state):
-            return None if hidden > OTHER else ""
+    by_state, by_past, by_time = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
+    if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle) and not (
+        by_state > OTHER * (1 - hidden) and min(by_past, by_time) < HALF * by_state
+    ):
+        return None if hidden > OTHER else ""
+    if by_time < min(by_past, HALF * by_state):
+        return (
+            "What is missed changes with time where positions, velocities and inputs are alike, as where a mass grows "
+            "or leaks. Try shorter recordings, each with a fit of its own, or what changes as an input (--inputs)"
+        )
     return (
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
         "what was not recorded. Try --level full, whose action remembers, or record what else acts (--inputs)"
@@ -132,11 +142,11 @@ class _Parabolas:
         return (self.weights[order][:, None] * x[self.rows]).sum(1) / self.h**order
 
 
-def _kick(data: Trajectories, miss: Tensor, owner: Tensor) -> int | None:
-    """Row of the hardest kick, if the lacking accelerations are kicks; else None."""
+def _kick(data: Trajectories, x: Tensor, owner: Tensor) -> int | None:
+    """Row of the hardest kick, if the second derivative of x, (N, n), is kicks; else None."""
     for width in KICK_SAMPLES:
         at = _Parabolas(data, owner, width)
-        square = (at(miss, 2) / miss.std(0)).square().sum(1)
+        square = (at(x, 2) / x.std(0)).square().sum(1)
         top = square.argsort(descending=True)[: len(square) // FEW]
         # Windows of a kick share its sample; those before and after it do not.
         around = torch.nn.functional.pad(square, (2 * width, 2 * width)).unfold(0, 4 * width + 1, 1)[top]

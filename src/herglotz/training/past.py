@@ -3,11 +3,12 @@
 The force y is predicted for blocks of time from the other blocks, by two kernel ridge regressions:
 
 * from the state x = (q, q̇, u) alone, with k(x, x′) = exp(−|x − x′|²/2ℓ²);
-* from the state and the past z, with k(x, x′) (1 + z·z′/m): sums of functions of x, and of such functions times z_j.
+* from the state and the past z, with k(x, x′) (1 + z·z′/m): sums of functions of x, and of such functions times z_j;
+* from the state and the time since the start of the recording, in the same way with z = (t, t²).
 
 A force of the state that a model lacks is predicted by the state as well. The past of a motion has m signals of each
 coordinate: q̇, q̇² and q² through low-pass filters, as springs behind dampers, heat and the action remember them, and
-the position that a play has lost, as hysteresis remembers it.
+the position that a play has lost, as hysteresis remembers it. Time predicts what grows, leaks or wears.
 """
 
 from __future__ import annotations
@@ -35,13 +36,17 @@ def left_by_the_past(
     y: Tensor,  # (K, n) force at some samples
     x: Tensor,  # (K, m) state there
     at: Tensor,  # (K,) rows of these samples
-) -> tuple[float, float]:
-    """Mean squares that remain, over the variance of y, of predictions from the state, and from state and past."""
+) -> tuple[float, float, float]:
+    """Mean squares that remain, over the variance of y, of predictions from the state, alone, with past, with time."""
     some = slice(None, None, -(-len(y) // MOST))
-    y, x, z = (_standard(part) for part in (y[some], x[some], signals(data)[at[some]]))
-    apart, past = torch.cdist(x, x).square(), 1 + z @ z.T / z.shape[1]
+    since = data.t - data.t[list(data.offsets)][data.trajectory]
+    time = torch.stack([since, since.square()], 1)
+    y, x, z, time = (_standard(part) for part in (y[some], x[some], signals(data)[at[some]], time[at[some]]))
+    apart = torch.cdist(x, x).square()
     kernels = [torch.exp(-apart / (2 * width**2)) for width in WIDTHS]
-    return min(_remains(k, y) for k in kernels), min(_remains(k * past, y) for k in kernels)
+    others = (torch.ones_like(apart), *(1 + x @ x.T / x.shape[1] for x in (z, time)))
+    of_state, of_past, of_time = (min(_remains(k * other, y) for k in kernels) for other in others)
+    return of_state, of_past, of_time
 
 
 def signals(data: Trajectories) -> Tensor:
