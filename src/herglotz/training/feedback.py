@@ -105,7 +105,7 @@ def caveat_of_inputs(model: ContactLagrangian, data: Trajectories, states: Tenso
     if data.u is None or not bool(torch.isfinite(states).all()) or (left := unexplained(data, states)) >= HALF:
         return ""
     return (
-        f"{_following(left)}: the motion under that controller is met, and what the inputs do by themselves rests on "
+        f"{_following(left)}: such motion is met, and what the inputs do by themselves rests on "
         "the rest of their spread and on how they are held between samples"
     )
 
@@ -135,9 +135,14 @@ def acting_inputs(model: ContactLagrangian) -> list[int]:
 
 
 def _following(left: float) -> str:
-    """That all but this share of the inputs' spread follows from the state, in words."""
+    """That all but this share of the inputs' spread follows from the state, in words.
+
+    A controller's inputs follow from the state; the state of a machine follows from inputs that are slow beside it.
+    """
     share = f"all but {100 * left:.2g} % of their spread"
-    return f"The inputs follow from positions and velocities, {share}, as those of a controller do"
+    return (
+        f"Positions and velocities give the inputs, {share}, as under a controller or where motion follows slow inputs"
+    )
 
 
 def growth_of_noise(model: ContactLagrangian, data: Trajectories, states: Tensor, max_step: float) -> Tensor:

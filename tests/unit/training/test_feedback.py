@@ -62,7 +62,7 @@ def test_noise_of_a_start_grows_as_the_unstable_motion_does():
     [
         (-9.0, 0.15, "The motion is unstable and its inputs hold it: "),
         (9.0, 0.15, ""),  # it is stable, and the goals act
-        (9.0, 0.0, "The inputs follow from positions and velocities, "),
+        (9.0, 0.0, "Positions and velocities give the inputs, "),
     ],
 )
 def test_the_reason_is_what_is_measured(stiffness, moved, expected):
