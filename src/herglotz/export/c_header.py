@@ -301,6 +301,7 @@ def _arrival(entries: Mapping[str, Any]) -> str:
     unit = _time_unit(entries)
     late = f"u(t - {delay:.6g} {unit})" if delay else "u(t)"
     formula = f"T u_f' = {late} - u_f with T = {lag:.6g} {unit}" if lag else f"u_f(t) = {late}"
+    formula += ";\n   the fit took u for constant before the first sample: there u_f = u" if lag else ""
     return f"   Inputs u act late: give each step the mean over it of u_f,\n   {formula}.\n\n"
 
 
