@@ -5,13 +5,16 @@ A rich model with k_r parameters, chosen as c_r of C offers, replaces a simple m
     Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)] + e/√τ
 
 and if the sum also exceeds e, its standard error over blocks. ℓ_b is the log-loss of block b under Student's t for a
-fit without the samples of the block. τ is the correlation time of the residuals in samples (`correlation_time`): N
-correlated values carry the information of N/τ independent values, for which the standard error would be e/√τ.
+fit without the samples of the block. τ is the correlation time of the residuals of the fit to all samples, in samples
+(`correlation_time`): N correlated values carry the information of N/τ independent values, for which the standard error
+would be e/√τ.
 
 * White residuals have τ = 1. Without e the inequality is then the extended Bayesian information criterion
   (Chen & Chen 2008).
 * If a force is missing, residuals are correlated from sample to sample, τ is large, and each parameter costs more.
 * Lost blocks and outliers have little weight, because the loss of Student's t grows only as log |r|.
+* The coefficients of waves of learned functions have no price. The evidence sets their prior variance, and held-out
+  blocks show what they add.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ class Score:
     count
         N, number of recorded values in q.
     numbers
-        k, number of parameters. The coefficient of a wave counts as the share (0 to 1) that the data determine.
+        k, number of parameters without the coefficients of waves.
     choices
         c, number of offers in the model.
     rms
@@ -58,7 +61,7 @@ class Score:
 
     losses: Tensor  # (B,)
     count: int
-    numbers: float
+    numbers: int
     choices: int
     rms: float
     correlation_time: float = 1.0
@@ -106,8 +109,9 @@ def scores(
     over the balance, are rounding and count as `floor`. With `white` residuals, τ is 1 and is not computed.
     """
     block = torch.where(model.complete, model.block, -1)
-    of_misfits = _of_misfits(model.residuals(sets), block, floor, white=white)
-    rest = zip(of_misfits, model.told(sets).sum(1).tolist(), choices, strict=True)
+    of_misfits = _of_misfits(model.residuals(sets), block, floor, None if white else model.fitted_residuals(sets))
+    priced = (model.waves == 0).tolist()
+    rest = zip(of_misfits, [sum(priced[i] for i in own) for own in sets], choices, strict=True)
     return [Score(losses, count, numbers, chosen, error, time) for (losses, error, time), numbers, chosen in rest]
 
 
@@ -117,34 +121,38 @@ def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int 
     Residuals without a block would depend, to first order, more on the many shared parameters than on the few others.
     """
     block = torch.where(problem.data.complete, blocks(problem.data), -1)
-    ((losses, rms, time),) = _of_misfits(problem.misfit(path)[None], block, floor)
+    r = problem.misfit(path)[None]
+    ((losses, rms, time),) = _of_misfits(r, block, floor, r)
     return Score(losses, int((problem.weight > 0).sum()), problem.P, 0, rms, time, zeros)
 
 
-def free_run_score(problem: ShootingProblem, path: Path, numbers: float, floor: float) -> Score:
+def free_run_score(problem: ShootingProblem, path: Path, numbers: int, floor: float) -> Score:
     """Score over the samples that a fit has not used, as a free run over whole trajectories predicts them.
 
     Choices cost nothing here: the few models that are compared in this way have already paid for their choices.
     """
     unseen = ~problem.used & problem.data.complete
     block = torch.where(unseen, torch.cumsum(unseen, 0) - 1, 0) * BLOCKS // max(1, int(unseen.sum()))
-    ((losses, rms, time),) = _of_misfits(problem.misfit(path)[None], torch.where(unseen, block, -1), floor)
+    r = problem.misfit(path)[None]
+    ((losses, rms, time),) = _of_misfits(r, torch.where(unseen, block, -1), floor, r)
     return Score(losses, int(unseen.sum()) * problem.n, numbers, 0, rms, time)
 
 
-def _of_misfits(r: Tensor, block: Tensor, floor: float, *, white: bool = False) -> list[tuple[Tensor, float, float]]:
+def _of_misfits(r: Tensor, block: Tensor, floor: float, fitted: Tensor | None) -> list[tuple[Tensor, float, float]]:
     """Log-losses (B,), RMS and τ of each of C sets of residuals r (C, N, n) over the balance.
 
-    `block` (N,) is the block of each sample; samples in block −1 do not count. |r| below `floor` counts as `floor`.
+    τ is that of the residuals `fitted` to all samples, and 1 without them. `block` (N,) is the block of each sample;
+    samples in block −1 do not count. |r| below `floor` counts as `floor`.
     """
     inside = block >= 0
     r, block = r[:, inside], block[inside]
+    fitted = None if fitted is None else fitted[:, inside]
     scale = _scale(r).clamp_min(floor)
     x = r.abs().clamp_min(floor) / scale
     loss = scale.log() + (FREEDOM + 1) / 2 * torch.log1p(x.square() / FREEDOM)
     loss = loss.nan_to_num(nan=LOSS_IF_NOT_FINITE, posinf=LOSS_IF_NOT_FINITE).sum(2)
     losses = torch.zeros(len(r), int(block.max()) + 1, dtype=r.dtype, device=r.device).index_add_(1, block, loss)
-    time = [1.0] * len(r) if white else correlation_time(r / scale).tolist()
+    time = [1.0] * len(r) if fitted is None else correlation_time(fitted / _scale(fitted).clamp_min(floor)).tolist()
     return list(zip(losses, r.square().mean((1, 2)).sqrt().tolist(), time, strict=True))
 
 
