@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.search import Search
-from herglotz.training.trials import Trial
+from herglotz.training.trials import Trial, Variant
 
 
 @inside()
 def with_functions(search: Search, best: Trial) -> Trial:
     """A model with functions if that is better than `best`, otherwise `best`.
 
-    The functions join one by one, from the shortest segments on, and all but those of the mass at once.
+    If `best` is near the data (`Trial.near`), functions join like all offers, by the linearised motion. Otherwise they
+    join the simplest model, from the shortest segments on. If the result is not at the noise and the model of all
+    functions is better, the functions leave that are not needed.
     """
-    fitter = None if best.at_the_noise else search.function_fitter
-    if fitter is None:
+    if best.at_the_noise or search.config.translations:
         return best
     part(MORE_TERMS)
-    found = search.climbed(fitter, fitter.simple, {})
-    if not (found and found.at_the_noise) and search.flexible is not None:
-        found = search.better(found, search.pared(search.flexible))
-    if found is None or not found.taken & set(found.fitter.functions):
-        return best
-    return search.better(best, found) or best
+    found = search.better(best, _joined(search, best) if best.near else _anew(search)) or best
+    flexible = None if found.at_the_noise else search.flexible
+    if flexible is not None and search.better(found, flexible) is flexible:
+        found = search.better(found, search.pared(flexible)) or found
+    return found if found.taken & set(found.fitter.functions) else best
+
+
+def _joined(search: Search, best: Trial) -> Trial | None:
+    """The model `best` with functions that join; None if it cannot be fitted with the dictionary that has functions."""
+    if (fitter := search.fitter_of_functions(replace(best.fitter.variant, kept=best.taken))) is None:
+        return None
+    taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
+    # A named term that is a wave of a function is in the model only with the band of that wave.
+    taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
+    same = fitter.fit(taken, fitter.values_of(best), best.length, best)
+    return same and search.settled(search.finer(same), swapped=True)
+
+
+def _anew(search: Search) -> Trial | None:
+    """The simplest model with functions that join, from the shortest segments on."""
+    fitter = search.fitter_of_functions(Variant(search.order))
+    return fitter and search.climbed(fitter, fitter.simple, {})

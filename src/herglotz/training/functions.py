@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement, groupby
 from typing import NamedTuple
@@ -99,9 +99,14 @@ def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Ban
     return [band for name, waves in found.items() for band in _octaves(name, waves)]
 
 
-def terms_with(every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...]) -> NamedTerms:
-    """The terms joined by all waves of the bands, without the powers in the potential that waves can replace."""
-    gone = replaced(terms.features, (), angles)
+def terms_with(
+    every: Sequence[Band], terms: NamedTerms, angles: tuple[bool, ...], kept: Collection[str] = ()
+) -> NamedTerms:
+    """The terms joined by all waves of the bands, without the powers in the potential that waves can replace.
+
+    Terms in `kept` stay.
+    """
+    gone = replaced(terms.features, (), angles).difference(kept)
     left = [text for text in terms.features if text not in gone]
     waves = {brakes: [text for own in every if own.brakes == brakes for text in own.texts] for brakes in (False, True)}
     return replace(terms, features=tuple(left)).joined(NamedTerms(tuple(waves[False]), tuple(waves[True])))

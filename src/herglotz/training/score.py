@@ -13,8 +13,6 @@ would be e/√τ.
   (Chen & Chen 2008).
 * If a force is missing, residuals are correlated from sample to sample, τ is large, and each parameter costs more.
 * Lost blocks and outliers have little weight, because the loss of Student's t grows only as log |r|.
-* The coefficients of waves of learned functions have no price. The evidence sets their prior variance, and held-out
-  blocks show what they add.
 """
 
 from __future__ import annotations
@@ -48,7 +46,7 @@ class Score:
     count
         N, number of recorded values in q.
     numbers
-        k, number of parameters without the coefficients of waves.
+        k, number of parameters. The coefficient of a wave counts as the share (0 to 1) that the data determine.
     choices
         c, number of offers in the model.
     rms
@@ -61,7 +59,7 @@ class Score:
 
     losses: Tensor  # (B,)
     count: int
-    numbers: int
+    numbers: float
     choices: int
     rms: float
     correlation_time: float = 1.0
@@ -110,8 +108,7 @@ def scores(
     """
     block = torch.where(model.complete, model.block, -1)
     of_misfits = _of_misfits(model.residuals(sets), block, floor, None if white else model.fitted_residuals(sets))
-    priced = (model.waves == 0).tolist()
-    rest = zip(of_misfits, [sum(priced[i] for i in own) for own in sets], choices, strict=True)
+    rest = zip(of_misfits, model.told(sets).sum(1).tolist(), choices, strict=True)
     return [Score(losses, count, numbers, chosen, error, time) for (losses, error, time), numbers, chosen in rest]
 
 
@@ -126,7 +123,7 @@ def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int 
     return Score(losses, int((problem.weight > 0).sum()), problem.P, 0, rms, time, zeros)
 
 
-def free_run_score(problem: ShootingProblem, path: Path, numbers: int, floor: float) -> Score:
+def free_run_score(problem: ShootingProblem, path: Path, numbers: float, floor: float) -> Score:
     """Score over the samples that a fit has not used, as a free run over whole trajectories predicts them.
 
     Choices cost nothing here: the few models that are compared in this way have already paid for their choices.

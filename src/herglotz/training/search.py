@@ -120,25 +120,36 @@ class Search:
     @cached_property
     def full(self) -> Trial | None:
         """The model of the whole dictionary over the longest segments that the model follows."""
-        fitter = self.fitter(Variant(self.order))
-        trial = fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        return trial and self.finer(fitter.grow(self.finer(trial)))
+        trial = self._every_term
+        return trial and self.finer(trial.fitter.grow(self.finer(trial)))
 
     @cached_property
-    def function_fitter(self) -> Fitter | None:
-        """The fitter with all functions; None with translations, or if a kernel cannot have so many numbers."""
+    def _every_term(self) -> Trial | None:
+        """The model of the whole dictionary over the shortest segments."""
+        fitter = self.fitter(Variant(self.order))
+        return fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
+
+    def fitter_of_functions(self, variant: Variant) -> Fitter | None:
+        """The fitter of a variant with all functions; None with translations, or if a kernel cannot have so many."""
         functions = () if self.config.translations else tuple(bands(self.range_data, self.base))
-        fitter = self.fitter(Variant(self.order, functions=functions))
+        fitter = self.fitter(replace(variant, functions=functions))
         return fitter if functions and len(fitter.start) <= MAX_PARAMETERS else None
 
     @cached_property
     def flexible(self) -> Trial | None:
-        """The model of all functions but those of the mass, over the longest segments that the model follows."""
-        if (fitter := self.function_fitter) is None:
+        """The model of all functions but those of the mass, over the longest segments that the model follows.
+
+        None if over the shortest segments, where the motion is almost linear in the forces, all named terms are as
+        good. Fits of short segments may find a mass that is negative somewhere, with which no longer segment is
+        followed.
+        """
+        if (fitter := self.fitter_of_functions(Variant(self.order))) is None:
             return None
         taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
         trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        while trial is not None and (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
+        if trial is None or (self._every_term is not None and not trial.replaces(self._every_term)):
+            return None
+        while (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
             trial = longer
         return trial
 

@@ -58,7 +58,8 @@ ORDER_4_NOISE = 1e-3
 class Variant:
     """Order and steps of the rule, kind of dry friction, and the dictionary of a model.
 
-    `functions` are bands of learned functions beside the named terms. `dissipation` are powers of s in L.
+    `functions` are bands of learned functions beside the named terms. `dissipation` are powers of s in L. `kept` are
+    named terms that stay offers although functions can replace them.
     """
 
     order: int
@@ -66,6 +67,7 @@ class Variant:
     sticking: bool = False
     functions: tuple[Band, ...] = ()
     dissipation: tuple[str, ...] = ()
+    kept: frozenset[str] = frozenset()
 
     def crossing(self, ratio: float) -> Variant:
         """The variant with model steps of about the same length for recorded steps that are `ratio` times as long."""
@@ -222,7 +224,7 @@ class Fitter:
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
         bands, terms = variant.functions, candidates(data, config.translations)
-        terms = terms_with(bands, terms, data.angles) if bands else terms
+        terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
