@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.search import Search
-from herglotz.training.trials import Trial, Variant
+from herglotz.training.trials import ITERATIONS, Trial, Variant, likeliest
 
 
 @inside()
@@ -14,8 +14,8 @@ def with_functions(search: Search, best: Trial) -> Trial:
     """A model with functions if that is better than `best`, otherwise `best`.
 
     If `best` is near the data (`Trial.near`), functions join like all offers, by the linearised motion. Otherwise they
-    join the simplest model, from the shortest segments on. If the result is not at the noise and the model of all
-    functions is better, the functions leave that are not needed.
+    join the simplest model, from the shortest segments on. If the result is not at the noise, the model of all
+    functions competes (`Search.flexible`), pared to those that it needs.
     """
     if best.at_the_noise or search.config.translations:
         return best
@@ -28,14 +28,25 @@ def with_functions(search: Search, best: Trial) -> Trial:
 
 
 def _joined(search: Search, best: Trial) -> Trial | None:
-    """The model `best` with functions that join; None if it cannot be fitted with the dictionary that has functions."""
+    """The model `best` with functions that join one by one or, if the result is not at the noise, all at once.
+
+    The model with all functions is fitted further only if its held-out log-loss is below that of `best`. None if
+    `best` cannot be fitted with the dictionary that has all functions.
+    """
     if (fitter := search.fitter_of_functions(replace(best.fitter.variant, kept=best.taken))) is None:
         return None
     taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
     # A named term that is a wave of a function is in the model only with the band of that wave.
     taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
     same = fitter.fit(taken, fitter.values_of(best), best.length, best)
-    return same and search.settled(search.finer(same), swapped=True)
+    found = same and search.settled(search.finer(same), swapped=True)
+    if found is None or found.at_the_noise:
+        return found
+    # A pendulum whose length turns with it needs mass, potential and damping together.
+    every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
+    if every is None or not float((best.score.losses - every.score.losses).sum()) > 0:
+        return found
+    return search.better(found, search.settled(likeliest(every, 2 * ITERATIONS), swapped=True))
 
 
 def _anew(search: Search) -> Trial | None:
