@@ -22,7 +22,7 @@ def with_functions(search: Search, best: Trial) -> Trial:
     part(MORE_TERMS)
     found = search.better(best, _joined(search, best) if best.near else _anew(search)) or best
     flexible = None if found.at_the_noise else search.flexible
-    if flexible is not None and search.better(found, flexible) is flexible:
+    if flexible is not None and flexible.foretells(found):
         found = search.better(found, search.pared(flexible)) or found
     return found if found.taken & set(found.fitter.functions) else best
 

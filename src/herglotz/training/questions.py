@@ -64,9 +64,9 @@ class Questions:
         return True
 
     def _rather_functions(self, best: Trial) -> bool:
-        """True if functions, with the readings as they are, are better than the model `best` with zeros."""
+        """True if functions, with the readings as they are, foretell more than the model `best` with zeros."""
         flexible = self.read.flexible
-        return flexible is not None and self.read.better(best, flexible) is flexible
+        return flexible is not None and flexible.foretells(best)
 
     def how_inputs_hold(self, *, by_residuals: bool = False) -> bool:
         """Find another hold of the inputs (`Search.better_hold`); True if the model is better with it.

@@ -5,9 +5,8 @@ A rich model with k_r parameters, chosen as c_r of C offers, replaces a simple m
     Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)] + e/√τ
 
 and if the sum also exceeds e, its standard error over blocks. ℓ_b is the log-loss of block b under Student's t for a
-fit without the samples of the block. τ is the correlation time of the residuals of the fit to all samples, in samples
-(`correlation_time`): N correlated values carry the information of N/τ independent values, for which the standard error
-would be e/√τ.
+fit without the samples of the block. τ is the correlation time of the residuals in samples (`correlation_time`): N
+correlated values carry the information of N/τ independent values, for which the standard error would be e/√τ.
 
 * White residuals have τ = 1. Without e the inequality is then the extended Bayesian information criterion
   (Chen & Chen 2008).
@@ -107,7 +106,7 @@ def scores(
     over the balance, are rounding and count as `floor`. With `white` residuals, τ is 1 and is not computed.
     """
     block = torch.where(model.complete, model.block, -1)
-    of_misfits = _of_misfits(model.residuals(sets), block, floor, None if white else model.fitted_residuals(sets))
+    of_misfits = _of_misfits(model.residuals(sets), block, floor, white=white)
     rest = zip(of_misfits, model.told(sets).sum(1).tolist(), choices, strict=True)
     return [Score(losses, count, numbers, chosen, error, time) for (losses, error, time), numbers, chosen in rest]
 
@@ -118,8 +117,7 @@ def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int 
     Residuals without a block would depend, to first order, more on the many shared parameters than on the few others.
     """
     block = torch.where(problem.data.complete, blocks(problem.data), -1)
-    r = problem.misfit(path)[None]
-    ((losses, rms, time),) = _of_misfits(r, block, floor, r)
+    ((losses, rms, time),) = _of_misfits(problem.misfit(path)[None], block, floor)
     return Score(losses, int((problem.weight > 0).sum()), problem.P, 0, rms, time, zeros)
 
 
@@ -130,26 +128,23 @@ def free_run_score(problem: ShootingProblem, path: Path, numbers: float, floor: 
     """
     unseen = ~problem.used & problem.data.complete
     block = torch.where(unseen, torch.cumsum(unseen, 0) - 1, 0) * BLOCKS // max(1, int(unseen.sum()))
-    r = problem.misfit(path)[None]
-    ((losses, rms, time),) = _of_misfits(r, torch.where(unseen, block, -1), floor, r)
+    ((losses, rms, time),) = _of_misfits(problem.misfit(path)[None], torch.where(unseen, block, -1), floor)
     return Score(losses, int(unseen.sum()) * problem.n, numbers, 0, rms, time)
 
 
-def _of_misfits(r: Tensor, block: Tensor, floor: float, fitted: Tensor | None) -> list[tuple[Tensor, float, float]]:
+def _of_misfits(r: Tensor, block: Tensor, floor: float, *, white: bool = False) -> list[tuple[Tensor, float, float]]:
     """Log-losses (B,), RMS and τ of each of C sets of residuals r (C, N, n) over the balance.
 
-    τ is that of the residuals `fitted` to all samples, and 1 without them. `block` (N,) is the block of each sample;
-    samples in block −1 do not count. |r| below `floor` counts as `floor`.
+    `block` (N,) is the block of each sample; samples in block −1 do not count. |r| below `floor` counts as `floor`.
     """
     inside = block >= 0
     r, block = r[:, inside], block[inside]
-    fitted = None if fitted is None else fitted[:, inside]
     scale = _scale(r).clamp_min(floor)
     x = r.abs().clamp_min(floor) / scale
     loss = scale.log() + (FREEDOM + 1) / 2 * torch.log1p(x.square() / FREEDOM)
     loss = loss.nan_to_num(nan=LOSS_IF_NOT_FINITE, posinf=LOSS_IF_NOT_FINITE).sum(2)
     losses = torch.zeros(len(r), int(block.max()) + 1, dtype=r.dtype, device=r.device).index_add_(1, block, loss)
-    time = [1.0] * len(r) if fitted is None else correlation_time(fitted / _scale(fitted).clamp_min(floor)).tolist()
+    time = [1.0] * len(r) if white else correlation_time(r / scale).tolist()
     return list(zip(losses, r.square().mean((1, 2)).sqrt().tolist(), time, strict=True))
 
 

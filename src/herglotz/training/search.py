@@ -139,15 +139,16 @@ class Search:
     def flexible(self) -> Trial | None:
         """The model of all functions but those of the mass, over the longest segments that the model follows.
 
-        None if over the shortest segments, where the motion is almost linear in the forces, all named terms are as
-        good. Fits of short segments may find a mass that is negative somewhere, with which no longer segment is
-        followed.
+        None if all named terms miss the shortest segments, over which the motion is almost linear in the forces, by
+        more than the noise, and functions foretell no better. Fits of short segments may find a mass that is negative
+        somewhere, with which no longer segment is followed.
         """
         if (fitter := self.fitter_of_functions(Variant(self.order))) is None:
             return None
         taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
         trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        if trial is None or (self._every_term is not None and not trial.replaces(self._every_term)):
+        named = self._every_term
+        if trial is None or (named is not None and not named.segments_at_the_noise and not trial.foretells(named)):
             return None
         while (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
             trial = longer
