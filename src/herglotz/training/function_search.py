@@ -5,33 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 
 from herglotz.progress import MORE_TERMS, inside, part
-from herglotz.training.functions import bands
-from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.search import Search
-from herglotz.training.trials import ITERATIONS, Fitter, Trial, Variant, likeliest
+from herglotz.training.trials import ITERATIONS, Trial, Variant, likeliest
 
 
 @inside()
 def with_functions(search: Search, best: Trial) -> Trial:
     """A model with functions if that is better than `best`, otherwise `best`.
 
-    If `best` is near the data (`Trial.near`), functions join like all offers, by the linearised motion. Otherwise a
-    model of functions is fitted anew, from the shortest segments on.
+    If `best` is near the data (`Trial.near`), functions join like all offers, by the linearised motion. Otherwise they
+    join the simplest model, from the shortest segments on. If the result is not at the noise, the model of all
+    functions competes (`Search.flexible`), pared to those that it needs.
     """
     if best.at_the_noise or search.config.translations:
         return best
     part(MORE_TERMS)
-    found = _joined(search, best) if best.near else None
-    found = _anew(search) if found is None else found
-    if found is None or not found.taken & set(found.fitter.functions):
-        return best
-    return search.better(best, found) or best
-
-
-def _fitter(search: Search, variant: Variant) -> Fitter | None:
-    """The fitter of a variant with all functions; None if they have more numbers than a kernel may have."""
-    fitter = search.fitter(replace(variant, functions=tuple(bands(search.range_data, search.base))))
-    return fitter if len(fitter.start) <= MAX_PARAMETERS else None
+    found = search.better(best, _joined(search, best) if best.near else _anew(search)) or best
+    flexible = None if found.at_the_noise else search.flexible
+    if flexible is not None and flexible.foretells(found):
+        found = search.better(found, search.pared(flexible)) or found
+    return found if found.taken & set(found.fitter.functions) else best
 
 
 def _joined(search: Search, best: Trial) -> Trial | None:
@@ -40,7 +33,7 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     The model with all functions is fitted further only if its held-out log-loss is below that of `best`. None if
     `best` cannot be fitted with the dictionary that has all functions.
     """
-    if (fitter := _fitter(search, replace(best.fitter.variant, kept=best.taken))) is None:
+    if (fitter := search.fitter_of_functions(replace(best.fitter.variant, kept=best.taken))) is None:
         return None
     taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
     # A named term that is a wave of a function is in the model only with the band of that wave.
@@ -49,7 +42,7 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     found = same and search.settled(search.finer(same), swapped=True)
     if found is None or found.at_the_noise:
         return found
-    # The row open 5417/6 of `benchmarks/judge.py` needs this fit: without it no model is found, with it a poor one.
+    # A pendulum whose length turns with it needs mass, potential and damping together.
     every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
     if every is None or not float((best.score.losses - every.score.losses).sum()) > 0:
         return found
@@ -57,15 +50,6 @@ def _joined(search: Search, best: Trial) -> Trial | None:
 
 
 def _anew(search: Search) -> Trial | None:
-    """A model fitted from the shortest segments on, with functions that join one by one or all at once.
-
-    All functions but those of the mass at once are tried unless terms alone follow whole trajectories or the first
-    model is at the noise.
-    """
-    if (fitter := _fitter(search, Variant(search.order))) is None:
-        return None
-    found = search.climbed(fitter, fitter.simple, {})
-    if found is None or not (found.whole and (found.at_the_noise or not found.taken & set(fitter.functions))):
-        taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
-        found = search.better(found, search.climbed(fitter, taken, {}, joining=False))
-    return found
+    """The simplest model with functions that join, from the shortest segments on."""
+    fitter = search.fitter_of_functions(Variant(search.order))
+    return fitter and search.climbed(fitter, fitter.simple, {})

@@ -56,8 +56,17 @@ class Questions:
 
     def zeros(self) -> bool:
         """Find zeros of sensors that differ between recordings; True if the model is better with them."""
-        self.read, self.best, self.differ = self.read.with_zeros(self.best)
-        return self.differ is not None
+        read, best, differ = self.read.with_zeros(self.best)
+        # Zeros may make up for a function that no dictionary of terms has.
+        if differ is None or best is None or (not best.at_the_noise and self._rather_functions(best)):
+            return False
+        self.read, self.best, self.differ = read, best, differ
+        return True
+
+    def _rather_functions(self, best: Trial) -> bool:
+        """True if functions, with the readings as they are, foretell more than the model `best` with zeros."""
+        flexible = self.read.flexible
+        return flexible is not None and flexible.foretells(best)
 
     def how_inputs_hold(self, *, by_residuals: bool = False) -> bool:
         """Find another hold of the inputs (`Search.better_hold`); True if the model is better with it.

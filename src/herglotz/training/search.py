@@ -7,7 +7,7 @@ compared by the inequality of `score`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -24,6 +24,8 @@ from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.friction_search import with_sticking, without_injecting_friction
+from herglotz.training.functions import bands
+from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import NamedTerms, candidates, special, started
@@ -113,14 +115,44 @@ class Search:
     @cached_property
     def first(self) -> Trial | None:
         """The model grown from the simplest: offers join over short segments and ever longer ones."""
-        return self.begun and self._grown(self.begun, self.joined)
+        return self.begun and self._grown(self.begun)
 
     @cached_property
     def full(self) -> Trial | None:
         """The model of the whole dictionary over the longest segments that the model follows."""
+        trial = self._every_term
+        return trial and self.finer(trial.fitter.grow(self.finer(trial)))
+
+    @cached_property
+    def _every_term(self) -> Trial | None:
+        """The model of the whole dictionary over the shortest segments."""
         fitter = self.fitter(Variant(self.order))
-        trial = fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        return trial and self.finer(fitter.grow(self.finer(trial)))
+        return fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
+
+    def fitter_of_functions(self, variant: Variant) -> Fitter | None:
+        """The fitter of a variant with all functions; None with translations, or if a kernel cannot have so many."""
+        functions = () if self.config.translations else tuple(bands(self.range_data, self.base))
+        fitter = self.fitter(replace(variant, functions=functions))
+        return fitter if functions and len(fitter.start) <= MAX_PARAMETERS else None
+
+    @cached_property
+    def flexible(self) -> Trial | None:
+        """The model of all functions but those of the mass, over the longest segments that the model follows.
+
+        None if all named terms miss the shortest segments, over which the motion is almost linear in the forces, by
+        more than the noise, and functions foretell no better. Fits of short segments may find a mass that is negative
+        somewhere, with which no longer segment is followed.
+        """
+        if (fitter := self.fitter_of_functions(Variant(self.order))) is None:
+            return None
+        taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
+        trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
+        named = self._every_term
+        if trial is None or (named is not None and not named.segments_at_the_noise and not trial.foretells(named)):
+            return None
+        while (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
+            trial = longer
+        return trial
 
     @inside()
     def run(self) -> Trial | None:
@@ -206,19 +238,22 @@ class Search:
         values = dict(zip(numbers.numbers, numbers.get().tolist(), strict=True))
         return [offer.name for offer in fitter.offers if values[offer.amplitudes[0]] != 0], values
 
-    def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float], joining=True) -> Trial | None:
-        """A model fitted from the shortest segments on; with `joining`, offers join at every length, then settled.
+    def climbed(self, fitter: Fitter, taken: Iterable[str], values: dict[str, float]) -> Trial | None:
+        """A model fitted from the shortest segments on; offers join at every length, then it is settled.
 
         The shorter the segments, the more linear is the motion, and the better are joining offers predicted.
         """
         fitted = fitter.fit(taken, values, fitter.lengths[0], None, 2 * ITERATIONS)
-        at_each = self.joined if joining else self.finer
-        return fitted and self._grown(at_each(fitted), at_each)
+        return fitted and self._grown(self.joined(fitted))
 
-    def _grown(self, trial: Trial, at_each: Callable[[Trial], Trial]) -> Trial:
-        """The model over ever longer segments, changed `at_each` length, then settled."""
+    def _grown(self, trial: Trial) -> Trial:
+        """The model over ever longer segments, which offers join, then pared."""
         while (longer := trial.fitter.longer(trial)) is not None:
-            trial = at_each(longer)
+            trial = self.joined(longer)
+        return self.pared(trial)
+
+    def pared(self, trial: Trial) -> Trial:
+        """The model with the likeliest prior variances, without the functions that it does not need, settled."""
         return self.settled(needed(likeliest(trial, 2 * self.iterations), 2 * self.iterations))
 
     def joined(self, trial: Trial) -> Trial:

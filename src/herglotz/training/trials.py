@@ -176,6 +176,15 @@ class Trial:
         offered = max(self.fitter.offered, simple.fitter.offered)
         return replace(self.score, zeros=more).gain(simple.score, offered)
 
+    def foretells(self, other: Trial) -> bool:
+        """True if this model misses held-out blocks clearly less than another, whatever the numbers of both cost.
+
+        The model that follows longer segments is better.
+        """
+        if self.length != other.length:
+            return self.length > other.length
+        return self.score.clearly_better(other.score)
+
     def fits_better(self, simple: Trial, zeros: int = 0) -> bool:
         """True if this model, with `zeros` of sensors as further numbers, replaces a model with the same offers.
 

@@ -128,9 +128,7 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
 def test_waves_of_a_part_are_those_of_all(monkeypatch):
     # fails if the waves that a search finds in a part of a long recording have another interval in the whole of it
     asked = []
-    monkeypatch.setattr(
-        "herglotz.training.function_search.bands", lambda data, base: asked.append(data) or bands(data, base)
-    )
+    monkeypatch.setattr("herglotz.training.search.bands", lambda data, base: asked.append(data) or bands(data, base))
     monkeypatch.setattr("herglotz.training.search.SAMPLES_OF_A_PART", 170)
     data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
@@ -368,6 +366,31 @@ def test_functions_join_all_at_once_where_none_does_alone(monkeypatch):
     assert "mass(q1) 1" in found.taken
 
 
+def test_all_functions_compete_where_none_joins(monkeypatch):
+    # fails if the model of all functions, which follows the motion to the noise, is not asked where no function joins,
+    # or if functions that it does not need stay
+    monkeypatch.setattr("herglotz.training.function_search._joined", lambda *_: None)
+    monkeypatch.setattr("herglotz.training.function_search._anew", lambda _: None)
+    data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    found = ended(search)
+    every = search.flexible
+    assert every is not None
+    assert every.whole
+    assert every.at_the_noise
+    assert found.at_the_noise
+    assert found.taken < every.taken
+
+
+def test_all_functions_do_not_compete_where_they_are_no_better_over_the_shortest_segments():
+    # fails if functions are grown to whole recordings of a motion with dry friction, which no sum of waves says better
+    data = recorded(lambda q, v: -q - 0.1 * v - 0.2 * np.sign(v), STARTS, angle=False, noise=0.0)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    assert search.flexible is None
+    of = next(variant for variant in search.fitters if variant.functions)
+    assert list(search.fitters[of].problems) == [search.fitters[of].lengths[0]]
+
+
 def test_no_functions_where_named_terms_are_at_the_noise(monkeypatch):
     # fails if functions are tried for every recording: they would take the place of the law
     data = recorded(lambda q, v: -np.sin(q) - 0.1 * v, [(2.0, 0.0), (0.5, 1.0)], angle=True)
@@ -381,7 +404,7 @@ def test_no_functions_where_named_terms_are_at_the_noise(monkeypatch):
     # nor does one join that has nothing to say: the model stays itself, without the numbers that functions bring
     monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
     assert found.near
-    same = SimpleNamespace(taken=found.taken, fitter=SimpleNamespace(functions={"V(q1) 1": []}))
+    same = SimpleNamespace(taken=found.taken, fitter=SimpleNamespace(functions={"V(q1) 1": []}), at_the_noise=True)
     monkeypatch.setattr("herglotz.training.function_search._joined", lambda *_: same)
     monkeypatch.setattr(search, "better", lambda *_: same)
     assert with_functions(search, found) is found

@@ -124,6 +124,9 @@ class Asked:
         self.part = self if name != "whole" or not told.get("long") else self.of(data, "part")
         self.first, self.full = self.model("simple", 0.3, noise=bool(told.get("easy"))), None
         self.misses_segments = bool(told.get("early"))
+        self.flexible = None
+        if told.get("flexible"):
+            self.flexible = SimpleNamespace(foretells=lambda _: not told.get("worse_functions"))
         if not told.get("hard"):  # else the whole dictionary follows nothing
             self.full = self.model("full", 0.2)
 
@@ -273,6 +276,14 @@ def test_terms_anew_that_are_worse_are_not_taken(asked):
     zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
     for told in ({"zeros": zeros, "hard": True}, {"hold of cos(q1)": "smooth", "hard": True}, {"terms": ("u^2",)}):
         assert [asked(worse=worse, rms=(0.1, 0.2), **told)[0].sigma for worse in (False, True)] == [0.2, 0.1]
+
+
+def test_zeros_that_functions_make_unnecessary_are_none(asked):
+    # fails if zeros of sensors stay that made up for a function: with wrong zeros no function meets the data
+    zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
+    assert asked(zeros=zeros, flexible=True)[0].zeros == ()
+    # functions that foretell no better do not stand against the zeros
+    assert asked(zeros=zeros, flexible=True, worse_functions=True)[0].zeros == pytest.approx((0.0, 0.1))
 
 
 def test_zeros_are_asked_once_more_of_the_model_that_is_found(asked):
