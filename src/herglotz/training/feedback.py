@@ -25,18 +25,15 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.column_roles import is_recorded_effort, is_set_point
 from herglotz.data.noise import precisions
-from herglotz.data.smoothing import slopes
 from herglotz.data.units import size
-from herglotz.least_squares import least_squares
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import input_forces
+from herglotz.training.following import HALF, unexplained
 from herglotz.training.free_run import continued
 from herglotz.training.problems.grid import segment_grid, step_inputs
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import linear_recurrence, linear_steps
 
-# Share of the spread that separates what follows from what does not.
-HALF = 0.5
 # Inputs that do not follow from the state.
 SIGNALS = ("a small random signal on the inputs", "set points that jump")
 
@@ -169,16 +166,6 @@ def leaves_without_inputs(model: ContactLagrangian, data: Trajectories, states: 
     run = continued(model, states[grid.start_sample], grid.h, step_inputs(model, mean, grid))
     q, low, high = grid.at_samples(run[..., : data.dof]), data.q.amin(0), data.q.amax(0)
     return not bool(((q > low - _spread(data)) & (q < high + _spread(data))).all())
-
-
-def unexplained(data: Trajectories, states: Tensor) -> float:
-    """The part of the inputs that is no linear function of q and q̇, RMS over the spread of each input."""
-    assert data.u is not None
-    q = states[:, : data.dof]
-    x, u = torch.cat([q, slopes(data, q)], 1), data.u.to(q)
-    x, u = x - x.mean(0), u - u.mean(0)
-    x, u = (y / y.square().mean(0).sqrt().clamp_min(1e-300) for y in (x, u))
-    return float((u - x @ least_squares(x.T @ x, x.T @ u)).square().mean().sqrt())
 
 
 def _spread(data: Trajectories) -> Tensor:

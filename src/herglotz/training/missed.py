@@ -30,7 +30,7 @@ from herglotz.data.noise import SAMPLES, precisions
 from herglotz.data.polar import LENGTH, with_hints
 from herglotz.data.rates import filled_inputs
 from herglotz.data.units import COUNTS, size
-from herglotz.training.feedback import HALF
+from herglotz.training.following import HALF
 from herglotz.training.past import left_by_the_past
 
 # Most samples: the distances between all of them take 32 MB.

@@ -23,12 +23,14 @@ from herglotz.models.features import spherical
 from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.following import HALF, unexplained
 from herglotz.training.friction_search import with_sticking, without_injecting_friction
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_terms import start_of
 from herglotz.training.moves import Moves
 from herglotz.training.named_terms import NamedTerms, candidates, special, started
+from herglotz.training.offers import INPUTS
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
@@ -99,13 +101,31 @@ class Search:
         Of data without noise the misfit is that of the rule, which says nothing yet.
         """
         part(FIRST_TERMS)
+        return self._begun_from(self.fitter(Variant(self.order)).simple)
+
+    def _begun_from(self, simple: Collection[str]) -> Trial | None:
+        """The model grown from these offers as `begun` says; None if no path is found."""
         fitter = self.fitter(Variant(self.order))
-        if (trial := fitter.fit(fitter.simple, {}, fitter.lengths[0], None, 2 * ITERATIONS)) is None:
+        if (trial := fitter.fit(simple, {}, fitter.lengths[0], None, 2 * ITERATIONS)) is None:
             return None
         trial = self.joined(trial)
         while (trial.segments_at_the_noise or fitter.exact) and (longer := trial.fitter.longer(trial)) is not None:
             trial = self.joined(longer)
         return trial
+
+    @property
+    def undriven(self) -> Trial | None:
+        """The model grown to the noise from the simplest one without inputs that follow from the state; else None.
+
+        The law of the machine with its controller needs no input. From a model with inputs no change of one offer leads
+        there: a wrong force of the inputs, and other forces that make up for it, meet the data as well.
+        """
+        fitter = self.fitter(Variant(self.order))
+        inputs = {fitter.keys[name] for name in fitter.keys if name.startswith(INPUTS)}
+        if self.data.u is None or not inputs & fitter.simple or unexplained(self.data, fitter.smooth.q) >= HALF:
+            return None
+        grown = self._begun_from(fitter.simple - inputs)
+        return grown if grown and grown.at_the_noise else None
 
     @property
     def misses_segments(self) -> bool:
@@ -165,6 +185,7 @@ class Search:
         ends.append((start := self.linear_start(fitter)) and self.climbed(fitter, *start))
         if not (best and best.at_the_noise) and (full := self.full) and (best is None or full.length >= best.length):
             ends.append(self.settled(full, swapped=True))
+        ends.append((grown := self.undriven) and self.settled(grown))
         for end in ends[1:]:
             best = self.better(best, end)
         if best is None:

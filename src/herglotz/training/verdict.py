@@ -35,13 +35,13 @@ from herglotz.data.units import common_unit
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.errors_of_runs import EXACT_ENOUGH, Errors
 from herglotz.training.feedback import (
-    HALF,
     caveat_of_inputs,
     reason_of_idle_inputs,
     reason_of_inputs,
     reason_of_set_points,
 )
 from herglotz.training.flow import motion
+from herglotz.training.following import HALF
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.look import Look
 from herglotz.training.missed import MOST, reason_of, reason_of_data

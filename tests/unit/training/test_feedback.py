@@ -20,8 +20,8 @@ from herglotz.training.feedback import (
     leaves_without_inputs,
     reason_of_inputs,
     reason_of_set_points,
-    unexplained,
 )
+from herglotz.training.following import unexplained
 from herglotz.training.foresight import Foresight
 from herglotz.training.verdict import in_words
 from runge_kutta import step
@@ -172,3 +172,29 @@ def test_the_verdict_says_what_the_inputs_leave():
     lost = in_words(Errors(0.01, 0.01, 2.0, noise=0.01, spread=1.0), ahead, good, unstable)
     assert lost.startswith("does not fit beyond the recording: ")
     assert lost.endswith("It is unstable. Try shorter ones")
+
+
+def held_at_a_set_point(starts, gain, rate, h, seed=0):
+    """θ″ = −18 sin θ − 0.9 θ′ + 5 u under u = gain (0.4 − θ) − rate θ′ at every time, recorded without noise."""
+    random, q, u = torch.Generator().manual_seed(seed), [], []
+    law = lambda x: gain * (0.4 - x[0]) - rate * x[1]  # noqa: E731
+    for start in starts:
+        x = torch.tensor([start, 0.0], dtype=torch.float64)
+        for _ in range(K):
+            q, u = [*q, x[0]], [*u, law(x)]
+            for _ in range(4):
+                x = step(lambda x: torch.stack([x[1], -18 * x[0].sin() - 0.9 * x[1] + 5 * law(x)]), x, h / 4)
+    q, u = torch.stack(q)[:, None], torch.stack(u)[:, None]
+    q = q + NOISE * torch.randn(q.shape, generator=random, dtype=q.dtype)
+    t = h * torch.arange(K, dtype=torch.float64).repeat(len(starts))
+    return replace(Trajectories.of(t, q, (K,) * len(starts), u=u, angles=(True,)), names=("theta",))
+
+
+def test_the_law_of_machine_and_controller_competes():
+    # fails if a torque with the wrong sign, −17.8 for 5, "fits to the noise" where a model without inputs does with
+    # fewer numbers: from a model with inputs the search does not come there
+    run = fit(held_at_a_set_point((0.8,), 20.0, 2.0, 0.02), progress=False)
+    said = run.metrics["verdict"]
+    assert said.startswith("does not fit: "), said
+    assert "and the model has no effect of theirs: its equation is that of the machine with the controller" in said
+    assert exit_code(run) == 3
