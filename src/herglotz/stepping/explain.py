@@ -76,7 +76,9 @@ def longest_step(
     towards a fold, q1 = q* − a√(h* − h), the ratios are 2.4 and 0.04.
     """
     reach, end = _continued(L_d, state, h, max_iterations)
-    half, late = (_continued(L_d, state, part * reach, max_iterations)[1] for part in (0.5, 0.999))
+    # Both parts of the step are one batch.
+    both = State(*(x.expand(2, *x.shape) for x in state))
+    half, late = _continued(L_d, both, torch.stack([0.5 * reach, 0.999 * reach]), max_iterations)[1]
     before, after, last = ((b - a).norm(dim=-1) for a, b in ((state.q, half), (half, end), (late, end)))
     return reach, (reach < h) & (after > ESCAPE * before) & (last > 0.2 * after)
 
