@@ -67,9 +67,12 @@ def attainable(of: OpenMechanism, x0: Array, data: Recording, floor: Array) -> f
 
     With sensitivities Z of the motion and noise e, the state is off by δ = Z⁺e over the warm-up, the run by Z δ.
     """
-    offsets = 1e-6
-    moved = [motion(of, x0 + offsets * row, data.t, data.u, PERIOD / 60) for row in (0 * x0[0], *np.eye(x0.shape[1]))]
-    Z = np.moveaxis((np.stack(moved[1:]) - moved[0]) / offsets, 0, -1) / floor[:, None]  # (B, N, n, 2n + hidden)
+    offset = 1e-6
+    # The start and a neighbour of the start along each state: one batch.
+    starts = [x0 + offset * row for row in (0 * x0[0], *np.eye(x0.shape[1]))]
+    moved = motion(of, np.concatenate(starts), data.t, np.tile(data.u, (len(starts), 1)), PERIOD / 60)
+    moved = moved.reshape(len(starts), *data.truth.shape)
+    Z = np.moveaxis((moved[1:] - moved[0]) / offset, 0, -1) / floor[:, None]  # (B, N, n, 2n + hidden)
     noise = np.random.default_rng(0).standard_normal(data.truth.shape)
     errors = []
     for z, e in zip(Z, noise, strict=True):
