@@ -109,7 +109,7 @@ def test_outliers_are_left_out():
 
 def test_outliers_that_stay_are_reported():
     # fails if samples that are off by fifty amplitudes give NaN, or a run that passes for a good one
-    t, q = motion(torch.arange(300) * 0.1)
+    t, q = motion(torch.arange(120) * 0.1)
     q[::37] += 50
     run = herglotz.fit(Trajectories.of(t, q), FitConfig(iterations=5, robust="off"))
     if run.metrics["one_step_rms"] is not None:  # a recorded step is one of the model's
@@ -136,9 +136,10 @@ def test_a_million_samples_are_fitted_thinned_or_not_at_all():
     begin = time.process_time()
     with pytest.raises(InputError, match=r"667000 samples to fit, at most 300000 .*--every 3,"):
         herglotz.fit(data)
-    many = replace(data, t=torch.arange(100, dtype=torch.float64).repeat(10_000), lengths=(100,) * 10_000)
+    t, q = torch.arange(100, dtype=torch.float64).repeat(4000), data.q[:400_000]
+    many = replace(data, t=t, q=q, observed=None, lengths=(100,) * 4000)
     with pytest.raises(InputError, match=r"--every 2,"):  # many short trajectories are as many states
-        herglotz.fit(many, FitConfig(train_fraction=0.5))
+        herglotz.fit(many, FitConfig(train_fraction=1.0))
     assert time.process_time() - begin < 20
     run = herglotz.fit(data.thinned(2000), FitConfig(iterations=5))
     assert run.metrics["train_rms"] < 1e-3 * run.metrics["spread"]

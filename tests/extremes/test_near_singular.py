@@ -43,34 +43,32 @@ def test_the_parachute_up_to_its_pole(distance):
         torch.testing.assert_close(step.state.q, exact, rtol=1e-12, atol=100 * 10 * 2.2e-16 / distance)
 
 
-@pytest.mark.parametrize(("extra", "passes"), [(-1e-2, False), (1e-2, True)])
-def test_both_sides_of_the_separatrix(extra, passes):
+def test_both_sides_of_the_separatrix():
     # fails if the pendulum turns over, or does not, on the wrong side of the energy 2
     model = build(level="conservative", potential_width=0)
     with torch.no_grad():
-        out = Stepper(model).rollout(*state([0.0], [2.0 + extra]), h=0.05, steps=400)
+        out = Stepper(model).rollout(*state([[0.0], [0.0]], [[2.0 - 1e-2], [2.0 + 1e-2]]), h=0.05, steps=400)
     assert bool(out.ok.all())
-    assert (float(out.q.max()) > math.pi) == passes
+    assert (out.q.amax((1, 2)) > math.pi).tolist() == [False, True]
     energy = out.p[..., 0] ** 2 / 2 + 1 - torch.cos(out.q[..., 0])
     assert float((energy - energy[:, :1]).abs().max()) < 1.5e-3  # h²/2: order 2, and bounded
 
 
-@pytest.mark.parametrize("extra", [-1e-6, 0.0, 1e-6])
 @pytest.mark.parametrize("settings", [{}, {"correction_width": 4}], ids=["explicit", "newton"])
-def test_on_the_separatrix(extra, settings):
+def test_on_the_separatrix(settings):
     # fails if a motion that may stay at the top for ever, or fall to either side, is not finite, drifts in energy
     # beyond order 2, or passes the top faster than energy lets it
     model = build(level="conservative", potential_width=0, **settings)
     with torch.no_grad():
-        out = Stepper(model).rollout(*state([0.0], [2.0 + extra]), h=0.05, steps=1000)
+        out = Stepper(model).rollout(*state([[0.0]] * 3, [[2.0 - 1e-6], [2.0], [2.0 + 1e-6]]), h=0.05, steps=1000)
     assert bool(out.ok.all())
     energy = out.p[..., 0] ** 2 / 2 + 1 - torch.cos(out.q[..., 0])
     assert float((energy - energy[:, :1]).abs().max()) < 1.5e-3
-    top = (torch.cos(out.q[..., 0]) < -0.999).sum()
-    assert int(top) > 60  # ln of the rounding, or of what order 2 makes of it: 3 units of time at the least
+    top = (torch.cos(out.q[..., 0]) < -0.999).sum(-1)
+    assert bool((top > 60).all())  # ln of the rounding, or of what order 2 makes of it: 3 units of time at the least
 
 
-@pytest.mark.parametrize("coefficient", [0.999999, 1.0, 1.000001, 1.5])
+@pytest.mark.parametrize("coefficient", [0.999999, 1.0, 1.5])
 @pytest.mark.parametrize("order", [2, 4])
 def test_a_mass_that_features_make_singular_or_indefinite(coefficient, order):
     # fails if a told mass, which no factorisation keeps positive, gives a number that is no solution: det M = 1 − a²

@@ -45,7 +45,7 @@ with _bounded(0.1, wall=0.3):
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("h", [1e-8, 1e-5, 1e-2, 1.0, 1e2])
+@pytest.mark.parametrize("h", [1e-8, 1e-2, 1.0, 1e2])
 @pytest.mark.parametrize("level", [*LEVELS, *TOLD])
 def test_any_step_is_solved_or_says_why(level, h, dtype):
     # fails if a step without a solution is returned as a number, a small one is not solved, or the solver hangs
@@ -105,7 +105,7 @@ def test_every_h_through_a_critical_one(rule, critical, reason, dtype):
     oscillator = scene("damped_oscillator", gamma=0.5)
     L_d = oscillator.L_d if rule == "exact" else oscillator.L_d_rules[rule]
     start = starts(2, dtype)
-    for relative in (-0.3, -1e-2, -1e-3, 0.0, 1e-3, 1e-2, 0.3):
+    for relative in (-0.3, -1e-3, 0.0, 1e-3, 0.3):
         h = critical * (1 + relative)
         with torch.no_grad():
             step = Stepper(L_d).step(start, h)
