@@ -37,6 +37,14 @@ def noisy(pendulum):
     return replace(pendulum, noise=0.02, sigma=sigma, train=train, test=test)
 
 
+@pytest.fixture(scope="module")
+def true_predictions(pendulum, noisy):
+    """The free runs of the true model, of both."""
+    return {
+        name: own_predictions(of, MechanismModel(of.mechanism)) for name, of in (("exact", pendulum), ("noisy", noisy))
+    }
+
+
 class Null:
     """Models that know nothing: the position stays, or goes on at its speed."""
 
@@ -109,22 +117,20 @@ def test_a_draw_is_the_same_everywhere(pendulum):
     assert kinds == set(KINDS)
 
 
-def test_the_true_model_is_at_the_noise_and_null_models_never_are(pendulum, noisy):
+def test_the_true_model_is_at_the_noise_and_null_models_never_are(pendulum, noisy, true_predictions):
     # fails if the score forgives: a frozen or a free-flying body must not pass, and the truth must
-    true = MechanismModel(pendulum.mechanism)
-    assert score(pendulum, own_predictions(pendulum, true)) < 0.1
-    assert score(noisy, own_predictions(noisy, true)) < 1.3
-    for moves in (0.0, 1.0):
-        for of in (pendulum, noisy):
-            found = own_predictions(of, Null(moves))
-            assert outcome(score(of, found), relative(of, found), said=False) == SILENT
-    constant = {name: (np.zeros_like(q), q) for name, (_, q) in own_predictions(noisy, true).items()}
+    assert score(pendulum, true_predictions["exact"]) < 0.1
+    assert score(noisy, true_predictions["noisy"]) < 1.3
+    for moves, of in ((0.0, pendulum), (1.0, noisy)):
+        found = own_predictions(of, Null(moves))
+        assert outcome(score(of, found), relative(of, found), said=False) == SILENT
+    constant = {name: (np.zeros_like(q), q) for name, (_, q) in true_predictions["noisy"].items()}
     assert score(noisy, constant) > 10
 
 
-def test_a_part_that_was_not_reached_fails(noisy):
+def test_a_part_that_was_not_reached_fails(noisy, true_predictions):
     # fails if NaN is averaged away, or the better of the two parts counts
-    found = dict(own_predictions(noisy, MechanismModel(noisy.mechanism)))
+    found = true_predictions["noisy"]
     prediction, data = found["unseen"]
     broken = prediction.copy()
     broken[-1] = np.nan
@@ -196,17 +202,17 @@ def test_the_command_prints_json(pendulum, tmp_path, monkeypatch, capsys):
     numbers = {"score": 1.0, "relative": 0.01, "cpu_s": 3.0}
     row |= {"ours": {**numbers, "said": ""}, "delan": numbers, "known": numbers}
     monkeypatch.setattr(zoo, "measure", lambda of, *_: row | {"index": of.index})
+    monkeypatch.setattr(zoo, "draw", lambda seed, index: {(1, 1): pendulum}[seed, index])
     zoo.main(["--draw", "1", "--only", "1", "--json", "--out", str(tmp_path)])
     found = json.loads(capsys.readouterr().out)
     assert found["shares"][AT] == 1.0
     assert [each["index"] for each in found["rows"]] == [1]
 
 
-def test_what_was_not_reached_is_null_in_json(pendulum):
+def test_what_was_not_reached_is_null_in_json(pendulum, true_predictions):
     # fails if a row holds Infinity or NaN, which JSON has not, or a table of such a row cannot be made
-    true = own_predictions(pendulum, MechanismModel(pendulum.mechanism))
     row = pendulum.facts() | {"commit": "abc", "ahead_of_delan": False, "outcome": SAID}
-    row |= {name: numbers(pendulum, true) | {"cpu_s": 1.0} for name in ("known", "delan")}
+    row |= {name: numbers(pendulum, true_predictions["exact"]) | {"cpu_s": 1.0} for name in ("known", "delan")}
     row["ours"] = {"score": None, "relative": None, "cpu_s": 150.0, "said": "too slow"}
     json.dumps(row, allow_nan=False)
     assert row["known"]["score"] == max(row["known"][f"score_{part}"] for part in ("later", "unseen"))
