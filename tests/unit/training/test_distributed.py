@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from herglotz.training import distributed
+from herglotz.training import distillation, distributed
 
 WORK = """
 import sys
@@ -17,7 +17,7 @@ from pathlib import Path
 from dataclasses import replace
 import torch
 from herglotz.data import simulate
-from herglotz.training import distributed
+from herglotz.training import distillation, distributed
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, ResidualProblem, ShootingProblem, SmoothingProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
@@ -28,6 +28,7 @@ from herglotz.training.distributed import is_first, process_group
 from herglotz.training.problems.prior import prior_of
 
 distributed.MIN_ROWS = 8  # there are few rows, and each process shall have some
+distillation.ITERATIONS = 3  # sums are shared from the first iteration on
 found = {}
 with process_group():
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
@@ -59,7 +60,9 @@ if any("gloo" in name for name in threads):
 
 def result_here(tmp_path, monkeypatch):
     """Parameters and costs of the fits in this process."""
-    monkeypatch.setattr(distributed, "MIN_ROWS", distributed.MIN_ROWS)  # `WORK` sets it
+    # `WORK` sets both.
+    monkeypatch.setattr(distributed, "MIN_ROWS", distributed.MIN_ROWS)
+    monkeypatch.setattr(distillation, "ITERATIONS", distillation.ITERATIONS)
     monkeypatch.setattr(sys, "argv", ["work.py", str(tmp_path / "1.pt")])
     exec(WORK, {"__name__": "work"})
     return torch.load(tmp_path / "1.pt", weights_only=True)
