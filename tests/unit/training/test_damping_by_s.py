@@ -80,7 +80,7 @@ def test_inputs_do_work_in_s():
 
 def test_exact_positions_give_exact_numbers():
     # fails if steps stay too long for exact data: β is then off by the rule's error
-    run = fit(recorded(3, 0.0, 3, steps=50), progress=False)
+    run = fit(recorded(2, 0.0, 3, steps=40), progress=False)
     beta, _ = beta_of(run)
     assert beta == pytest.approx(BETA, rel=1e-3)
     assert run.metrics["verdict"].startswith("fits to the noise")
@@ -103,7 +103,7 @@ def test_it_is_found_where_no_model_without_s_follows_the_data():
 def test_damping_of_a_plain_kind_is_left_as_it_is():
     # fails if s² stands for a force that the dictionary lacks, or is taken beside data that plain damping explains
     for name in ("damped_pendulum", "van_der_pol"):
-        run = fit(simulate(name, trajectories=2, steps=150, noise=0.003, seed=1), progress=False)
+        run = fit(simulate(name, trajectories=2, steps=80, noise=0.003, seed=1), progress=False)
         assert run.model.config.dissipation == ()
         assert math.isfinite(run.metrics["train_rms"])
 

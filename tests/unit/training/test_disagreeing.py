@@ -26,10 +26,9 @@ def _drops(seed: int, count: int, samples: int, bad: int, wrong: float = 0.25) -
     return Trajectories.of(t.repeat(count), torch.cat(parts), (samples,) * count, units=("m",), names=("x",))
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_one_bad_recording_is_left_out_and_named(seed, capsys):
+def test_one_bad_recording_is_left_out_and_named(capsys):
     # fails if the bad recording bends the model of the others, is not named, or takes another one with it
-    run = fit(_drops(seed, 6, 13, bad=4), progress=False)
+    run = fit(_drops(0, 6, 13, bad=4), progress=False)
     (out,) = run.metrics["left_out"]
     assert out["recording"] == 4
     assert out["missed"] > 50 * out["others"]
@@ -118,13 +117,14 @@ def test_a_recording_that_differs_little_is_left_out():
 def test_a_recording_that_short_segments_do_not_tell_is_left_out(damping, scale, starts):
     # fails if recordings are followed over 20 steps alone: a fifth more damping, or 3 % of scale, bent the model, and
     # the verdict was that the force depends on the past
-    of, t, parts = torch.Generator().manual_seed(1), 0.02 * torch.arange(400).double(), []
+    of, t, parts = torch.Generator().manual_seed(1), 0.04 * torch.arange(200).double(), []
     for b, start in enumerate(starts):
         bad, x, q = b == 2, torch.tensor(start, dtype=torch.float64), []
         c = damping if bad else 0.3
         for _ in range(len(t)):
             q.append(x[0] * (scale if bad else 1.0))
-            x = step(lambda x, c=c: torch.stack([x[1], -9 * x[0].sin() - c * x[1]]), x, 0.02)
+            for _ in range(2):
+                x = step(lambda x, c=c: torch.stack([x[1], -9 * x[0].sin() - c * x[1]]), x, 0.02)
         parts.append(torch.stack(q) + 0.002 * torch.randn(len(t), generator=of, dtype=torch.float64))
     data = Trajectories.of(t.repeat(5), torch.cat(parts), (len(t),) * 5, angles=(True,))
     run = fit(data, progress=False)

@@ -68,6 +68,12 @@ STARTS = [(0.9, 0.0), (-0.7, 0.6), (0.5, -0.9), (-0.4, 0.2)]
 
 
 @pytest.fixture(scope="module")
+def in_the_well():
+    """Motion in the well with plain damping."""
+    return recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
+
+
+@pytest.fixture(scope="module")
 def searched():
     """A search over motion in the well, which is damped by position, and the model that it ends in."""
     data = recorded(lambda q, v: -well(q) - (0.05 + 0.3 * np.exp(-4 * q * q)) * v, STARTS, angle=False)
@@ -125,16 +131,21 @@ def test_the_fit_to_a_part_and_the_linear_motion_have_the_priors_of_the_fit(sear
             assert {own[wave] for own in asked} == {float(found.prior.weight[at[wave]])}
 
 
-def test_waves_of_a_part_are_those_of_all(monkeypatch):
+def test_waves_of_a_part_are_those_of_all(in_the_well, monkeypatch):
     # fails if the waves that a search finds in a part of a long recording have another interval in the whole of it
     asked = []
     monkeypatch.setattr("herglotz.training.search.bands", lambda data, base: asked.append(data) or bands(data, base))
     monkeypatch.setattr("herglotz.training.search.SAMPLES_OF_A_PART", 170)
-    data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
+    data = in_the_well
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     named = search.part.run()
     assert named is not None
     monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
+    # Functions are made, and none is better.
+    monkeypatch.setattr("herglotz.training.search.Search.better", lambda *_: None)
+    monkeypatch.setattr("herglotz.training.search.Search.climbed", lambda *_: None)
+    monkeypatch.setattr("herglotz.training.search.Search.settled", lambda _, trial, **__: trial)
+    monkeypatch.setattr("herglotz.training.search.Search.finer", lambda _, trial: trial)
     with_functions(search.part, named)
     with_functions(search.part.of(search.part.data), named)
     assert all(over is data for over in asked)
@@ -366,12 +377,12 @@ def test_functions_join_all_at_once_where_none_does_alone(monkeypatch):
     assert "mass(q1) 1" in found.taken
 
 
-def test_all_functions_compete_where_none_joins(monkeypatch):
+def test_all_functions_compete_where_none_joins(in_the_well, monkeypatch):
     # fails if the model of all functions, which follows the motion to the noise, is not asked where no function joins,
     # or if functions that it does not need stay
     monkeypatch.setattr("herglotz.training.function_search._joined", lambda *_: None)
     monkeypatch.setattr("herglotz.training.function_search._anew", lambda _: None)
-    data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
+    data = in_the_well
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     found = ended(search)
     every = search.flexible
@@ -418,10 +429,9 @@ def test_joints_whose_masses_have_second_waves_have_these_offers():
     assert {"cos(2q2) v1 v1", "sin(2q1) v1 v2", "cos(2q1) v2 v2"} <= found
 
 
-def test_a_run_steps_prints_and_keeps_its_functions(tmp_path):
+def test_a_run_steps_prints_and_keeps_its_functions(in_the_well, tmp_path):
     # fails if a plan forgets the priors of waves: a fit that follows it would be another one
-    data = recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
-    run = fit(data, out=tmp_path, train_fraction=1.0)
+    run = fit(in_the_well, out=tmp_path, train_fraction=1.0)
     plan = run.metrics["plan"]
     assert plan["spreads"]
     assert set(plan["spreads"]) <= {*plan["features"], *plan["drag"]}

@@ -150,7 +150,7 @@ def text_of(run):
 def test_the_printed_equation_is_the_model(name):
     # fails if a number of the model is not in the text, or not with its sign, factor or width, or rounded too coarsely
     sticks = "sticks" in name
-    run = run_of(*MODELS[name], h=0.004 if sticks else H, count=1 if sticks else 3, steps=120)
+    run = run_of(*MODELS[name], h=0.004 if sticks else H, count=1 if sticks else 2, steps=120 if sticks else 60)
     missed, moved = compared(run, parts=1 if sticks else 2)
     assert "step it as" not in text_of(run)
     assert moved < TWICE * missed

@@ -85,12 +85,12 @@ def test_many_outliers_are_outweighed(clean, settings):
 
 def test_outliers_in_runs_are_noticed_before_the_first_fit():
     # fails if a start pulled by outliers that are no lone spikes is kept, or clean, smooth data are mistrusted
-    for seed in range(3):
+    for seed in range(2):
         assert outliers_pull(recorded(seed, share=0.15, run=6)[0])
         assert not outliers_pull(recorded(seed)[0])
     for name, steps, h in (("parachute", 60, 0.2), ("kepler", 60, 0.05), ("double_pendulum", 60, 0.05),
-                           ("quadratic_drag", 400, 0.2), ("damped_pendulum", 400, 0.2)):  # fmt: skip
-        assert not outliers_pull(simulate(scene(name), trajectories=4, steps=steps, h=h).unwrapped())
+                           ("quadratic_drag", 200, 0.2), ("damped_pendulum", 200, 0.2)):  # fmt: skip
+        assert not outliers_pull(simulate(scene(name), trajectories=3, steps=steps, h=h).unwrapped())
     t = 2.0 * torch.arange(500, dtype=torch.float64)  # three samples a period, and at rest for most of the time
     assert not outliers_pull(Trajectories.of(t, torch.exp(-0.1 * t) * torch.cos(t)))
 

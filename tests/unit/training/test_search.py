@@ -142,7 +142,7 @@ def test_a_spherical_pendulum_is_found_in_noise():
         return -2 * b.cos() / b.sin() * v * w - 0.05 * v, b.sin() * b.cos() * v**2 - 9.81 * b.sin() - 0.05 * w
 
     starts = torch.tensor([[0.0, 0.9, 2.5, 0.0], [1.0, 0.6, 4.5, -1.0]], dtype=torch.float64)
-    found = there(searched(rolled(acceleration, starts, 200, 0.02, 1e-3, (True, True))).run())
+    found = there(searched(rolled(acceleration, starts, 120, 0.02, 1e-3, (True, True))).run())
     assert {name for name in found.taken if " v" in name} == {"cos(2q2) v1 v1"}
     assert found.at_the_noise
 
@@ -636,16 +636,16 @@ def test_a_search_of_many_samples_is_made_of_some(monkeypatch):
     import herglotz.training.search as module
 
     monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
-    data, seen = simulate(scene("duffing"), trajectories=1, steps=900, h=0.05, noise=NOISE, seed=0), []
+    data, seen = simulate(scene("duffing"), trajectories=1, steps=600, h=0.05, noise=NOISE, seed=0), []
     fit = module.Fitter.fit
     monkeypatch.setattr(
         module.Fitter, "fit", lambda self, *a, **k: seen.append(self.data.samples) or fit(self, *a, **k)
     )
     search = searched(data)
     found = there(search.of_part(search.part.run(), None)[1])
-    assert found.problem.data.samples == 901
+    assert found.problem.data.samples == 601
     assert found.taken == {"q1^2", "q1^4"}
-    assert sum(count < 300 for count in seen) > sum(count > 300 for count in seen)
+    assert sum(count < 400 for count in seen) > sum(count > 400 for count in seen)
 
 
 def test_zeros_of_a_part_are_where_those_of_all_data_begin(monkeypatch):
@@ -654,7 +654,7 @@ def test_zeros_of_a_part_are_where_those_of_all_data_begin(monkeypatch):
     import herglotz.training.search as module
 
     monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
-    data = simulate(scene("duffing"), trajectories=2, steps=450, h=0.05, noise=NOISE, seed=0)
+    data = simulate(scene("duffing"), trajectories=2, steps=300, h=0.05, noise=NOISE, seed=0)
     shift = torch.tensor([0.0, 0.5], dtype=torch.float64)
     data = replace(data, q=data.q + shift[data.trajectory][:, None], p=None, s=None)
     search, firsts, again = searched(data), [], module.Search.again
@@ -720,10 +720,10 @@ def test_a_line_and_zeros_are_found_one_after_the_other(monkeypatch):
 def test_an_angle_with_a_spring_is_a_position_on_a_line():
     # θ″ = −0.8 θ − 0.06 θ′ over turns: fails if an angle has no offer but a pendulum's, if a plan forgets what was
     # found, or if another recording is read otherwise
-    t = 0.1 * torch.arange(300, dtype=torch.float64)
+    t = 0.1 * torch.arange(150, dtype=torch.float64)
     omega = (0.8 - 0.03**2) ** 0.5
     q = 11 * torch.exp(-0.03 * t) * torch.cos(omega * t)
-    q = q + 0.01 * torch.randn(300, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q = q + 0.01 * torch.randn(150, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     data = Trajectories.of(t, q, names=("theta",), units=("rad",), angles=(True,))
     run = fit(data, progress=False)
     plan = run.metrics["plan"]

@@ -213,7 +213,7 @@ def test_a_magnetic_field_is_found():
         return p, 0.8 * turned - 0.05 * p - q * (q * q).sum(-1, keepdim=True) ** -1.5, torch.zeros_like(s)
 
     charged = replace(scene("kepler"), flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
-    data = simulate(charged, trajectories=8, steps=60, h=0.02, seed=0)
+    data = simulate(charged, trajectories=6, steps=30, h=0.02, seed=0)
     config, base, *_ = structured(data, estimate_baseline(data), FitConfig().resolved(data))
     assert config.features == ("r^-1", "q1 v2 - q2 v1")
     assert base.start[MOVING][0] == pytest.approx(0.4, rel=1e-4)  # of K: half the field
@@ -231,7 +231,7 @@ def test_a_dictionary_that_misses_is_not_taken_for_noise():
         return p, -pull.sum(-2) - 0.5 * q - 0.05 * p, torch.zeros_like(s)
 
     wells = replace(scene("kepler"), flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
-    data, told = simulate(wells, trajectories=6, steps=50, h=0.1, seed=0), FitConfig()
+    data, told = simulate(wells, trajectories=6, steps=30, h=0.1, seed=0), FitConfig()
     config, base, *_ = structured(data, estimate_baseline(data), told.resolved(data))
     assert not config.features
     assert not base.start
