@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -97,13 +98,15 @@ def test_gradients_match_finite_differences(make, level, n):
     assert float(torch.linalg.eigvalsh(A).min()) > -1e-9 * float(A.diagonal().max())
 
 
+@cache
+def long_noisy():
+    return simulate(scene("damped_pendulum"), trajectories=3, steps=200, h=0.1, noise=0.01, seed=0)
+
+
 @pytest.mark.parametrize(("sigma", "length", "better"), [(0.1, 10**3, 10), (0.1, 10, 1), (0.011, 10**3, 1)])
 def test_free_runs_over_whole_trajectories_start_where_the_data_do(sigma, length, better):
     # fails if states make up for forces that are missing, or if the noise of the starts is taken for motion
-    model, data = (
-        model_of("linear"),
-        simulate(scene("damped_pendulum"), trajectories=3, steps=200, h=0.1, noise=0.01, seed=0),
-    )
+    model, data = model_of("linear"), long_noisy()
     problem = ShootingProblem(model, data, segment_grid(data, length, 0.1), sigma=sigma)
     first = (torch.arange(data.samples) % 201 < 3)[:, None]
     assert bool((problem.weight[~first.expand_as(problem.weight)] == 1).all())
