@@ -64,7 +64,7 @@ def test_exact_positions_are_followed_by_named_terms(exact_data):
 def test_raw_residual_collapses_and_verify_says_so(exact_data, seed):
     # fails if ‖R‖² is as good as ‖M⁻¹R‖², or if `verify` passes a model that predicts nothing
     settings = FitConfig(train_fraction=1.0, objective="raw", optimiser="adam", iterations=15, restarts=1, seed=seed)
-    run = fit(exact_data.select(range(4)), settings)
+    run = fit(exact_data.select(range(2)), settings)
     costs = [h["cost"] for h in run.history if h["stage"] == "one-step error"]
     assert costs[-1] < 1e-3 * costs[0]  # the objective says that training went well ...
     assert run.metrics["one_step_rms"] > 0.1 * run.metrics["one_step_rms_constant_velocity"]  # ... and it did not

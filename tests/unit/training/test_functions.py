@@ -70,7 +70,7 @@ STARTS = [(0.9, 0.0), (-0.7, 0.6), (0.5, -0.9), (-0.4, 0.2)]
 @pytest.fixture(scope="module")
 def in_the_well():
     """Motion in the well with plain damping."""
-    return recorded(lambda q, v: -well(q) - 0.1 * v, STARTS, angle=False)
+    return recorded(lambda q, v: -well(q) - 0.1 * v, STARTS[:3], angle=False)
 
 
 @pytest.fixture(scope="module")

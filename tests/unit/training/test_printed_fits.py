@@ -36,8 +36,8 @@ def is_met(run):
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in scene_names()])
 def test_the_equation_of_a_scene_is_the_model(name):
     # fails if a number of the model is left out of its equation, rounded too coarsely, or not said to be none
-    spread = float(simulate(name, trajectories=2, steps=80, seed=0).q.std())
-    run = fit(simulate(name, trajectories=2, steps=80, noise=0.003 * spread, seed=0), progress=False)
+    spread = float(simulate(name, trajectories=2, steps=10, seed=0).q.std())
+    run = fit(simulate(name, trajectories=2, steps=60, noise=0.003 * spread, seed=0), progress=False)
     assert is_met(run), run.equation()
 
 

@@ -37,7 +37,7 @@ def double_pendulum(noise=0.0, seed=0, trajectories=12, steps=40, gaps=0):
 
 def two_pendulums(noise):
     """Two pendulums that do not touch each other."""
-    one, other = (simulate(scene("damped_pendulum"), trajectories=12, steps=40, h=0.1, noise=noise, seed=k)
+    one, other = (simulate(scene("damped_pendulum"), trajectories=8, steps=30, h=0.1, noise=noise, seed=k)
                   for k in (0, 1))  # fmt: skip
     return Trajectories.of(one.t, torch.cat([one.q, other.q], 1), one.lengths, angles=(True, True))
 
