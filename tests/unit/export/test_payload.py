@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from test_c_parameters import COMPILER, _quick_compiler  # noqa: F401  the fixture
+from test_c_parameters import COMPILER
 
 from herglotz.errors import InputError
 from herglotz.export import compile_c, export_c, load_c
