@@ -14,7 +14,6 @@ from herglotz.stepping import State, Status, Stepper
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-pytestmark = pytest.mark.usefixtures("registered_once")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from herglotz.stepping import State, Status, Stepper
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-pytestmark = pytest.mark.usefixtures("registered_once")
 MODELS = {
     "explicit": lambda: model_of(2, "linear"),
     "network": lambda: model_of(2, "affine"),
