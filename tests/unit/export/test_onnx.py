@@ -150,12 +150,13 @@ def test_a_file_starts_from_positions(written):
 
 @pytest.mark.parametrize(
     ("correction", "dtype"),
-    [(0, torch.float32), (0, torch.float64), (4, torch.float32), (4, torch.float64)],
-    ids=["explicit, float32", "explicit, float64", "newton, float32", "newton, float64"],
+    [(0, torch.float64), (4, torch.float32)],
+    ids=["explicit, float64", "newton, float32"],
 )
 def test_explicit_and_iterated_steps_agree_with_eager(correction, dtype, tmp_path):
     # fails if a single precision sum, the guess of a first step or a lost neighbour changes a step, if one h for each
-    # sample is read as one for all, or a step without c has another status than the eager one
+    # sample is read as one for all, or a step without c has another status than the eager one. The precisions of both
+    # forms: explicit steps in float32 are those of the slow tests in test_matrix.py
     model = model_of(2, "linear", correction, dtype)
     exported = load_onnx(export_onnx(model, tmp_path / "linear.onnx", h=0.1))
     q, p, s = (0.5 * x for x in states_of(2, 6, dtype))
