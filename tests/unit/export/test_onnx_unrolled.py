@@ -8,6 +8,9 @@ from export_models import model_of, near, states_of, with_terms
 
 from herglotz.errors import InputError
 from herglotz.export import compare, export_onnx, load_onnx
+from herglotz.export.equation import Equations
+from herglotz.export.programs import StepModule
+from herglotz.export.step import StepGraphs
 from herglotz.stepping import State, Status, Stepper
 
 onnx = pytest.importorskip("onnx")
@@ -60,6 +63,10 @@ def test_too_few_iterations_are_a_status(tmp_path):
     step = load_onnx(export_onnx(model, tmp_path / "step.onnx", h=0.1, unroll=2)).step(State(q, p, s), 0.1)
     lost = step.status == Status.MAX_ITERATIONS
     assert lost.any()
+    equations = Equations.of(model)
+    with torch.no_grad():
+        looped = StepModule(equations, StepGraphs(equations.model), 2)(q, p, s, torch.full_like(s, 0.1))
+    assert torch.equal(step.status, looped[5])
     assert torch.isnan(step.state.q[lost]).all()
     with pytest.raises(InputError, match="unroll must be a number of iterations of at least 2, got 1"):
         export_onnx(model, tmp_path / "one.onnx", h=0.1, unroll=1)
