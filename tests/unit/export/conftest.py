@@ -1,4 +1,4 @@
-"""Every test of exported files collects the operations of torch.onnx once."""
+"""Every test of exported files collects and reads the operations of torch.onnx once."""
 
 import pytest
 
