@@ -84,7 +84,10 @@ def _compiled_once():
 
 @pytest.fixture(scope="session")
 def registered_once():
-    """torch.onnx collects its operations once for all graphs: that took 0.3 s of each graph, and a file has four."""
+    """torch.onnx collects its operations once for all graphs, and reads the signature of an operation once.
+
+    The collection took 0.3 s of each graph, of which a file has four; the signatures took a seventh of an export.
+    """
     registry = pytest.importorskip("torch.onnx._internal.exporter._registration").ONNXRegistry
     made = functools.cache(registry.from_torchlib)
 
@@ -94,8 +97,18 @@ def registered_once():
         found.functions = {target: list(functions) for target, functions in known.functions.items()}
         return found
 
+    signature, read = pytest.importorskip("onnx_ir").schemas.OpSignature, {}
+    of_schema = signature.from_op_schema
+
+    def signature_of(schema):
+        key = schema.domain, schema.name, schema.since_version
+        if key not in read:
+            read[key] = of_schema(schema)
+        return read[key]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registry, "from_torchlib", staticmethod(copied))
+        patch.setattr(signature, "from_op_schema", staticmethod(signature_of))
         yield
 
 

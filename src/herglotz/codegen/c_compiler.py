@@ -48,13 +48,14 @@ def build(header: str, loops: str) -> ctypes.CDLL:
     return built("\0".join([header, loops]), lambda: {"stepper.h": header, SOURCE: loops})
 
 
-def built(key: str, sources: Callable[[], Mapping[str, str]], level: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
+def built(key: str, sources: Callable[[], Mapping[str, str]], level: Sequence[str] = ()) -> ctypes.CDLL:
     """The loaded library of these files, of which `SOURCE` is compiled; from the cache if the cache has the library.
 
     `key` identifies the files in the cache, together with the compiler, its flags and the processor. `level` are
-    the flags of optimisation. Raise InputError if there is no compiler, or the compiler refuses the files.
+    flags of optimisation in place of -O3. Raise InputError if there is no compiler, or the compiler refuses the files.
     """
-    words, flags = compiler(), (*(flag for flag in FLAGS if not flag.startswith("-O")), *level)
+    # Compilers take the last of several -O flags.
+    words, flags = compiler(), (*FLAGS, *level)
     digest = hashlib.sha256("\0".join([key, *words, *flags, sys.platform, _processor()]).encode()).hexdigest()[:32]
     library = private_folder("c") / f"{digest}.so"
     if not _is_whole(library):

@@ -28,9 +28,10 @@ def tiny_run(tiny_csv, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def exported(tiny_run, tmp_path_factory) -> tuple[Path, dict]:
+def exported(tiny_run, tmp_path_factory, request) -> tuple[Path, dict]:
     """The run as an ONNX file, the quickest to write and to read, and what `export --json` said; read-only."""
     pytest.importorskip("onnxruntime")
+    request.getfixturevalue("registered_once")
     path, said = tmp_path_factory.mktemp("cli_onnx") / "tiny.onnx", StringIO()
     with redirect_stdout(said):
         assert main(["export", str(tiny_run), "--out", str(path), "--json"]) == 0

@@ -4,7 +4,7 @@ import re
 
 import pytest
 import torch
-from test_c_parameters import CASES, H, _quick_compiler, address, join, named, problem  # noqa: F401  the fixture
+from test_c_parameters import CASES, H, address, join, named, problem
 
 from herglotz.codegen.c_compiler import build
 from herglotz.export.c_header import c_source, described

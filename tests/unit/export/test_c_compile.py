@@ -8,6 +8,8 @@ import pytest
 import torch
 
 import herglotz as hz
+from herglotz.codegen import c_compiler
+from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compile_c, export_c, load_c
 from herglotz.stepping import State, Stepper
 from tests.compilers import needs_compiler
@@ -119,3 +121,20 @@ def test_a_cached_library_is_not_built_again(monkeypatch):
     compile_c(m)
     monkeypatch.setattr(c_compiler, "_compile", lambda *_: pytest.fail("compiled again"))
     hz.compile(m)
+
+
+@pytest.mark.parametrize("level", [(), ("-O1",)], ids=str)
+@needs_compiler
+def test_a_level_of_optimisation_stands_after_the_flags(level, monkeypatch):
+    # fails if the flags are not those of the package, which the tests replace by flags without optimisation, or another
+    # flag than the level given has the last word
+    seen = []
+
+    def refused(_words, _sources, flags):
+        seen.append(tuple(flags))
+        raise InputError("seen")
+
+    monkeypatch.setattr(c_compiler, "_compile", refused)
+    with pytest.raises(InputError, match="seen"):
+        c_compiler.built(f"no library {level}", dict, level)
+    assert seen == [(*c_compiler.FLAGS, *level)]

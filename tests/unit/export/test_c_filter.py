@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_c_parameters import COMPILER, WARNINGS, _quick_compiler, address  # noqa: F401  the fixture
+from test_c_parameters import COMPILER, WARNINGS, address
 
 import herglotz as hz
 from herglotz.codegen.c_compiler import build

@@ -10,7 +10,6 @@ import pytest
 import torch
 from export_models import randomise
 
-from herglotz.codegen import c_compiler
 from herglotz.errors import InputError
 from herglotz.export import export_c, load_c
 from herglotz.export.c_header import RUNTIME, c_source, described, runtime
@@ -43,15 +42,6 @@ QUICK = ("conservative", "affine", "viscous, motors", "inputs by position", "sti
 
 def address(x):
     return ctypes.c_void_p(None if x is None else x.data_ptr())
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quick_compiler(tmp_path_factory):
-    """An own cache, and no optimisation: a compiler run a case."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(c_compiler, "FLAGS", tuple("-O0" if flag.startswith("-O") else flag for flag in c_compiler.FLAGS))
-        yield
 
 
 def model_of(case):

@@ -1,7 +1,10 @@
 """The C file for CasADi: its step beside Python's, its derivatives, and what it does where there is no step."""
 
 import ctypes
+import functools
+import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +25,12 @@ MODELS = {
     "mass m(q)": lambda: with_terms("m(q), coupled"),
     "sticking": lambda: with_terms("sticking"),
 }
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A function of a name in `MODELS`: the model's function of CasADi and its file, made once; read-only."""
+    return functools.cache(lambda name: function(MODELS[name](), tmp_path_factory.mktemp("casadi")))
 
 
 def function(model, folder, flags=(), **settings):
@@ -52,11 +61,11 @@ def eager(model, x, u, h):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_the_step_and_its_jacobian(name, tmp_path):
+def test_the_step_and_its_jacobian(name, written):
     # fails if q, p and s are mixed up, rows and columns of a block are exchanged, u is read from the place of h, or a
     # compiler warns
     model = MODELS[name]()
-    step, _ = function(model, tmp_path)
+    step, _ = written(name)
     given = arguments(model, near(model.config.dof, 1))
     u = given[1] if model.inputs else None
     ours, theirs = np.array(step(*given)).ravel(), eager(model, given[0], u, 0.1)
@@ -76,10 +85,9 @@ def test_the_step_and_its_jacobian(name, tmp_path):
             assert abs(block[:, j] - slope).max() <= 1e-7 * max(1.0, abs(block).max()), (k, j)
 
 
-def test_casadi_differentiates_through_many_steps(tmp_path):
+def test_casadi_differentiates_through_many_steps(written):
     # fails if CasADi does not find the Jacobian, its own sparsities do not fit, or a null argument or output is read
-    model = MODELS["inputs"]()
-    step, _ = function(model, tmp_path)
+    step, _ = written("inputs")
     x, u, h = ca.MX.sym("x", 3), ca.MX.sym("u", 2, 5), ca.MX.sym("h")
     end = x
     for k in range(5):
@@ -96,9 +104,9 @@ def test_casadi_differentiates_through_many_steps(tmp_path):
     assert abs(zero - np.array(step(at[0], [0, 0], 0.1))).max() == 0
 
 
-def test_null_arguments_are_zeros_and_null_results_are_left_out(tmp_path):
+def test_null_arguments_are_zeros_and_null_results_are_left_out(written):
     # fails if code that CasADi generated, which passes null for zeros and for what nobody asks for, ends the process
-    step, path = function(MODELS["inputs"](), tmp_path)
+    step, path = written("inputs")
     library, x1 = ctypes.CDLL(str(path.with_suffix(".so"))), (ctypes.c_double * 3)()
     x, h = (ctypes.c_double * 3)(0.2, 0.3, 0.0), (ctypes.c_double * 1)(0.1)
     pointer = ctypes.POINTER(ctypes.c_double)
@@ -110,9 +118,9 @@ def test_null_arguments_are_zeros_and_null_results_are_left_out(tmp_path):
     assert library.arm_step((pointer * 4)(), (pointer * 1)(), None, None, 0) == 1  # h = 0
 
 
-def test_a_step_that_does_not_exist_is_an_error(tmp_path):
+def test_a_step_that_does_not_exist_is_an_error(written):
     # fails if a failed step hands out its start, or NaN without a word
-    step, _ = function(MODELS["mass m(q)"](), tmp_path)
+    step, _ = written("mass m(q)")
     x = np.ones(5)
     for bad in (-0.1, 0.0, float("nan")):
         with pytest.raises(RuntimeError):
@@ -136,10 +144,10 @@ def test_float32_and_many_coordinates(tmp_path):
         many.jacobian()
 
 
-def test_the_file_is_read_as_a_header_is(tmp_path):
+def test_the_file_is_read_as_a_header_is(written, tmp_path):
     # fails if `herglotz verify arm.c` compiles CasADi's part, finds no metadata, or takes a changed file
     model = MODELS["inputs"]()
-    _, path = function(model, tmp_path)
+    path = Path(shutil.copy(written("inputs")[1], tmp_path))
     state = states_of(1, 3)
     ours = load_exported(path).step(state, 0.1)
     with torch.no_grad():
@@ -159,11 +167,11 @@ def test_names_that_cannot_be(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["inputs", "mass m(q)"])
-def test_a_hold_is_the_fewest_steps_that_are_no_longer_than_the_typical_one(name, tmp_path):
+def test_a_hold_is_the_fewest_steps_that_are_no_longer_than_the_typical_one(name, written):
     # fails if a step is lost or too long, rounding of the time adds one, a step's Jacobian is multiplied from the wrong
     # side or its own derivative by u is left out, or the derivative by the time is that of one step
     model = MODELS[name]()
-    step, path = function(model, tmp_path)
+    step, path = written(name)
     hold = ca.external("arm_hold", str(path.with_suffix(".so")))
     x, *u, _ = given = arguments(model, near(model.config.dof, 1))
     for time, count in ((0.04, 1), (0.3, 3), (0.3 * (1 + 1e-9), 3), (0.31, 4)):

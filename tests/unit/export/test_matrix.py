@@ -19,11 +19,11 @@ from herglotz.stepping import State, Status
 
 WRITE = {"pt2": export_pt2, "onnx": export_onnx, "aoti": export_aoti}
 SUFFIX = {"pt2": "pt2", "onnx": "onnx", "aoti": "pt2"}
-# A closed form, Newton's iteration by jets, and what sticks; test_pt2.py and test_onnx.py have the iteration at the
-# affine level: rollouts of every batch size, starts and derivatives.
+# A closed form, and what sticks; test_pt2.py and test_onnx.py have Newton's iteration by jets at the affine level:
+# rollouts of every batch size, starts and derivatives. test_every_term.py has the steps of order 4.
 FILES = {
     "pt2": ("forced",),
-    "onnx": ("forced", "order 4", "sticking"),
+    "onnx": ("forced", "sticking"),
     "aoti": ("affine", "forced", "order 4", "sticking"),  # a compiler run of 20–60 s for each
 }
 MATRIX = [

@@ -14,7 +14,6 @@ from herglotz.stepping import State, Status, Stepper
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-pytestmark = pytest.mark.usefixtures("registered_once")
 
 
 @pytest.fixture(scope="module")
@@ -149,19 +148,15 @@ def test_a_file_starts_from_positions(written):
     torch.testing.assert_close(torch.as_tensor(p), eager.p, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("correction", "dtype"),
-    [(0, torch.float32), (0, torch.float64), (4, torch.float32), (4, torch.float64)],
-    ids=["explicit, float32", "explicit, float64", "newton, float32", "newton, float64"],
-)
-def test_explicit_and_iterated_steps_agree_with_eager(correction, dtype, tmp_path):
+@pytest.mark.parametrize("correction", [0, 4], ids=["explicit", "newton"])
+def test_explicit_and_iterated_steps_agree_with_eager_in_float32(correction, tmp_path):
     # fails if a single precision sum, the guess of a first step or a lost neighbour changes a step, if one h for each
-    # sample is read as one for all, or a step without c has another status than the eager one
+    # sample is read as one for all, or a step without c has another status than the eager one; float64 has its own
+    # files: those of the affine level above, and the closed form of test_matrix.py
+    dtype, tol = torch.float32, 1e-4
     model = model_of(2, "linear", correction, dtype)
     exported = load_onnx(export_onnx(model, tmp_path / "linear.onnx", h=0.1))
     q, p, s = (0.5 * x for x in states_of(2, 6, dtype))
-    single = dtype == torch.float32
-    tol = 1e-4 if single else 1e-11 if correction else 1e-13
     own = torch.linspace(0.05, 0.15, 6, dtype=dtype)[:, None].expand(6, 35)
     for h in (torch.full((35,), 0.1, dtype=dtype), own, torch.linspace(0.05, 0.15, 35, dtype=dtype)):
         with torch.no_grad():
@@ -169,7 +164,7 @@ def test_explicit_and_iterated_steps_agree_with_eager(correction, dtype, tmp_pat
         for name in ("q", "p", "s", "sigma"):
             torch.testing.assert_close(getattr(ours, name), getattr(eager, name), rtol=tol, atol=tol)
         assert not ours.status.any()
-        assert float(ours.residual.max()) <= (1e-6 if single else 1e-14)
+        assert float(ours.residual.max()) <= 1e-6
     if correction == 0:
         own = own.clone()
         own[1, 20] = 1e4

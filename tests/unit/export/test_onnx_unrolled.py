@@ -1,29 +1,44 @@
 """ONNX files of one step without a loop, for importers that take none."""
 
+import functools
+
 import pytest
 import torch
 from export_models import model_of, near, states_of, with_terms
 
 from herglotz.errors import InputError
 from herglotz.export import compare, export_onnx, load_onnx
+from herglotz.export.equation import Equations
+from herglotz.export.programs import StepModule
+from herglotz.export.step import StepGraphs
 from herglotz.stepping import State, Status, Stepper
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-pytestmark = pytest.mark.usefixtures("registered_once")
 MODELS = {
     "explicit": lambda: model_of(2, "linear"),
-    "network": lambda: model_of(2, "affine"),
+    "network": lambda: model_of(1, "affine"),
     "sticking": lambda: with_terms("sticking"),
 }
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A function of a name in `MODELS`: the model and its file, made once."""
+
+    @functools.cache
+    def file(name):
+        model = MODELS[name]()
+        return model, export_onnx(model, tmp_path_factory.mktemp("unrolled") / "step.onnx", h=0.1, unroll=6)
+
+    return file
+
+
 @pytest.mark.parametrize("name", MODELS)
-def test_there_is_no_loop_and_the_steps_are_those_of_the_eager_stepper(name, tmp_path):
+def test_there_is_no_loop_and_the_steps_are_those_of_the_eager_stepper(name, written):
     # fails if a loop or a branch is left, an iteration is missing, finished samples go on, rows of h or u are mixed up,
     # or the Jacobian in the metadata has a loop
-    model = MODELS[name]()
-    path = export_onnx(model, tmp_path / "step.onnx", h=0.1, unroll=6)
+    model, path = written(name)
     proto = onnx.load(path)
     assert not {node.op_type for node in proto.graph.node} & {"Loop", "Scan", "If"}
     assert [x.name for x in proto.graph.input] == ["q", "p", "s", "h", *(["u"] if model.inputs else [])]
@@ -43,22 +58,26 @@ def test_there_is_no_loop_and_the_steps_are_those_of_the_eager_stepper(name, tmp
 
 def test_too_few_iterations_are_a_status(tmp_path):
     # fails if a step that has not converged passes for one, or the number counts one iteration more or less
-    model = model_of(2, "affine")
-    q, p, s = states_of(2, 20)
+    model = model_of(1, "affine")
+    q, p, s = states_of(1, 20)
     step = load_onnx(export_onnx(model, tmp_path / "step.onnx", h=0.1, unroll=2)).step(State(q, p, s), 0.1)
     lost = step.status == Status.MAX_ITERATIONS
     assert lost.any()
+    equations = Equations.of(model)
+    with torch.no_grad():
+        looped = StepModule(equations, StepGraphs(equations.model), 2)(q, p, s, torch.full_like(s, 0.1))
+    assert torch.equal(step.status, looped[5])
     assert torch.isnan(step.state.q[lost]).all()
     with pytest.raises(InputError, match="unroll must be a number of iterations of at least 2, got 1"):
         export_onnx(model, tmp_path / "one.onnx", h=0.1, unroll=1)
 
 
-def test_casadi_reads_the_file(tmp_path):
+def test_casadi_reads_the_file(written):
     # fails if CasADi's importer of ONNX finds a loop, or the names of inputs and outputs are others
     ca = pytest.importorskip("casadi", reason="casadi is not installed (extra: control)")
     if not hasattr(ca, "GraphBuilder"):
         pytest.skip("this casadi has no importer of ONNX")
-    path = export_onnx(model_of(1, "affine"), tmp_path / "step.onnx", h=0.1, unroll=6)
+    _, path = written("network")
     read = ca.GraphBuilder(str(path), {})
     assert read.name_in() == ["q", "p", "s", "h"]
     assert read.name_out()[:3] == ["q_out", "p_out", "s_out"]

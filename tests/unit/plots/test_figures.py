@@ -47,9 +47,8 @@ KINDS = {
     "one": {},
     "many": {"trajectories": 5, "steps": 20},
     "affine": {"level": "affine", "steps": 30},
-    "plane": {"dof": 2, "steps": 30},
+    "plane, everything trained": {"dof": 2, "steps": 30, "fraction": 1.0},
     "single precision": {"dtype": torch.float32, "steps": 30},
-    "everything trained": {"fraction": 1.0, "steps": 20},
 }
 
 
@@ -238,7 +237,7 @@ def test_the_first_of_several_motions_says_what_is_what():  # fails if captions 
 
 def test_lines_of_the_flow_last_as_long_as_the_longest_motion():
     # fails if they end after a sample, or if a panel shows the flow of another coordinate
-    run = run_of("plane")
+    run = run_of("plane, everything trained")
     flow = _background(run)
     assert flow.shape == (1, 31, 2, 2)
     for i, ax in enumerate(plot_phase_portrait(run).axes):

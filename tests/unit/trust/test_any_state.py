@@ -39,7 +39,7 @@ WRONG = (0.0, -0.1, NAN, INF, -INF, 0)  # and those that are not
 ALONE = {torch.float64: 1e-12, torch.float32: 1e-5}
 
 
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=KINDS, scope="module")
 def kind(request, files) -> tuple[Any, int, torch.dtype]:
     """A stepper, its number of coordinates, and its precision."""
     how, name, *single = request.param.split()
