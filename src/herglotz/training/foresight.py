@@ -55,8 +55,9 @@ UNCERTAIN = 0.1
 TURNS = 2.0
 # Longest free run, over the recorded time.
 LONGEST = 10
-# A term with a smaller share of its information left is a combination of other terms, and changes nothing.
-MIN_INFORMATION = 1e-9
+# A term with a smaller share of its information left is a combination of other terms, to rounding, and changes nothing.
+# Under a controller, terms that do change the free motion have shares of 1e-11.
+MIN_INFORMATION = 1e-12
 # Most trajectories that are continued.
 RUNS = 4
 

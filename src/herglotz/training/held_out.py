@@ -61,7 +61,9 @@ class HeldOut:
         # With joints the samples alone have another optimum.
         if not problem.jointed:
             self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
-        # [J, r] with the states following, each sample for the fit without its block.
+        # [J, r] with the states following, of the fit to all samples.
+        self.own = rows[..., : P + 1] - rows[..., P + 1 :] @ self.following[segment]
+        # The same, each sample for the fit without its block.
         self.rows = rows[..., : P + 1].clone()
         for k in range(len(self.equations) - 1):
             mine = (piece[:, 1] == k).nonzero()[:, 0]
@@ -85,6 +87,12 @@ class HeldOut:
             own = (self.block == k).nonzero()[:, 0]
             out[:, own] += (self.rows[own][..., :P] @ by.T).permute(2, 0, 1)
         return out * self.sigma
+
+    def fitted_residuals(self, sets: Sequence[Sequence[int]]) -> Tensor:
+        """Residuals of the fits to all samples over the balance, (C, N, n), for C sets of numbers; NaN: no solution."""
+        P = self.rows.shape[-1] - 1
+        (steps,) = self._steps(self.equations[-1:], sets)
+        return (self.own[..., P] + (self.own[..., :P] @ steps.T).permute(2, 0, 1)) * self.sigma
 
     def steps(self, own: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Steps of the numbers (P,) and of the starts of segments (S, d) in a model of `own`; NaN: no solution."""

@@ -57,18 +57,18 @@ class Moves:
         self.known.update(zip(new, self._in_parts(new), strict=True))
         return [self.known[offers] for offers in sets]
 
-    def _in_parts(self, sets: Sequence[Offers], *, white: bool = False) -> list[Score]:
+    def _in_parts(self, sets: Sequence[Offers], *, rough: bool = False) -> list[Score]:
         """The scores, of so many sets at once as `MAX_VALUES_AT_ONCE` allows."""
         curvatures = BLOCKS * max((len(self.fitter.numbers(offers)) for offers in sets), default=0) ** 2
         size = max(1, MAX_VALUES_AT_ONCE // max(curvatures, self.fitter.data.q.numel()))
         parts = [sets[k : k + size] for k in range(0, len(sets), size)]
-        return [score for part in parts for score in self.computed(part, white=white)]
+        return [score for part in parts for score in self.computed(part, rough=rough)]
 
-    def computed(self, sets: Sequence[Offers], *, white: bool = False) -> list[Score]:
-        """Scores of models with these sets of offers by the linearised motion; `white` as in `score.scores`."""
+    def computed(self, sets: Sequence[Offers], *, rough: bool = False) -> list[Score]:
+        """Scores of models with these sets of offers by the linearised motion; `rough` as in `score.scores`."""
         (model, places), count = self._linear, self.trial.problem.data.q.numel()
         numbers = [[places[name] for name in self.fitter.numbers(offers)] for offers in sets]
-        return scores(model, numbers, [len(offers) for offers in sets], count, self.fitter.floor, white=white)
+        return scores(model, numbers, [len(offers) for offers in sets], count, self.fitter.floor, rough=rough)
 
     def start(self, offers: Offers) -> tuple[dict[str, float], Tensor | None]:
         """The values of all numbers and the start states (S, d) from which a fit with these offers begins.
@@ -100,8 +100,8 @@ class Moves:
     def _better(self, at: Offers, sets: list[Offers]) -> list[Offers]:
         """The sets that replace `at`, the best first."""
         (now,) = self.scores([at])
-        # Correlation times take as long as all the rest, and cannot make up for the standard error of the losses.
-        rough = zip(sets, self._in_parts(sets, white=True), strict=True)
+        # Fits to all samples take as long as all the rest, and cannot make up for the standard error of the losses.
+        rough = zip(sets, self._in_parts(sets, rough=True), strict=True)
         sets = [offers for offers, score in rough if score.clearly_better(now)]
         found = [(score.gain(now, self.offered), other) for other, score in zip(sets, self.scores(sets), strict=True)]
         return [other for gain, other in sorted(found, key=lambda x: -x[0]) if gain > 0]

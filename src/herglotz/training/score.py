@@ -4,12 +4,15 @@ A rich model with k_r parameters, chosen as c_r of C offers, replaces a simple m
 
     Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)] + e/√τ
 
-and if the sum also exceeds e, its standard error over blocks. ℓ_b is the log-loss of block b under Student's t for a
-fit without the samples of the block. τ is the correlation time of the residuals in samples (`correlation_time`): N
-correlated values carry the information of N/τ independent values, for which the standard error would be e/√τ.
+and if the sum also exceeds e, its standard error over blocks of time: both where ℓ_b is the log-loss of block b under
+Student's t for a fit without the samples of the block, and where ℓ_b is that for the fit to all samples. τ is the
+correlation time of the residuals of the rich model's fit to all samples, in samples (`correlation_time`): N correlated
+values carry the information of N/τ independent values, for which the standard error would be e/√τ.
 
-* White residuals have τ = 1. Without e the inequality is then the extended Bayesian information criterion
-  (Chen & Chen 2008).
+* White residuals have τ = 1. Without e the inequality for fits to all samples is then the extended Bayesian information
+  criterion (Chen & Chen 2008).
+* Without a block, a simple model may be ill-determined. If a rich model meets all samples no better, no sample speaks
+  for its further numbers, however much better it predicts the block.
 * If a force is missing, residuals are correlated from sample to sample, τ is large, and each parameter costs more.
 * Lost blocks and outliers have little weight, because the loss of Student's t grows only as log |r|.
 """
@@ -41,7 +44,7 @@ class Score:
     Parameters
     ----------
     losses
-        (B,) log-loss of each block, summed over its samples.
+        (B,) log-loss of each held-out block, summed over its samples.
     count
         N, number of recorded values in q.
     numbers
@@ -54,6 +57,8 @@ class Score:
         τ, in samples.
     zeros
         Number of further parameters that are no choice among offers: zeros of sensors.
+    fitted
+        (B,) log-loss of each block for the fit to all samples; None if `losses` are of that fit, or of a free run.
     """
 
     losses: Tensor  # (B,)
@@ -63,22 +68,28 @@ class Score:
     rms: float
     correlation_time: float = 1.0
     zeros: int = 0
+    fitted: Tensor | None = None  # (B,)
 
     def replaces(self, simple: Score, offered: int) -> bool:
         """True if this richer model replaces a simpler model; `offered` is C, the number of offers."""
         return self.gain(simple, offered) > 0
 
     def gain(self, simple: Score, offered: int) -> float:
-        """Left side of the inequality minus the larger of the two bounds, with the τ of this richer model."""
-        by_block = simple.losses - self.losses
-        error = float(by_block.std()) * len(by_block) ** 0.5
-        dearer = self.price(self, offered) - self.price(simple, offered)
-        return float(by_block.sum()) - max(dearer + error / self.correlation_time**0.5, error)
+        """Left side of the inequality minus the larger of its bounds, with the τ of this richer model.
+
+        The smaller difference of held-out blocks and of the fits to all samples.
+        """
+        dearer, gains = self.price(self, offered) - self.price(simple, offered), []
+        for own, other in ((self.losses, simple.losses), (self.fitted, simple.fitted)):
+            if own is not None and other is not None:
+                total, error = _sum_and_error(other - own)
+                gains.append(total - max(dearer + error / self.correlation_time**0.5, error))
+        return min(gains)
 
     def clearly_better(self, simple: Score) -> bool:
         """True if the losses differ by more than their standard error, without which no τ lets a model replace one."""
-        by_block = simple.losses - self.losses
-        return float(by_block.sum()) > float(by_block.std()) * len(by_block) ** 0.5
+        total, error = _sum_and_error(simple.losses - self.losses)
+        return total > error
 
     def price(self, model: Score, offered: int) -> float:
         """Price of a model's parameters and choices at the τ of this score; `offered` is C, the number of offers."""
@@ -98,17 +109,22 @@ def scores(
     count: int,
     floor: float,
     *,
-    white: bool = False,
+    rough: bool = False,
 ) -> list[Score]:
     """Scores, to first order, of C models that keep these sets of a fit's parameters (indices).
 
     `choices` are the numbers of offers that the sets come from, `count` is N. Residuals below `floor`, in units of q
-    over the balance, are rounding and count as `floor`. With `white` residuals, τ is 1 and is not computed.
+    over the balance, are rounding and count as `floor`. If `rough`, the scores are for `Score.clearly_better` alone:
+    the fits to all samples are not computed.
     """
     block = torch.where(model.complete, model.block, -1)
-    of_misfits = _of_misfits(model.residuals(sets), block, floor, white=white)
-    rest = zip(of_misfits, model.told(sets).sum(1).tolist(), choices, strict=True)
-    return [Score(losses, count, numbers, chosen, error, time) for (losses, error, time), numbers, chosen in rest]
+    held_out = _of_misfits(model.residuals(sets), block, floor, white=True)
+    fits = held_out if rough else _of_misfits(model.fitted_residuals(sets), block, floor)
+    every = zip(held_out, fits, model.told(sets).sum(1).tolist(), choices, strict=True)
+    return [
+        Score(losses, count, numbers, chosen, error, time, fitted=fitted)
+        for (losses, error, _), (fitted, _, time), numbers, chosen in every
+    ]
 
 
 def fitted_score(problem: ShootingProblem, path: Path, floor: float, zeros: int = 0) -> Score:
@@ -136,6 +152,7 @@ def _of_misfits(r: Tensor, block: Tensor, floor: float, *, white: bool = False) 
     """Log-losses (B,), RMS and τ of each of C sets of residuals r (C, N, n) over the balance.
 
     `block` (N,) is the block of each sample; samples in block −1 do not count. |r| below `floor` counts as `floor`.
+    τ of `white` residuals is 1 and is not computed.
     """
     inside = block >= 0
     r, block = r[:, inside], block[inside]
@@ -146,6 +163,11 @@ def _of_misfits(r: Tensor, block: Tensor, floor: float, *, white: bool = False) 
     losses = torch.zeros(len(r), int(block.max()) + 1, dtype=r.dtype, device=r.device).index_add_(1, block, loss)
     time = [1.0] * len(r) if white else correlation_time(r / scale).tolist()
     return list(zip(losses, r.square().mean((1, 2)).sqrt().tolist(), time, strict=True))
+
+
+def _sum_and_error(by_block: Tensor) -> tuple[float, float]:
+    """The sum over blocks (B,) and its standard error."""
+    return float(by_block.sum()), float(by_block.std()) * len(by_block) ** 0.5
 
 
 def correlation_time(x: Tensor) -> Tensor:

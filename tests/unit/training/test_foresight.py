@@ -1,5 +1,9 @@
 """What the data leave open of free runs beyond them, and that a fit to too short a recording says so."""
 
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
 import pytest
 import torch
 
@@ -8,7 +12,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import fit, foresight, verdict
-from herglotz.training.foresight import _Ahead
+from herglotz.training.foresight import _Ahead, _open
 from herglotz.training.free_run import states_everywhere
 from herglotz.training.objectives import Fitted
 
@@ -34,6 +38,18 @@ def test_runs_that_go_on_by_one_sample_are_followed():
     states = torch.cat([out.q, out.p, out.s[:, None]], -1)
     found = runs.stepped_on(model, states[:4], 0.1)
     torch.testing.assert_close(found, states)
+
+
+def test_a_term_that_other_terms_nearly_replace_may_be_large():
+    # fails if the little information left is taken for rounding (under a controller 1e-11 of all: a wrong effect of the
+    # torque, "fits to the noise"), or if a term that others replace altogether may be anything
+    J = torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    near = J[:, 0] + 1e-5 * J[:, 2]
+    A = (rows := torch.stack([J[:, 0], J[:, 1], near, J[:, 0]], 1)).T @ rows
+    problem = cast(Any, SimpleNamespace(data=SimpleNamespace(q=J[:, :1])))
+    _, follow = _open(A, {"near": [2], "twin": [3]}, problem)
+    assert follow[2, 0] == pytest.approx(math.sqrt(math.log(200)) * 1e5 / 200**0.5, rel=0.2)
+    assert not follow[:, 1].any()
 
 
 @pytest.mark.parametrize(("last", "ends"), [(0.9, None), (1.1, 6)])

@@ -274,6 +274,17 @@ def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, time,
     assert rich.replaces(simple, 80) is replaces
 
 
+@pytest.mark.parametrize(
+    ("held_out", "fitted", "replaces"), [(20.0, 20.0, True), (20.0, 0.3, False), (0.3, 20.0, False)]
+)
+def test_a_richer_model_meets_all_samples_better_and_foretells_blocks_better(held_out, fitted, replaces):
+    # fails if one of both is enough: a simple model that is ill-determined without a block misses the block, whatever
+    # the further number of a rich model is
+    simple = Score(torch.full((10,), float(held_out)), 400, 3.0, 3, 1.0, fitted=torch.full((10,), float(fitted)))
+    rich = Score(torch.zeros(10), 400, 4.0, 4, 1.0, fitted=torch.zeros(10))
+    assert rich.replaces(simple, 80) is replaces
+
+
 def test_samples_that_repeat_one_another_tell_as_much_as_one():
     # fails if τ is not that of an autoregressive process, (1 + φ)/(1 − φ), or a residual that is no number makes it one
     torch.manual_seed(0)
@@ -345,6 +356,21 @@ def test_held_out_residuals_are_those_of_fits_without_the_blocks():
             x = x - torch.linalg.solve(A.dense(), b)
         missed = problem.misfit(there(problem.solve(x)))[out]
         torch.testing.assert_close(found[out], missed, rtol=0.05, atol=2e-4)
+
+
+def test_residuals_of_a_smaller_set_are_those_of_its_fit():
+    # fails if numbers that leave do not go, or those that stay and the starts do not follow. To first order is exact
+    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    data = replace(data, q=data.q + 0.01)
+    fitter = searched(data).fitter(Variant(2))
+    assert "q1" in {offer.name for offer in fitter.offers}
+    whole = fitter.grow(there(fitter.fit({"q1^2", "q1"}, {}, 5, None, 60)))
+    more = there(fitter.fit({"q1^2", "q1"}, whole.values, whole.length, whole, 60))
+    less = there(fitter.fit({"q1^2"}, more.values, more.length, more, 60))
+    fewer, every = Moves(more).scores([frozenset({"q1^2"}), more.taken])
+    assert there(fewer.fitted).tolist() == pytest.approx(there(less.score.fitted).tolist(), abs=0.1)
+    assert there(every.fitted).tolist() == pytest.approx(there(more.score.fitted).tolist(), abs=0.1)
+    assert float((there(fewer.fitted) - there(every.fitted)).abs().max()) > 1
 
 
 def test_fits_start_where_the_linear_motion_sees_their_numbers(duffing):
@@ -434,7 +460,7 @@ def test_of_many_offers_some_leave_at_once_but_not_those_that_stand_for_one_anot
     names, asked = [f"{x}{i}" for i in range(16) for x in "ab"], []
 
     class Pairs(Moves):
-        def computed(self, sets, *, white=False):  # noqa: ARG002
+        def computed(self, sets, *, rough=False):  # noqa: ARG002
             asked.extend(sets)
             lost = [sum(not {f"a{i}", f"b{i}"} & own for i in range(16)) for own in sets]
             every = zip(sets, lost, strict=True)
@@ -453,7 +479,7 @@ def test_offers_of_many_numbers_are_compared_in_parts():
     asked = []
 
     class Parts(Moves):
-        def computed(self, sets, *, white=False):  # noqa: ARG002
+        def computed(self, sets, *, rough=False):  # noqa: ARG002
             asked.append(len(sets))
             return [Score(torch.zeros(10), 400, len(own), len(own), 1.0) for own in sets]
 
@@ -469,7 +495,7 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
     dry, excess = Offer("dry", ("dry",)), Offer("excess", ("excess",), on="dry")
 
     class Friction(Moves):
-        def computed(self, sets, *, white=False):  # noqa: ARG002
+        def computed(self, sets, *, rough=False):  # noqa: ARG002
             lost = [10.0 * ("excess" not in own) + 0.1 * ("dry" in own) for own in sets]
             every = zip(sets, lost, strict=True)
             return [Score(torch.full((10,), none), 400, len(own), len(own), 1.0) for own, none in every]
