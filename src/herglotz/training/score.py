@@ -4,13 +4,14 @@ A rich model with k_r parameters, chosen as c_r of C offers, replaces a simple m
 
     Σ_b (ℓ_b(simple) − ℓ_b(rich)) > τ [½ (k_r − k_s) log (N/τ) + log C(C, c_r) − log C(C, c_s)] + e/√τ
 
-and if the sum also exceeds e, its standard error over blocks of time: both where ℓ_b is the log-loss of block b under
-Student's t for a fit without the samples of the block, and where ℓ_b is that for the fit to all samples. τ is the
-correlation time of the residuals of the rich model's fit to all samples, in samples (`correlation_time`): N correlated
-values carry the information of N/τ independent values, for which the standard error would be e/√τ.
+and if the sum also exceeds e, its standard error over blocks of time. ℓ_b is the log-loss of block b under Student's t
+for a fit without the samples of the block. τ is the correlation time of the residuals of the rich model's fit to all
+samples, in samples (`correlation_time`): N correlated values carry the information of N/τ independent values, for which
+the standard error would be e/√τ. The log-loss of the fit to all samples must fall, too: by more than the bracket and
+the standard error of that fall.
 
-* White residuals have τ = 1. Without e the inequality for fits to all samples is then the extended Bayesian information
-  criterion (Chen & Chen 2008).
+* White residuals have τ = 1. Without e the inequality is then the extended Bayesian information criterion
+  (Chen & Chen 2008).
 * Without a block, a simple model may be ill-determined. If a rich model meets all samples no better, no sample speaks
   for its further numbers, however much better it predicts the block.
 * If a force is missing, residuals are correlated from sample to sample, τ is large, and each parameter costs more.
@@ -75,16 +76,17 @@ class Score:
         return self.gain(simple, offered) > 0
 
     def gain(self, simple: Score, offered: int) -> float:
-        """Left side of the inequality minus the larger of its bounds, with the τ of this richer model.
+        """What held-out blocks exceed the larger of their bounds by, with the τ of this richer model.
 
-        The smaller difference of held-out blocks and of the fits to all samples.
+        Or what the fits to all samples exceed their bound by, if that is less.
         """
-        dearer, gains = self.price(self, offered) - self.price(simple, offered), []
-        for own, other in ((self.losses, simple.losses), (self.fitted, simple.fitted)):
-            if own is not None and other is not None:
-                total, error = _sum_and_error(other - own)
-                gains.append(total - max(dearer + error / self.correlation_time**0.5, error))
-        return min(gains)
+        dearer = self.price(self, offered) - self.price(simple, offered)
+        total, error = _sum_and_error(simple.losses - self.losses)
+        held_out = total - max(dearer + error / self.correlation_time**0.5, error)
+        if self.fitted is None or simple.fitted is None:
+            return held_out
+        total, error = _sum_and_error(simple.fitted - self.fitted)
+        return min(held_out, total - dearer / self.correlation_time - error)
 
     def clearly_better(self, simple: Score) -> bool:
         """True if the losses differ by more than their standard error, without which no τ lets a model replace one."""

@@ -278,9 +278,13 @@ class Search:
         return self.settled(needed(likeliest(trial, 2 * self.iterations), 2 * self.iterations))
 
     def joined(self, trial: Trial) -> Trial:
-        """The model after offers have joined over segments of the same length; none join over whole trajectories."""
+        """The model after offers have joined over segments of the same length; none join over whole trajectories.
+
+        A model at the noise of segments lacks nothing that these segments tell. Offers that joined it nevertheless made
+        up for one another under a controller, and no change of a single offer led back to the law.
+        """
         trial = self.finer(trial)
-        while not trial.whole and (more := self.moved(trial)) is not None:
+        while not (trial.whole or trial.segments_at_the_noise) and (more := self.moved(trial)) is not None:
             trial = self.finer(more)
         return trial
 

@@ -203,6 +203,18 @@ def test_inputs_that_follow_from_the_state_do_not_mislead():
     assert value["damping.rate"] == pytest.approx(0.9, rel=0.2)
 
 
+@pytest.mark.parametrize(
+    ("whole", "at_the_noise", "joined"), [(False, False, True), (False, True, False), (True, False, False)]
+)
+def test_offers_join_segments_that_are_missed(whole, at_the_noise, joined):
+    # fails if offers join that segments at the noise need no more: under a controller they made up for one another, and
+    # no change of a single offer led back to the law of the machine
+    trial: Any = SimpleNamespace(whole=whole, segments_at_the_noise=at_the_noise)
+    met: Any = SimpleNamespace(whole=whole, segments_at_the_noise=True)
+    search: Any = SimpleNamespace(finer=lambda trial: trial, moved=lambda _: met)
+    assert (Search.joined(search, trial) is met) is joined
+
+
 def test_friction_of_one_direction_is_found():
     # z″ = −40 z − 1.5 z′ + |z′|: fails if no offer is even in the speed
     x, v, path = 0.1, 0.0, []
