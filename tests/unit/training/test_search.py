@@ -211,7 +211,8 @@ def test_offers_join_segments_that_are_missed(whole, at_the_noise, joined):
     # no change of a single offer led back to the law of the machine
     trial: Any = SimpleNamespace(whole=whole, segments_at_the_noise=at_the_noise)
     met: Any = SimpleNamespace(whole=whole, segments_at_the_noise=True)
-    search: Any = SimpleNamespace(finer=lambda trial: trial, moved=lambda _: met)
+    more = iter([met])
+    search: Any = SimpleNamespace(finer=lambda trial: trial, moved=lambda _: next(more, None))
     assert (Search.joined(search, trial) is met) is joined
 
 
@@ -383,6 +384,10 @@ def test_residuals_of_a_smaller_set_are_those_of_its_fit():
     assert there(fewer.fitted).tolist() == pytest.approx(there(less.score.fitted).tolist(), abs=0.1)
     assert there(every.fitted).tolist() == pytest.approx(there(more.score.fitted).tolist(), abs=0.1)
     assert float((there(fewer.fitted) - there(every.fitted)).abs().max()) > 1
+    # The correlation time is that of the fit to all samples.
+    seen = [correlation_time(x.problem.misfit(x.path)[None] / x.rms) for x in (less, more)]
+    assert [fewer.correlation_time, every.correlation_time] == pytest.approx([float(x) for x in seen], rel=0.1)
+    assert fewer.correlation_time > 1.5 * every.correlation_time
 
 
 def test_fits_start_where_the_linear_motion_sees_their_numbers(duffing):
