@@ -62,7 +62,7 @@ class HeldOut:
         if not problem.jointed:
             self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
         # [J, r] with the states following, of the fit to all samples.
-        self.own = rows[..., : P + 1] - rows[..., P + 1 :] @ self.following[segment]
+        self.fitted_rows = rows[..., : P + 1] - rows[..., P + 1 :] @ self.following[segment]
         # The same, each sample for the fit without its block.
         self.rows = rows[..., : P + 1].clone()
         for k in range(len(self.equations) - 1):
@@ -92,7 +92,7 @@ class HeldOut:
         """Residuals of the fits to all samples over the balance, (C, N, n), for C sets of numbers; NaN: no solution."""
         P = self.rows.shape[-1] - 1
         (steps,) = self._steps(self.equations[-1:], sets)
-        return (self.own[..., P] + (self.own[..., :P] @ steps.T).permute(2, 0, 1)) * self.sigma
+        return (self.fitted_rows[..., P] + (self.fitted_rows[..., :P] @ steps.T).permute(2, 0, 1)) * self.sigma
 
     def steps(self, own: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Steps of the numbers (P,) and of the starts of segments (S, d) in a model of `own`; NaN: no solution."""

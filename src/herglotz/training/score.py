@@ -76,9 +76,9 @@ class Score:
         return self.gain(simple, offered) > 0
 
     def gain(self, simple: Score, offered: int) -> float:
-        """What held-out blocks exceed the larger of their bounds by, with the τ of this richer model.
+        """The smaller excess of the two sums over their bounds, with the τ of this richer model.
 
-        Or what the fits to all samples exceed their bound by, if that is less.
+        The sums are over held-out blocks and, if both scores have these losses, of the fits to all samples.
         """
         dearer = self.price(self, offered) - self.price(simple, offered)
         total, error = _sum_and_error(simple.losses - self.losses)

@@ -424,7 +424,6 @@ def needed(trial: Trial, most: int) -> Trial:
 
     `Moves.leaving` removes bands too, but by the linearised motion alone.
     """
-    # The row law 1 noisy of `benchmarks/judge.py` needs this loop: 6.1 times the noise, and 61 without it.
     for name in sorted(trial.likeliest_scales, key=trial.likeliest_scales.__getitem__):
         other = trial.fitter.fit(trial.taken - {name}, trial.values, trial.length, trial, most)
         if other is not None and not trial.replaces(other):
