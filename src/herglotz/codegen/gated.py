@@ -21,7 +21,7 @@ SUMS = ("{0} + {1}", "{0} - {1}", "{0} + {1} * {2}", "{0} - {1} * {2}")
 # Operations with finite results for finite operands, each cheaper than a branch.
 PLAIN = (*SUMS, "{0} * {1}", "-{0}")
 # Arguments that do not change from step to step.
-CONSTANT = ("theta", "sharpest")
+CONSTANT = ("theta", "constants")
 # Number of plain operations from which a branch is cheaper than the operations.
 WORTH_A_BRANCH = 3
 
@@ -57,8 +57,8 @@ class Prepared:
         """The C function that sets all flags and fixed numbers; `on` says which parameters are on."""
         flags = [f"  gate[{i}] = {' || '.join(f'on[{k}]' for k in sorted(x))};\n" for x, i in self.gates.items()]
         sizes = f"\n#define hz_GATES {max(1, len(self.gates))}\n#define hz_FIXED {max(1, self.fixed)}\n"
-        taken = "const double *theta, const double *sharpest, const char *on, char *gate, double *fixed"
-        head = f"static void hz_prepare({taken}) {{\n  (void)on, (void)gate, (void)fixed, (void)sharpest;\n"
+        taken = "const double *theta, const double *constants, const char *on, char *gate, double *fixed"
+        head = f"static void hz_prepare({taken}) {{\n  (void)on, (void)gate, (void)fixed, (void)constants;\n"
         return "".join([sizes, head, *flags, *self.parts, "}\n"])
 
 

@@ -88,11 +88,14 @@ class DragFeature:
         return (self.b, self.c) == (1, 0)
 
     def position(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the factor that depends on q_at, and its slope."""
+        """Return the factor that depends on q_at, and its slope; a wave takes rate · q_at."""
         return self._wave(q) if self.wave and not self.of_speed else (_power(q, self.a), _power(q, self.a - 1) * self.a)
 
     def speed(self, v: Tensor, width: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the factor that depends on v, and its slope; dry friction is tanh(v/width), or 0 without a width."""
+        """Return the factor that depends on v, and its slope; a wave takes rate · v.
+
+        Dry friction is tanh(v/width), or 0 without a width.
+        """
         if self.of_speed:
             return self._wave(v)
         if self.dry:
@@ -104,10 +107,8 @@ class DragFeature:
         return own * _power(v, self.c), slope
 
     def _wave(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the wave of rate · x, and its slope."""
-        x = x * self.rate
-        value, slope = (x.cos(), -x.sin()) if self.wave == "cos" else (x.sin(), x.cos())
-        return value, slope * self.rate
+        """Return the wave at x, and its slope by x."""
+        return (x.cos(), -x.sin()) if self.wave == "cos" else (x.sin(), x.cos())
 
 
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
@@ -192,10 +193,16 @@ class Drag(nn.Module):
         on, of = [f.on for f in features], [f.on if f.air else dof if f.of is None else f.of for f in features]
         self.air, self.dry = ([g for g, f in enumerate(features) if getattr(f, kind)] for kind in ("air", "dry"))
         self.driven = any(f.input is not None for f in features)
-        self.register_buffer("on", eye[on] - eye[of], persistent=False)
-        self.register_buffer("at", eye[[f.at for f in features]], persistent=False)
-        self.on: Tensor
-        self.at: Tensor
+        rate = torch.tensor([f.rate for f in features], dtype=torch.float64)[:, None]
+        of_speed = torch.tensor([f.of_speed for f in features])[:, None]
+        e, place = eye[on] - eye[of], eye[[f.at for f in features]]
+        self.register_buffer("on", e, persistent=False)
+        # Arguments of the factors: of those of the position, and of those of the speed; waves have a rate.
+        self.register_buffer("at", torch.where(of_speed, place, rate * place), persistent=False)
+        self.register_buffer("along", torch.where(of_speed, rate * e, e), persistent=False)
+        self.on: Tensor  # (G, n)
+        self.at: Tensor  # (G, n)
+        self.along: Tensor  # (G, n)
 
     def held(self, q0: Tensor) -> tuple[Tensor, Tensor] | None:
         """Return the part of set-valued friction that depends on q0, (..., n), and ∂/∂q0, (..., n, n)."""
@@ -209,11 +216,11 @@ class Drag(nn.Module):
     def terms(
         self, q: Tensor, v: Tensor, widths: Tensor | None = None, u: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return φ_g, ∂φ_g/∂q̄_j and ∂φ_g/∂v, each (..., G).
+        """Return φ_g, and its derivatives by the arguments at·q̄ and along·v of its factors, each (..., G).
 
         Dry terms have the `widths` (n,), those of inputs u (..., m), and are 0 without.
         """
-        x, y = q @ self.at.T, v @ self.on.T
+        x, y = q @ self.at.T, v @ self.along.T
         columns = []
         for g, f in enumerate(self.features):
             position, by_q = f.position(x[..., g])
@@ -236,7 +243,7 @@ class Drag(nn.Module):
         `widths` (n,) are those of smooth dry friction, u (..., m) the inputs.
         """
         value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v, widths, u))
-        slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.on), (by_q, self.at)))
+        slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.along), (by_q, self.at)))
         f = -value @ self.on
         if self.air:
             air, air_slope = self._through_air(v)

@@ -33,18 +33,14 @@ class Combination(nn.Module):
         self.highest = max((p.power for p in self.products[: self.ridges]), default=0)
         self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
         form = torch.tensor([p.form for p in self.products[: self.ridges]], dtype=torch.float64).reshape(-1, dof)
-        i, j = pairs(dof, torch.device("cpu"))
         arm = torch.tensor([p.arm or (0.0,) * dof for p in self.products[: self.ridges]], dtype=torch.float64)
         arm = arm.reshape(-1, dof)
         numbers = {
             "factor": torch.tensor([p.factor for p in self.products], dtype=torch.float64),
-            "form": form,  # (ridges, n) w
             "phase": torch.tensor([p.phase for p in self.products[: self.ridges]], dtype=torch.float64),
-            "outer": form[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w wᵀ
             "arm": arm,  # (ridges, n) a
             "degree": torch.tensor([float(p.degree) for p in self.products[: self.ridges]], dtype=torch.float64),
-            "arms": form[:, i] * arm[:, j] + arm[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w aᵀ + a wᵀ
-            "outer_arm": arm[:, i] * arm[:, j],  # (ridges, n(n+1)/2) rows of a aᵀ
+            **of_forms(form, arm),
             "power": torch.tensor([float(p.power) for p in self.products], dtype=torch.float64),
             "group": torch.tensor([g for _, g in grouped], dtype=torch.long),
         }
@@ -113,6 +109,17 @@ class Combination(nn.Module):
         """Return the k-th derivative of the radial functions by r², (..., number of radial functions)."""
         exponent = self.power.split(self.counts)[-1] / 2
         return _front(exponent, k) * square[..., None].pow(exponent - k)
+
+
+def of_forms(form: Tensor, arm: Tensor) -> dict[str, Tensor]:
+    """Return the buffers of a `Combination` that follow from its forms w and arms a, (ridges, n) each."""
+    i, j = pairs(form.shape[-1], form.device)
+    return {
+        "form": form,
+        "outer": form[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w wᵀ
+        "arms": form[:, i] * arm[:, j] + arm[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w aᵀ + a wᵀ
+        "outer_arm": arm[:, i] * arm[:, j],  # (ridges, n(n+1)/2) rows of a aᵀ
+    }
 
 
 class FeaturePotential(nn.Module):

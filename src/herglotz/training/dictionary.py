@@ -1,7 +1,8 @@
 """The dictionary that a compiled kernel holds: every named term that coordinates of one kind may have.
 
 One kernel serves all models of a kind of coordinates, and is compiled once. It evaluates every model whose terms are in
-the dictionary, with 0 for the absent numbers; any other model has a kernel of its own.
+the dictionary, with 0 for the absent numbers; any other model has a kernel of its own. The dictionary of models with
+learned functions has the waves of all functions besides, with the standard numbers of `rates`.
 """
 
 from __future__ import annotations
@@ -9,12 +10,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 from itertools import combinations
 
 from herglotz.models import ModelConfig
 from herglotz.models.config import POWERS
 from herglotz.models.drag import AIR, parse_drag
 from herglotz.models.features import expand, lengths, revolute, slides, spherical
+from herglotz.training.rates import rates_of
+from herglotz.training.waves import BRAKES, waves_of
 
 # Highest power of a length in the potential of one coordinate: forces up to x⁵.
 HIGHEST = 6
@@ -38,8 +42,27 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
         input_zero=c.inputs > 0, damping_width=0, rate=0.1, scale=(1.0,) * n, speed=(1.0,) * n, tilt=(0.0,) * n,
         stiffness=(0.0 if n == 1 else 1.0,) * n, seed=0, absent=(), dissipation=tuple(POWERS) if c.dissipation else (),
     )  # fmt: skip
-    known = set(expand(config.features, c.angles)) <= set(whole.features) and set(config.drag) <= set(drag)
-    return whole if known else None
+    more = waves_of_kind(c.angles)
+    for wider in (whole, replace(whole, features=_joined(whole.features, more[0]), drag=_joined(drag, more[1]))):
+        if set(expand(config.features, c.angles)) <= set(wider.features) and set(config.drag) <= set(wider.drag):
+            return wider
+    return None
+
+
+@cache
+def waves_of_kind(angles: tuple[bool, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The waves of all functions of coordinates of one kind, with standard numbers: terms of L, and dissipation."""
+    # Which waves there are does not depend on the intervals.
+    found = waves_of(angles, lambda form: (0.1, 1.0 + 0.1 * len(form)), [1.0] * len(angles), plane=True)
+    every = {name: [text for text, _ in waves] for name, waves in found.items()}
+    rates = rates_of(tuple(text for texts in every.values() for text in texts))
+    features, drag = ([text for name, texts in every.items() if name.startswith(BRAKES) == brakes for text in texts]
+                      for brakes in (False, True))  # fmt: skip
+    return rates.standard(features), rates.standard(drag)
+
+
+def _joined(first: Iterable[str], second: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys((*first, *second)))
 
 
 def _has_other_parts(c: ModelConfig) -> bool:

@@ -50,9 +50,8 @@ class Observed(NamedTuple):
 class CompiledFlow:
     """Free runs over the segments of a grid by a kernel."""
 
-    def __init__(self, placed: Placed, grid: SegmentGrid, u: Tensor | None, sharpest: Tensor | None, n: int):
+    def __init__(self, placed: Placed, grid: SegmentGrid, u: Tensor | None, n: int):
         self.placed, self.kernel, self.n = placed, placed.kernel, n
-        self.sharpest = placed.rest.new_zeros(n) if sharpest is None else sharpest.contiguous()
         S, K = grid.h.shape
         there = torch.arange(K) < grid.end[:, None]
         at = torch.full((S * (K + 1),), -1)
@@ -93,9 +92,9 @@ class CompiledFlow:
                 J = ends.new_zeros(piece.samples * self.n, F + d)
                 derived, summed = (sums.slopes[own], r), (sums.border[own], sums.blocks[own], sums.by_state[own])
             failed = self.kernel.sweep(
-                piece.last - piece.first, piece.steps, self.h, self.u, whole, self.sharpest, F, chosen, self.sample,
-                first, of.y, of.weight, of.freedom, piece.offset, piece.place, ends[own], delta[own], states, *derived,
-                J, *summed,
+                piece.last - piece.first, piece.steps, self.h, self.u, whole, self.placed.constants, F, chosen,
+                self.sample, first, of.y, of.weight, of.freedom, piece.offset, piece.place, ends[own], delta[own],
+                states, *derived, J, *summed,
             )  # fmt: skip
             return None if failed >= 0 else (piece, J)
 
@@ -207,7 +206,6 @@ def motion(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None)
         return None
     none, end = torch.zeros(0, dtype=torch.long), torch.full((S,), K)
     grid = SegmentGrid(h, none, torch.zeros(S, dtype=torch.long), torch.zeros(S, dtype=torch.bool), end, end, h, K)
-    sharpest = dict(model.named_buffers()).get("friction.sharpest")
-    flow = CompiledFlow(placed, grid, u, sharpest, model.dof)
+    flow = CompiledFlow(placed, grid, u, model.dof)
     empty = start.new_zeros(0, model.dof)
     return flow.run(ParameterVector(model).get(), start, Observed(empty, empty, 0.0))

@@ -17,7 +17,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, combinations_with_replacement, groupby
+from itertools import groupby
 from typing import NamedTuple
 
 import torch
@@ -28,21 +28,10 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.features import parse
 from herglotz.training.baseline import Baseline
 from herglotz.training.named_terms import NamedTerms, own_terms
+from herglotz.training.waves import BRAKES, Form, Wave, waves_of
 
 # Interval of the waves over the recorded range.
 REACH = 1.5
-# Waves of the potential of the only coordinate, if a length.
-POTENTIAL_WAVES = 47
-# Waves of the potential of each of several lengths, and harmonics of an angle.
-POTENTIAL_WAVES_OF_MANY = 15
-# Pairs of cos and sin of the potential of two lengths together.
-PLANE_PAIRS = 80
-# Waves of the mass of the only coordinate.
-MASS_WAVES = 7
-# Pairs of cos and sin of the damping as a function of position: of the only coordinate, and of each of several.
-DAMPING_PAIRS, DAMPING_PAIRS_OF_MANY = 7, 3
-# Pairs of cos and sin of the friction as a function of speed.
-FRICTION_PAIRS = 7
 
 # The first harmonic of an angle, which is a named term.
 FIRST_HARMONIC = re.compile(r"(cos|sin)\(q\d+\)")
@@ -63,7 +52,7 @@ class Band(NamedTuple):
     @property
     def brakes(self) -> bool:
         """True if the function is a dissipative force, which is no part of L."""
-        return self.name.startswith(("damping", "friction"))
+        return self.name.startswith(BRAKES)
 
 
 def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Band]:
@@ -72,30 +61,10 @@ def bands(data: Trajectories, base: Baseline, *, fine: bool = False) -> list[Ban
     `fine`: the damping and the mass of the only coordinate have waves as short as those of the potential, which would
     be too many for a search.
     """
-    found: dict[str, list[tuple[str, float]]] = {}
-    several = data.dof > 1
-    pairs, mass = DAMPING_PAIRS_OF_MANY if several else DAMPING_PAIRS, MASS_WAVES
-    if fine and not several:
-        pairs, mass = POTENTIAL_WAVES // 2, POTENTIAL_WAVES
-    count = POTENTIAL_WAVES_OF_MANY if several else POTENTIAL_WAVES
-    for i, angle in enumerate(data.angles):
-        own = _harmonics(i) if angle else _waves(data, [(i, 1.0)], count)
-        found[f"V(q{i + 1})"] = own
-        around = own if angle else _pairs(data, i, pairs)
-        found[f"damping(q{i + 1})"] = [(f"{x} v{i + 1}", k) for x, k in around[: 2 * pairs]]
-        found[f"friction(v{i + 1})"] = _of_speed(f"v{i + 1}", base.speed[i])
-        if not several:
-            found["mass(q1)"] = [(f"{x} v1^2", k) for x, k in own[: 2 * mass if angle else mass]]
-        elif angle:
-            for a, b in combinations_with_replacement(range(1, data.dof + 1), 2):
-                found[f"mass(q{i + 1}) of v{a} v{b}"] = [(f"{x} v{a} v{b}", k) for x, k in own[2:4]]
-    for i, j in combinations(range(data.dof), 2):
-        if data.angles[i] or data.angles[j]:
-            continue
-        found[f"V(q{j + 1} - q{i + 1})"] = _waves(data, [(j, 1.0), (i, -1.0)], POTENTIAL_WAVES_OF_MANY)
-        found[f"friction(v{j + 1} - v{i + 1})"] = _of_speed(f"(v{j + 1} - v{i + 1})", base.speed[i] + base.speed[j])
-        if data.dof == 2 and data.units[i] == data.units[j]:
-            found[f"V(q{i + 1}, q{j + 1})"] = _plane(data, i, j)
+    found = waves_of(
+        data.angles, lambda form: _interval(data, form), [REACH * v for v in base.speed], fine=fine,
+        plane=len(set(data.units)) == 1,
+    )  # fmt: skip
     return [band for name, waves in found.items() for band in _octaves(name, waves)]
 
 
@@ -148,7 +117,7 @@ def prior_spreads(every: Sequence[Band], base: Baseline, balance: Tensor, powers
     return found
 
 
-def _octaves(name: str, waves: list[tuple[str, float]]) -> Iterator[Band]:
+def _octaves(name: str, waves: list[Wave]) -> Iterator[Band]:
     """The waves of a function in bands, one for each octave of the rate, the first two octaves together.
 
     The first harmonic of an angle is left out, because it is a named term.
@@ -161,59 +130,8 @@ def _octaves(name: str, waves: list[tuple[str, float]]) -> Iterator[Band]:
         yield Band(f"{name} {number}", texts, rates, longest)
 
 
-def _interval(data: Trajectories, form: list[tuple[int, float]]) -> tuple[float, float]:
-    """Middle and half length of the interval of a linear form Σ w q_i, `form` = [(i, w), …]."""
+def _interval(data: Trajectories, form: Form) -> tuple[float, float]:
+    """Middle and half length of the interval of a linear form."""
     x = torch.stack([w * data.q[:, i] for i, w in form]).sum(0)
     low, high = float(x.min()), float(x.max())
     return (low + high) / 2, REACH * (high - low) / 2
-
-
-def _waves(data: Trajectories, form: list[tuple[int, float]], count: int) -> list[tuple[str, float]]:
-    """sin(k (x − a)) of a linear form x, zero at both ends of the interval of x, which begins at a; with rates k."""
-    middle, half = _interval(data, form)
-    longest, found = _short(math.pi / (2 * half)), []
-    phase = _short(longest * (half - middle))
-    for j in range(1, count + 1):
-        parts = [(w * j * longest, f" q{i + 1}") for i, w in form] + [(j * phase, "")]
-        text = " ".join(f"{'-' if w < 0 else '+'} {abs(w):.10g}{what}" for w, what in parts)
-        found.append((f"sin({text.removeprefix('+ ')})", j * longest))
-    return found
-
-
-def _pairs(data: Trajectories, i: int, count: int) -> list[tuple[str, float]]:
-    """Pairs of cos and sin of one coordinate, with the period of its interval."""
-    return _periodic(f"q{i + 1}", _interval(data, [(i, 1.0)])[1], count)
-
-
-def _of_speed(speed: str, largest: float) -> list[tuple[str, float]]:
-    """Pairs of cos and sin of a speed, or of a difference of speeds, with the period of its interval."""
-    return _periodic(speed, REACH * largest, FRICTION_PAIRS)
-
-
-def _periodic(x: str, half: float, count: int) -> list[tuple[str, float]]:
-    """Pairs of cos and sin of a variable x whose period is its interval, of half length `half`."""
-    rates = [j * _short(math.pi / half) for j in range(1, count + 1)]
-    return [(f"{f}({k:.10g} {x})", k) for k in rates for f in ("cos", "sin")]
-
-
-def _plane(data: Trajectories, i: int, j: int) -> list[tuple[str, float]]:
-    """Plane waves of two coordinates with the periods of both intervals, the longest waves first."""
-    a, b = (_short(math.pi / _interval(data, [(at, 1.0)])[1]) for at in (i, j))
-    multiples = ((m, n) for m in range(PLANE_PAIRS) for n in range(-PLANE_PAIRS, PLANE_PAIRS))
-    every = ((math.hypot(m * a, n * b), m * a, n * b) for m, n in multiples)
-    found = []
-    for k, x, y in sorted(wave for wave in every if wave[1] > 0 or wave[2] > 0)[:PLANE_PAIRS]:
-        parts = [f"{abs(w):.10g} q{at + 1}" for w, at in ((x, i), (y, j)) if w]
-        found += [(f"{f}({(' - ' if y < 0 else ' + ').join(parts)})", k) for f in ("cos", "sin")]
-    return found
-
-
-def _short(x: float) -> float:
-    """Round x to seven digits: ten printed digits then hold multiples exactly, and sin k x follows from sin x."""
-    return float(f"{x:.7g}")
-
-
-def _harmonics(i: int) -> list[tuple[str, float]]:
-    """Pairs of cos and sin of whole multiples of an angle."""
-    multiples = range(1, POTENTIAL_WAVES_OF_MANY + 1)
-    return [(f"{f}({'' if k == 1 else k}q{i + 1})", float(k)) for k in multiples for f in ("cos", "sin")]

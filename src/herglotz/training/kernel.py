@@ -1,8 +1,8 @@
 """The compiled kernel of a fit: the step of a model with its derivatives by state and parameters, traced to C.
 
-The parameters θ are an argument of the kernel. One library therefore serves every fit of a structure and every subset
-of its terms: an absent term has the coefficient 0. The library is cached on disk under the hash of the configuration,
-the sources of this package, the compiler and the processor.
+The parameters θ are an argument of the kernel, and so are the rates of waves (`rates`). One library therefore serves
+every fit of a structure and every subset of its terms: an absent term has the coefficient 0. The library is cached on
+disk under the hash of the configuration, the sources of this package, the compiler and the processor.
 
 Large networks, order 4 of several coordinates, and machines without a compiler have no kernel: `kernel_of` returns
 None, and torch evaluates the same functions.
@@ -14,7 +14,7 @@ import ctypes
 import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -36,11 +36,13 @@ from herglotz.codegen.trace import traced
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative
 from herglotz.models import Capabilities, ContactLagrangian, ModelConfig, numbers_of
+from herglotz.models.features import expand
 from herglotz.stepping.equation import PartialsEquation
 from herglotz.stepping.newton import StickSlip, at_rest
 from herglotz.stepping.state import State
 from herglotz.training.dictionary import dictionary, keys_of
 from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.rates import Base, buffers_at, rates_of, terms_of
 
 RUNTIME = Path(herglotz.__file__).parent / "codegen" / "runtime"
 # Largest number of parameters of a kernel. Three joints with all their terms have 206, which gcc compiles in 5 s.
@@ -50,7 +52,7 @@ MAX_PARAMETERS = 300
 COMPILER_FLAGS = ("-O1", "-fexpensive-optimizations")
 # Packages, and files of `training`, whose sources decide what a kernel computes.
 SOURCE_PACKAGES = ("models", "mechanics", "stepping", "codegen")
-SOURCE_FILES = ("kernel.py", "parameter_vector.py")
+SOURCE_FILES = ("kernel.py", "parameter_vector.py", "rates.py")
 # Arguments of the C functions that `hz_prepare` sets.
 PREPARED_ARGUMENTS = ("const char *restrict gate", "const double *restrict fixed")
 # Batch sizes for a trace: the first prime above the number of parameters differs from every other axis.
@@ -58,11 +60,15 @@ BATCHES = (101, 211, 431, 1021)
 
 
 class Placed(NamedTuple):
-    """A kernel and the places of a model's free parameters in its θ; `rest` is θ with 0 at these places."""
+    """A kernel and the places of a model's free parameters in its θ; `rest` is θ with 0 at these places.
+
+    `constants` are the least widths of smooth friction, and the rates of waves.
+    """
 
     kernel: Kernel
     chosen: Tensor  # (P,)
     rest: Tensor  # (Pk,) of the kernel
+    constants: Tensor  # (n + R,)
 
 
 def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = None) -> Placed | None:
@@ -81,11 +87,14 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
         compiler()
     except InputError:
         return None
-    kernel = _kernel(_whole(config))
+    rates = rates_of(terms_of(config))
+    features, drag = rates.standard(expand(config.features, config.angles)), rates.standard(config.drag)
+    kernel = _kernel(_whole(replace(config, features=features, drag=drag)))
     if kernel is None:
         return None
     every = ParameterVector(model)
-    place = dict(zip(every.numbers, (kernel.place[key] for key in keys_of(every.numbers, config)), strict=True))
+    keys = [rates.texts.get(key, key) for key in keys_of(every.numbers, config)]
+    place = dict(zip(every.numbers, (kernel.place[key] for key in keys), strict=True))
     rest = torch.zeros(len(kernel.numbers), dtype=torch.float64)
     numbers = every.numbers
     if parameters is not None and len(parameters.numbers) < len(numbers):
@@ -93,7 +102,8 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
         numbers = parameters.numbers
     chosen = torch.tensor([place[name] for name in numbers], dtype=torch.long)
     rest[chosen] = 0.0
-    return Placed(kernel, chosen, rest)
+    sharpest = dict(model.named_buffers()).get("friction.sharpest", rest.new_zeros(model.dof))
+    return Placed(kernel, chosen, rest, torch.cat([sharpest, kernel.rates(rates.values)]))
 
 
 def structure(config: ModelConfig) -> ModelConfig:
@@ -115,8 +125,10 @@ def structure(config: ModelConfig) -> ModelConfig:
 
 @cache
 def _whole(config: ModelConfig) -> ModelConfig:
-    """The dictionary that contains a model; the structure of the model itself if no dictionary does."""
-    return dictionary(config) or structure(config)
+    """The dictionary that contains a model; the structure of the model itself if no small dictionary does."""
+    whole = dictionary(config)
+    small = whole is not None and len(numbers_of(ContactLagrangian(whole))) <= MAX_PARAMETERS
+    return whole if whole is not None and small else structure(config)
 
 
 @cache
@@ -152,10 +164,15 @@ class Kernel:
         # Names of the entries of θ, in order.
         self.numbers = ParameterVector(model).numbers
         self.place = {key: i for i, key in enumerate(keys_of(self.numbers, model.config))}
+        self.bases = list(rates_of(terms_of(model.config)).values)
         key = _sources() + json.dumps(model.config.to_dict(), sort_keys=True)
         self.library = built(key, lambda: {SOURCE: source_of(model)}, COMPILER_FLAGS)
         self.library.hz_sweep.restype = ctypes.c_long
         self.library.hz_eliminate.restype = ctypes.c_long
+
+    def rates(self, values: Mapping[Base, float]) -> Tensor:
+        """The rates of waves (R,) as arguments, from those of a model; the waves of the others are absent."""
+        return torch.tensor([values.get(base, base.standard) for base in self.bases], dtype=torch.float64)
 
     def sweep(self, *arguments: Any) -> int:
         """`hz_sweep` of `codegen/runtime/sweep.c`: -1, or the index of the segment with a step without solution."""
@@ -196,13 +213,17 @@ class _Increments(nn.Module):
 
 
 class _At:
-    """The discrete Lagrangian at parameters θ (P,), least widths of smooth friction (n,), and inputs u (B, m)."""
+    """The discrete Lagrangian at parameters θ (P,), with the `constants` of a kernel (n + R,), and inputs u (B, m)."""
 
-    def __init__(self, parameters: ParameterVector, theta: Tensor, sharpest: Tensor, u: Tensor | None):
+    def __init__(
+        self, parameters: ParameterVector, theta: Tensor, bases: Sequence[Base], constants: Tensor, u: Tensor | None
+    ):
         self.model, self.u = parameters.model, u
-        self.named = {f"model.{name}": value for name, value in parameters.unflatten(theta).items()}
+        sharpest, rates = constants.split([self.model.dof, len(constants) - self.model.dof])
+        named = parameters.unflatten(theta) | buffers_at(self.model, bases, rates)
         if "friction.sharpest" in dict(self.model.named_buffers()):
-            self.named["model.friction.sharpest"] = sharpest
+            named["friction.sharpest"] = sharpest
+        self.named = {f"model.{name}": value for name, value in named.items()}
 
     @property
     def capabilities(self) -> Capabilities:
@@ -217,33 +238,34 @@ class _At:
 class Functions:
     """The functions that the C runtime calls, as tensor code to be traced.
 
-    x = (q, p, s) is (B, 2n + 1). θ (P,) and `sharpest` (n,), the least widths of smooth friction, have no batch.
+    x = (q, p, s) is (B, 2n + 1). θ (P,) and `constants` (n + R,), the least widths of smooth friction and the rates of
+    waves, have no batch.
     """
 
     def __init__(self, model: ContactLagrangian):
         self.parameters, self.n, self.sticks = ParameterVector(model), model.dof, model.capabilities.sticking
-        self.d = states_of(model)
+        self.d, self.bases = states_of(model), list(rates_of(terms_of(model.config)).values)
 
-    def equation(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> PartialsEquation:
+    def equation(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, constants: Tensor) -> PartialsEquation:
         """The step equation in Δ, with second derivatives."""
-        n, at = self.n, _At(self.parameters, theta, sharpest, u)
+        n, at = self.n, _At(self.parameters, theta, self.bases, constants, u)
         state = State(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
         return PartialsEquation(at, state, h, 2, increments=True)  # pyright: ignore[reportArgumentType]
 
-    def rest(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> tuple[Tensor, ...]:
+    def rest(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, constants: Tensor) -> tuple[Tensor, ...]:
         """z, K and w/K with which the iteration for set-valued friction starts (`herglotz.stepping.newton`)."""
-        return tuple(y.clone() for y in at_rest(self.equation(x, h, u, theta, sharpest)))
+        return tuple(y.clone() for y in at_rest(self.equation(x, h, u, theta, constants)))
 
     def evaluate(
-        self, x: Tensor, z: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor, *held: Tensor
+        self, x: Tensor, z: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, constants: Tensor, *held: Tensor
     ) -> tuple[Tensor, ...]:
         """F and J at the increment Δ = z; with set-valued friction at the z of `herglotz.stepping.newton`."""
-        equation: Any = self.equation(x, h, u, theta, sharpest)
+        equation: Any = self.equation(x, h, u, theta, constants)
         point = (StickSlip(equation, *held) if held else equation)(z, True)
         return point.F.clone(), point.J.clone()
 
     def derive(
-        self, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor
+        self, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, constants: Tensor
     ) -> tuple[Tensor, ...]:
         """F, J, (p1, s1 − s0), ∂(q1, p1)/∂(q, p), c and ∂(F, p1)/∂θ at the increment Δ of a solved step.
 
@@ -253,7 +275,7 @@ class Functions:
 
         def of_sample(theta: Tensor, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None) -> Tensor:
             driven = None if u is None else u[None]
-            P = self.equation(x[None], h[None], driven, theta, sharpest)(delta[None], False).rest
+            P = self.equation(x[None], h[None], driven, theta, constants)(delta[None], False).rest
             return torch.cat([momentum_residual(P, x[None, n : 2 * n]), momentum_plus(P), P.L[:, None]], -1)[0, :d]
 
         # Autograd by a copy of θ for each sample: `torch.func.vjp` would import torch's compiler, which takes longer
@@ -262,7 +284,7 @@ class Functions:
             own = theta.expand(len(x), -1).clone().requires_grad_()
             results = vmap(of_sample, (0, 0, 0, 0, None if u is None else 0))(own, x, delta, h, u).unbind(-1)
             G = torch.stack([torch.autograd.grad(r.sum(), own, retain_graph=True)[0] for r in results], 1)
-        point = self.equation(x, h, u, theta, sharpest)(delta, True)
+        point = self.equation(x, h, u, theta, constants)(delta, True)
         P, J = point.rest, point.J
         assert J is not None
         end = torch.cat([momentum_plus(P), P.L[:, None]], -1)
@@ -274,7 +296,7 @@ def source_of(model: ContactLagrangian) -> str:
     """The C source of a structure: sizes, traced functions, and the runtime."""
     functions, prepared = Functions(model), Prepared()
     n, m, P, sticks = functions.n, model.inputs, len(functions.parameters.numbers), functions.sticks
-    end = {"h": 0, **({"u": m} if m else {}), "theta": P, "sharpest": n}
+    end = {"h": 0, **({"u": m} if m else {}), "theta": P, "constants": n + len(functions.bases)}
     held = {"stiffness": n, "bound": n} if sticks else {}
     state, solved = {"x": 2 * n + 1}, ("F", "J", "end", "A", "*c", "G")
     parts = []
@@ -334,13 +356,13 @@ class _Traced:
 
 
 def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:
-    """Example arguments of these sizes for a trace; θ and `sharpest` have no batch, and a size of 0 is a scalar."""
+    """Example arguments of these sizes for a trace; θ and `constants` have no batch, and a size of 0 is a scalar."""
     batch = next(prime for prime in BATCHES if prime > given["theta"])
     make = torch.Generator().manual_seed(0)
     random = lambda *shape: torch.rand(*shape, generator=make, dtype=torch.float64)  # noqa: E731
     found = []
     for name, size in given.items():
-        if name in ("theta", "sharpest"):
+        if name in ("theta", "constants"):
             found.append(0.1 + random(size) / 10)
         else:
             found.append(0.1 + random(batch, size) / 10 if size else 0.1 + random(batch) / 10)

@@ -16,13 +16,14 @@ from herglotz.models.features import parse
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.function_search import with_functions
-from herglotz.training.functions import FRICTION_PAIRS, PLANE_PAIRS, REACH, bands, prior_spreads
+from herglotz.training.functions import REACH, bands, prior_spreads
 from herglotz.training.moves import Moves
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.search import Search
 from herglotz.training.task import build_model
 from herglotz.training.trials import Variant
+from herglotz.training.waves import FRICTION_PAIRS, PLANE_PAIRS
 from tests import runge_kutta
 
 H, NOISE = 0.05, 0.002
@@ -318,8 +319,10 @@ def test_friction_by_speed_is_periodic_beyond_what_was_recorded():
 
 def test_a_potential_of_both_coordinates_is_learned(monkeypatch):
     # fails if waves of the plane are not offered: no sum of functions of one coordinate has the force of this bump
-    monkeypatch.setattr("herglotz.training.functions.PLANE_PAIRS", 12)
-    monkeypatch.setattr("herglotz.training.functions.POTENTIAL_WAVES_OF_MANY", 4)
+    # The kernel of these few waves is compiled in a quarter of the time.
+    monkeypatch.setattr("herglotz.training.dictionary.waves_of_kind", lambda _: ((), ()))
+    monkeypatch.setattr("herglotz.training.waves.PLANE_PAIRS", 12)
+    monkeypatch.setattr("herglotz.training.waves.POTENTIAL_WAVES_OF_MANY", 4)
     t = H * torch.arange(161, dtype=torch.float64)
     x, out = np.array([[1.0, -0.7, 0.5, -0.2], [0.2, 0.6, -0.9, 0.8], [0, 0.4, 0.6, -0.9], [0.7, 0.3, 0, 0.2]]), []
 

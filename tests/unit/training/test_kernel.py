@@ -16,6 +16,7 @@ from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.waves import waves_of
 
 PENDULUM = ModelConfig(angles=(True,), level="forced", stiffness=(0.0,), alike=True, potential_width=0, damping_width=0,
                        features=("cos(q1)", "sin(2q1)"), drag=("|v1| v1",))  # fmt: skip
@@ -25,6 +26,17 @@ JOINTS = ModelConfig(angles=(True, True), level="forced", scale=(1.0, 1.0), spee
                      tilt=(0.1, 0.0), potential_width=0, damping_width=0, coupled=True, coulomb=True,
                      features=("cos(q1 - q2) v1 v2", "sin(q2) v1 v1"))  # fmt: skip
 NETWORK = ModelConfig(angles=(True,), scale=(0.7,), speed=(1.7,), stiffness=(2.0,), tilt=(0.1,), potential_width=4)
+
+
+def waves(*, middle, half, speed):
+    """A model of one length with some of the waves of all functions over this interval, and a power."""
+    found = waves_of((False,), lambda _: (middle, half), [speed], plane=False)
+    own = {name: [text for text, _ in some] for name, some in found.items()}
+    features = (*own["V(q1)"][:20], *own["mass(q1)"][:3], "q1^4")
+    drag = (*own["damping(q1)"][2:6], *own["friction(v1)"][:4])
+    return replace(PENDULUM, angles=(False,), features=features, drag=drag)
+
+
 MODELS = {
     "order 2": PENDULUM,
     "order 4": replace(PENDULUM, order=4),
@@ -44,11 +56,13 @@ MODELS = {
         drag=("(v1 - v2)", "|v| v"),
     ),
     "own structure": replace(PENDULUM, alike=False, stiffness=(1.0,)),
-    "waves of one length": replace(
-        PENDULUM,
-        angles=(False,),
-        features=(*(f"sin({1.234567 * k:.10g} q1 + {0.7654321 * k:.10g})" for k in range(1, 25)), "cos(3 q1) v1^2"),
-        drag=("cos(2 q1) v1", "sin(2 q1) v1", "cos(4 q1) v1"),
+    "waves of one length": waves(middle=0.3, half=1.7, speed=2.0),
+    "waves of several kinds": replace(
+        JOINTS,
+        angles=(False, False),
+        features=("cos(0.7 q1 - 1.4 q2)", "sin(2.1 q1)", "cos(2.8 q2)", "cos(1.5 q1 + 0.3) v1 v2", "cos(3 q1)", "q1^3"),
+        coupled=False,
+        drag=("cos(1.9 q2) v1", "sin(0.8 v1)", "cos(1.3 (v1 - v2))", "sin(2.6 (v1 - v2))", "cos(2.2 q1) sgn(v2)"),
     ),
     "network": replace(NETWORK, level="forced"),
     "network, driven": replace(NETWORK, level="forced", inputs=1, input_zero=True),
@@ -201,6 +215,16 @@ def test_numbers_go_by_their_terms():
     assert set(keys_of(ParameterVector(ContactLagrangian(fewer)).numbers, fewer)) == {
         "sin(2q1)", "damping.rate", "friction.viscous", "|v1| v1",
     }  # fmt: skip
+
+
+def test_one_kernel_serves_functions_over_every_interval():
+    # fails if a rate or a phase is a constant of the kernel: every recording would then wait for the compiler
+    one, other = MODELS["waves of one length"], waves(middle=-2.0, half=0.31, speed=9.0)
+    few = replace(other, features=other.features[4:9], drag=other.drag[1:3])
+    assert kernel(one) is kernel(other) is kernel(few)
+    problem, x = problem_of(few)
+    its, _ = eager(few)
+    assert float(problem.cost(x)) == pytest.approx(float(its.cost(x)), rel=1e-12)
 
 
 def test_what_no_kernel_holds_has_none():

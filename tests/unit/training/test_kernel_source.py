@@ -45,6 +45,19 @@ def test_sines_of_multiples_follow_from_one(k):
     assert out == pytest.approx([math.sin(angle), math.cos(angle)], abs=4e-15)
 
 
+def test_sines_of_multiples_of_a_rate_that_is_no_constant_follow_from_one():
+    # fails if the product of a rate and a coordinate is a number of its own for every multiple, or at every point
+    program, x, k = program_of("x", "k")
+    near = add(program, x[0], multiply(program, x[1], 0.5))
+    rates = [multiply(program, k[0], float(j)) for j in (1, 2, 3)]
+    found = [program.angles.waves(multiply(program, near, rate)) for rate in rates]
+    text = whole(program, "static void f(const double *x, const double *k)", {"out": list(found[-1])})
+    assert len(re.findall("FN_sin|FN_cos", text)) == 2
+    out = [0.0, 0.0]
+    value(text, x=[0.7, 0.4], k=[1.3], out=out)
+    assert out == pytest.approx([math.sin(3 * 1.3 * 0.9), math.cos(3 * 1.3 * 0.9)], abs=4e-15)
+
+
 def test_sines_of_sums_and_differences_follow_from_those_of_the_angles():
     # fails if only multiples of one number are known
     program, x = program_of("x")

@@ -84,8 +84,7 @@ class ShootingProblem(StatesProblem):
         # Readings of the sensors at q = 0, (N, n), if `WithZeros` fits them.
         self.zeros = data.q.new_zeros(())
         placed = kernel_of(model) if compiled and s is None and world()[1] == 1 else None
-        sharpest = dict(model.named_buffers()).get("friction.sharpest")
-        self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, sharpest, self.n)
+        self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, self.n)
 
     def _weigh(self) -> None:
         """Set the weights (N, n) of samples and the scales (d,) of joint defects, which follow from σ."""
