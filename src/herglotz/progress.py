@@ -15,7 +15,7 @@ REDRAW_SECONDS = 0.2
 # Share of a fit's time that has passed when a part begins and when it ends: medians over 19 systems of `zoo.py --draw
 # 9301`. The second line has shares of FINDING.
 LOOKING, FINDING, STAGES = (0.0, 0.05), (0.05, 0.65), (0.66, 0.98)
-FIRST_TERMS, MORE_TERMS, FEWER_TERMS = (0.0, 0.65), (0.65, 0.7), (0.7, 1.0)
+FIRST_TERMS, MORE_TERMS = (0.0, 0.65), (0.65, 1.0)
 
 
 class ProgressBar(tqdm):

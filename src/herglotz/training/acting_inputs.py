@@ -84,7 +84,7 @@ def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:
     """
     other = search.driven_by(terms)
     if trial.near and (same := other.again(beside(trial, len(input_columns(terms))))) is not None:
-        return other.settled(other.finer(same), swapped=True)
+        return other.settled(other.finer(same))
     fitter = other.fitter(Variant(search.order))
     return other.climbed(fitter, fitter.simple, {})
 

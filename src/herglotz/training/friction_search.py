@@ -21,7 +21,7 @@ EXCESS = "friction.breakaway"
 def without_injecting_friction(search: Any, trial: Trial) -> Trial:
     """The model settled anew without dry friction that injects energy, with a load of the joint in its place."""
     other = _with_loads(trial)
-    return trial if other is trial else _with_loads(search.settled(other, swapped=True))
+    return trial if other is trial else _with_loads(search.settled(other))
 
 
 def _with_loads(trial: Trial) -> Trial:

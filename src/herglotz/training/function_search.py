@@ -15,7 +15,7 @@ def with_functions(search: Search, best: Trial) -> Trial:
 
     If `best` is near the data (`Trial.near`), functions join like all offers, by the linearised motion. Otherwise they
     join the simplest model, from the shortest segments on. If the result is not at the noise, the model of all
-    functions competes (`Search.flexible`), pared to those that it needs.
+    functions competes (`Search.flexible`), settled.
     """
     if best.at_the_noise or search.config.translations:
         return best
@@ -39,14 +39,14 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     # A named term that is a wave of a function is in the model only with the band of that wave.
     taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
     same = fitter.fit(taken, fitter.values_of(best), best.length, best)
-    found = same and search.settled(search.finer(same), swapped=True)
+    found = same and search.settled(search.finer(same))
     if found is None or found.at_the_noise:
         return found
     # A pendulum whose length turns with it needs mass, potential and damping together.
     every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
     if every is None or not float((best.score.losses - every.score.losses).sum()) > 0:
         return found
-    return search.better(found, search.settled(likeliest(every, 2 * ITERATIONS), swapped=True))
+    return search.better(found, search.settled(likeliest(every, 2 * ITERATIONS)))
 
 
 def _anew(search: Search) -> Trial | None:

@@ -1,4 +1,4 @@
-"""Sets of offers that promise a better model than a fit, to first order: offers join, leave, or are exchanged.
+"""Sets of offers that promise a better model than a fit, to first order: offers join or leave.
 
 Sets are compared by the inequality of `score`. The residuals of held-out blocks come from the motion of the fit,
 linearised in all numbers (`held_out`). All offers are scored in milliseconds; a fit of one offer takes as long.
@@ -87,11 +87,6 @@ class Moves:
         """Sets better than `at` with one more offer and the offer that it depends on, the best first."""
         others = [offer for offer in self.fitter.offers if offer.name not in at]
         return self._better(at, [at | {offer.name, offer.on or offer.name} for offer in others])
-
-    def exchanges(self, at: Offers) -> list[Offers]:
-        """Sets better than `at` with one offer in the place of another, the best first."""
-        pairs = [(new, old) for old in self.names if old in at for new in self.names if new not in at]
-        return self._better(at, [self._without(at | {new}, {old}) for new, old in pairs])
 
     def _without(self, at: Offers, gone: Collection[str]) -> Offers:
         """The offers `at` without those in `gone` and without offers that depend on them."""

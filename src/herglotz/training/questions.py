@@ -98,7 +98,7 @@ class Questions:
         self._drive(terms, self.wanted, read, found)
         tried = []
         if self.how_inputs_hold():
-            left = taken_terms(self.read.settled(self.best, swapped=True), terms)
+            left = taken_terms(self.read.settled(self.best), terms)
             tried = [(self.hold, left)] if left != terms else []
         elif self.wanted.part.step_ratio == 1:
             left = tuple(term for term in terms if not term.endswith("'"))
@@ -125,7 +125,7 @@ class Questions:
         if self.wanted.part is self.wanted:
             if self.best is not None and self.differ is not None:
                 self.read, best, self.differ = self.wanted.zeros_again(self.read, self.best, self.differ)
-                self.best = best and (best if best is self.best else self.read.settled(best, swapped=True))
+                self.best = best and (best if best is self.best else self.read.settled(best))
             return
         longer = self.wanted.part.step_ratio > 1
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)

@@ -20,7 +20,7 @@ from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
 from herglotz.models.drag import input_columns, input_forces
 from herglotz.models.features import spherical
-from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
+from herglotz.progress import FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.following import HALF, unexplained
@@ -47,7 +47,6 @@ from herglotz.training.trials import (
     is_precise,
     likeliest,
     moved,
-    needed,
 )
 
 # Samples of the part that is searched, if there are more than twice as many.
@@ -184,14 +183,12 @@ class Search:
         # The row zoo 2953/7 of `benchmarks/judge.py` needs this start: 1.0 times the noise, and 10.7 without it.
         ends.append((start := self.linear_start(fitter)) and self.climbed(fitter, *start))
         if not (best and best.at_the_noise) and (full := self.full) and (best is None or full.length >= best.length):
-            ends.append(self.settled(full, swapped=True))
+            ends.append(self.settled(full))
         ends.append((grown := self.undriven) and self.settled(grown))
         for end in ends[1:]:
             best = self.better(best, end)
         if best is None:
             return None
-        part(FEWER_TERMS)
-        ends.append(best := self.settled(best, swapped=True))
         return with_sticking(self, without_injecting_friction(self, self.finalist(best, ends)))
 
     def of_part(self, found: Trial | None, differ: tuple[Tensor, Tensor] | None) -> Zeroed:
@@ -273,8 +270,8 @@ class Search:
         return self.pared(trial)
 
     def pared(self, trial: Trial) -> Trial:
-        """The model with the likeliest prior variances, without the functions that it does not need, settled."""
-        return self.settled(needed(likeliest(trial, 2 * self.iterations), 2 * self.iterations))
+        """The model with the likeliest prior variances, settled."""
+        return self.settled(likeliest(trial, 2 * self.iterations))
 
     def joined(self, trial: Trial) -> Trial:
         """The model after offers have joined over segments of the same length; none join over whole trajectories.
@@ -294,24 +291,21 @@ class Search:
         rich, simple = (up, down) if up.problem.P > down.problem.P else (down, up)
         return rich if rich.replaces(simple) else simple
 
-    def settled(self, trial: Trial, *, swapped: bool = False) -> Trial:
-        """The model after offers have joined, left and, if `swapped`, been exchanged, until no change is better."""
+    def settled(self, trial: Trial) -> Trial:
+        """The model after offers have joined and left until no change is better."""
         seen = {trial.taken}
-        while (other := self.moved(trial, seen, whole=True, swapped=swapped)) is not None:
+        while (other := self.moved(trial, seen, whole=True)) is not None:
             seen.add(other.taken)
             trial = self.finer(other.fitter.grow(likeliest(other, 2 * self.iterations)))
         return trial
 
-    def moved(
-        self, trial: Trial, seen: Collection[frozenset[str]] = (), *, whole: bool = False, swapped: bool = False
-    ) -> Trial | None:
+    def moved(self, trial: Trial, seen: Collection[frozenset[str]] = (), *, whole: bool = False) -> Trial | None:
         """The first better model of the changes that `Moves` predicts; None if no fit of a change is better.
 
-        One offer joins; if `whole`, many may leave; if `swapped`, one is exchanged. No change brings dry friction that
-        injects energy.
+        One offer joins; if `whole`, many may leave. No change brings dry friction that injects energy.
         """
         moves, at = Moves(trial), trial.taken
-        kinds = [moves.joining, *([moves.leaving] if whole else []), *([moves.exchanges] if swapped else [])]
+        kinds = [moves.joining, *([moves.leaving] if whole else [])]
         for taken in (taken for kind in kinds for taken in kind(at)[: self.fits]):
             if taken in seen:
                 continue

@@ -419,18 +419,6 @@ def likeliest(trial: Trial, most: int) -> Trial:
     return trial
 
 
-def needed(trial: Trial, most: int) -> Trial:
-    """The model without the bands that are not worth their price; each removal is fitted, the weakest band first.
-
-    `Moves.leaving` removes bands too, but by the linearised motion alone.
-    """
-    for name in sorted(trial.likeliest_scales, key=trial.likeliest_scales.__getitem__):
-        other = trial.fitter.fit(trial.taken - {name}, trial.values, trial.length, trial, most)
-        if other is not None and not trial.replaces(other):
-            trial = likeliest(other, most)
-    return trial
-
-
 def compared_models(fitters: Iterable[Fitter], trial: Trial) -> list[dict[str, Any]]:
     """The models that were scored over segments of the length of a trial, and the trial itself, by their size."""
     rows: dict[frozenset[str], Compared] = {}

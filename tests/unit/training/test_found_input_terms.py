@@ -205,8 +205,8 @@ class Asked:
     def again(self, _):
         return self.run()
 
-    def settled(self, _, swapped):
-        return self.trial(self.left if swapped else ())
+    def settled(self, _):
+        return self.trial(self.left)
 
     def better(self, _, other):
         return other

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 import herglotz
 from herglotz.errors import InputError
-from herglotz.progress import FEWER_TERMS, FIRST_TERMS, STAGES, FitBar, ProgressBar, beat, inside, part
+from herglotz.progress import FIRST_TERMS, MORE_TERMS, STAGES, FitBar, ProgressBar, beat, inside, part
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.stages import Progress, Stages
@@ -80,7 +80,7 @@ def test_one_bar_tells_what_is_left_of_the_fit(clock):
         for inner in of:
             terms(*inner)
         clock[0] += 11.5
-        part(FEWER_TERMS)
+        part(MORE_TERMS)
         shares.append(stages.bar.span[0])
         clock[0] += 1.0
         return {}
@@ -90,8 +90,8 @@ def test_one_bar_tells_what_is_left_of_the_fit(clock):
         beat()
         assert last() == "looking at the data:   0%|          | 00:01, about ? left"
         stages.keep("terms", lambda: terms([((), 0.0)]))
-        assert shares == pytest.approx([0.05 + 0.6 * 0.65 * 0.7, 0.05 + 0.6 * 0.7])
-        assert bar.expected == pytest.approx(25.0 / (0.05 + 0.6 * 0.7))
+        assert shares == pytest.approx([0.05 + 0.6 * 0.65 * 0.65, 0.05 + 0.6 * 0.65])
+        assert bar.expected == pytest.approx(25.0 / (0.05 + 0.6 * 0.65))
         stages.run("b", torch.zeros(1), 9, optimise)
         clock[0] += 20.0
         beat()

@@ -259,7 +259,7 @@ def test_an_offer_that_says_nothing_is_not_taken(duffing):
     less = there(found.fitter.fit(found.taken - {"q1^4"}, found.values, found.length, found))
     assert not more.replaces(found)
     assert found.replaces(less)
-    assert search.moved(found, whole=True, swapped=True) is None
+    assert search.moved(found, whole=True) is None
 
 
 def test_a_start_without_a_path_is_none():
@@ -468,8 +468,6 @@ def test_moves_are_the_offers_that_are_better(duffing):
     assert all(fewer < more for fewer, more in pairwise(ways))
     poor = there(found.fitter.fit({"q1^2"}, found.values, 20, None, 60))
     assert Moves(poor).joining(poor.taken)[0] == poor.taken | {"q1^4"}
-    wrong = there(found.fitter.fit({"q1^2", "q1^6"}, found.values, found.length, found, 60))
-    assert Moves(wrong).exchanges(wrong.taken)[0] == found.taken
 
 
 def test_of_many_offers_some_leave_at_once_but_not_those_that_stand_for_one_another():
@@ -524,7 +522,6 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
 
     free = Offer("free", ("free",))
     assert moves(dry, excess, free).joining(frozenset()) == [{"dry", "excess"}]
-    assert {"excess"} not in moves(dry, excess, free).exchanges(frozenset({"dry", "free"}))
     assert all(
         "dry" in own or "excess" not in own for own in moves(dry, excess, free).leaving(frozenset({"dry", "excess"}))
     )
@@ -598,7 +595,7 @@ def test_friction_that_pushes_does_not_join():
     assert "friction.breakaway" not in without_injecting_friction(search, there(both)).taken
     braked = without_injecting_friction(search, pushed)
     assert not braked.injecting_friction
-    assert search.moved(braked, whole=True, swapped=True) is None
+    assert search.moved(braked, whole=True) is None
 
 
 def test_a_block_that_is_lost_weighs_no_more_than_it_may():

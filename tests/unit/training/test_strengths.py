@@ -1,11 +1,11 @@
-"""The strength of functions and the bands that a model needs: which fits are asked for, and which stay."""
+"""The strength of functions: which fits are asked for, and which stay."""
 
 from types import SimpleNamespace
 from typing import Any
 
 import torch
 
-from herglotz.training.trials import likeliest, needed
+from herglotz.training.trials import likeliest
 
 
 class Fits:
@@ -25,7 +25,6 @@ def trial(fits, taken, loss=0.0) -> Any:
     return SimpleNamespace(
         fitter=fits, taken=frozenset(taken), values={}, length=5, likeliest_scales=scales,
         score=SimpleNamespace(losses=torch.tensor([loss]), price_of_a_number=0.97),
-        replaces=lambda other: "c" not in other.taken,
     )  # fmt: skip
 
 
@@ -48,13 +47,4 @@ def test_a_model_without_functions_is_not_fitted_again():
     fits = Fits([1.0])
     first = trial(fits, "xy", 4.0)
     assert likeliest(first, 7) is first
-    assert needed(first, 7) is first
     assert fits.asked == []
-
-
-def test_bands_that_are_not_worth_their_price_leave_the_weakest_first():
-    # fails if a band that is worth its price leaves, one that is not stays, or the strongest is tried first
-    fits = Fits()
-    found = needed(trial(fits, "abcx", 4.0), 7)
-    assert found.taken == {"c", "x"}
-    assert [gone for gone, _ in fits.asked if gone] == [{"b"}, {"c"}, {"a"}]
