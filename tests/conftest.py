@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from herglotz.codegen import c_compiler
+from herglotz.training import kernel
+from tests.unoptimised import OPTIMISED, leave_out_optimisation
 
-OPTIMISED = c_compiler.FLAGS
 RELATIVE = 1e-14
 SHAKEN = set()  # digests of what was disturbed
 
@@ -68,9 +68,8 @@ def pytest_configure():
 
 @pytest.fixture(autouse=True, scope="session")
 def _unoptimised_c():
-    """C without optimisation: what it computes does not hang on -O3, which takes the compiler 4 to 8 times as long."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(c_compiler, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in OPTIMISED))
+        leave_out_optimisation(patch.setattr)
         yield
 
 
@@ -115,4 +114,6 @@ def registered_once():
 @pytest.fixture
 def optimised_c(monkeypatch):
     """C as the package compiles it."""
-    monkeypatch.setattr(c_compiler, "FLAGS", OPTIMISED)
+    for module, name, value in OPTIMISED:
+        monkeypatch.setattr(module, name, value)
+    kernel._kernel.cache_clear()

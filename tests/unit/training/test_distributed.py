@@ -11,6 +11,7 @@ import torch
 
 from herglotz.training import distillation, distributed
 
+ROOT = Path(__file__).resolve().parents[3]
 WORK = """
 import sys
 from pathlib import Path
@@ -26,7 +27,9 @@ from herglotz.training.problems.grid import segment_grid
 from herglotz.training.task import build_model
 from herglotz.training.distributed import is_first, process_group
 from herglotz.training.problems.prior import prior_of
+from tests.unoptimised import leave_out_optimisation
 
+leave_out_optimisation()
 distributed.MIN_ROWS = 8  # there are few rows, and each process shall have some
 distillation.ITERATIONS = 3  # sums are shared from the first iteration on
 found = {}
@@ -70,9 +73,8 @@ def result_here(tmp_path, monkeypatch):
 
 def result(tmp_path, processes):
     """Parameters and costs of the fits on so many processes."""
-    script, out = tmp_path / "work.py", tmp_path / f"{processes}.pt"
-    script.write_text(WORK)
-    command = [sys.executable, str(script), str(out)]
+    out = tmp_path / f"{processes}.pt"
+    command = [sys.executable, "-c", WORK, str(out)]
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
@@ -80,7 +82,7 @@ def result(tmp_path, processes):
     started = []
     for rank in range(processes):
         extra = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
-        started.append(subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1", **extra}))
+        started.append(subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1", **extra}))
     assert [p.wait(timeout=300) for p in started] == [0] * processes
     return torch.load(out, weights_only=True)
 
@@ -99,10 +101,9 @@ def test_two_processes_find_what_one_finds(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_torchrun_runs_the_training_script(tmp_path):
     # fails if the script does not join the process group, both processes write, or they end at another model than one
-    root = Path(__file__).resolve().parents[3]
     for processes in (1, 2):
         launcher = ["-m", "torch.distributed.run", "--nproc-per-node", "2"] if processes == 2 else []
-        script = [sys.executable, *launcher, str(root / "train" / "fit.py"), "--config", "demo"]
+        script = [sys.executable, *launcher, str(ROOT / "train" / "fit.py"), "--config", "demo"]
         done = subprocess.run(
             [*script, "--out", str(tmp_path / str(processes))], capture_output=True, text=True, check=False,
             env={**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},

@@ -137,6 +137,12 @@ def test_compiled_equations_are_those_of_torch(name, freedom):
     assert float((rows - own).abs().max()) <= 1e-10 * float(rows.abs().max())
 
 
+@pytest.mark.usefixtures("optimised_c")
+def test_the_optimised_kernel_has_the_same_equations():
+    # fails if the compiler's optimisation, which other tests leave out, changes more than roundings
+    test_compiled_equations_are_those_of_torch("joints", None)
+
+
 @pytest.mark.parametrize("length", [5, 23])
 def test_pieces_add_up_to_the_whole(length, monkeypatch):
     # fails if a segment that is cut into pieces loses a sample, its state or its derivatives
