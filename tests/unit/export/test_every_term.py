@@ -37,7 +37,6 @@ Setting = dict[str, Any]
 # Angles ("a") and lengths ("l") of a case, and its settings. Terms of one function stand alone in one case and beside
 # others in another one: a sum of one product has shapes of its own.
 CASES: dict[str, tuple[str, Setting]] = {
-    "waves": ("a", {"level": "conservative", "alike": True, "features": ("cos(q1)", "sin(q1)", "cos(2q1)")}),
     "one wave": ("a", {
         "level": "forced", "order": 4, "alike": True, "features": ("cos(q1)", "sin(q1) v1^2"),
         "drag": ("|v1| v1", "load 1"), "coulomb": True, "inputs": 1,
@@ -48,23 +47,19 @@ CASES: dict[str, tuple[str, Setting]] = {
         "features": ("q1", *(f"q1^{k}" for k in range(2, 7)), "sin(1.3 q1 + 0.4)", "cos(2.6 q1 - 1) v1^2",
                      "cos(q1 + 1) - cos(2 q1 - 0.5)"),
     }),
-    "one bent spring": ("l", {"alike": True, "order": 4, "features": ("|q1|^3",)}),
     "bent springs that stick": ("l", {
         "level": "forced", "alike": True, "features": ("|q1| q1", "|q1|^3", "q1^4"), "coulomb": True, "sticking": True,
         "order": 4, "inputs": 2, "input_zero": True, "absent": ("friction.viscous",),
     }),
-    "double pendulum": ("aa", {"order": 4, "features": ("cos(q1 - q2) v1 v2",)}),
+    "one bent spring, one shared mass": ("la", {"order": 4, "features": ("|q1|^3", "cos(q2) v1 v2")}),
     "joints": ("aa", {
         "level": "forced", "coupled": True, "coulomb": True, "features": ("revolute", "spherical"), "inputs": 1,
         "input_map": (1.0, 0.0),
     }),
-    "cart and pole": ("la", {
-        "level": "forced", "diagonal": True, "features": ("cos(q2) v1 v2", "q1^3", "sin(q2) v1^2"), "coulomb": True,
-        "inputs": 1, "input_map": (1.0, 0.0), "drag": ("load 2", "|v2| v2", "q1 sgn(v2)", "sin(q2) sgn(v1)"),
-    }),
-    "a slide that turns, inputs by position": ("la", {
-        "level": "forced", "diagonal": True, "features": ("slides",), "inputs": 2, "input_zero": True,
-        "drag": ("u1 sin(q2) on q1", "u2 cos(q2)", "u1 q1"),
+    "cart and pole that slides, inputs by position": ("la", {
+        "level": "forced", "diagonal": True, "features": ("slides", "q1^3"), "coulomb": True,
+        "inputs": 2, "input_zero": True,
+        "drag": ("load 2", "|v2| v2", "q1 sgn(v2)", "sin(q2) sgn(v1)", "u1 sin(q2) on q1", "u2 cos(q2)", "u1 q1"),
     }),
     "lengths": ("ll", {
         "level": "forced", "diagonal": True, "coulomb": True, "sticking": True, "features": ("lengths", "q1 v1^2 v2"),
@@ -83,17 +78,14 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "affine", "potential_width": 3, "damping_width": 3, "correction_width": 3, "activation": "softplus",
         "features": ("1", "q2^2"),
     }),
-    "full": ("a", {
+    "full, powers of s, waves": ("a", {
         "level": "full", "potential_width": 3, "potential_depth": 2, "mass_width": 2, "action_width": 2,
-        "correction_width": 3, "correction_depth": 1, "activation": "silu",
+        "correction_width": 3, "correction_depth": 1, "activation": "silu", "dissipation": ("s^2", "s^3"),
+        "features": ("cos(q1)", "sin(q1)", "cos(2q1)"),
     }),
-    "powers of s": ("l", {"level": "full", "dissipation": ("s^2", "s^3"), "features": ("q1^4",)}),
-    "powers of s, forces": ("al", {
-        "level": "forced", "dissipation": ("s^3", "s^2"), "inputs": 1, "coulomb": True, "drag": ("q2^2 v2",),
-    }),
-    "mass": ("al", {
+    "mass, powers of s, forces": ("al", {
         "level": "forced", "potential_width": 3, "mass_width": 3, "mass_depth": 2, "coupled": True, "coulomb": True,
-        "inputs": 3,
+        "inputs": 3, "dissipation": ("s^3", "s^2"), "drag": ("q2^2 v2",),
     }),
 }  # fmt: skip
 
