@@ -1,5 +1,7 @@
 """A run as the fit returns it, without a fit: a model near the truth, its free run, and an invented history."""
 
+from functools import cache
+
 import torch
 
 from herglotz.data import Trajectories, simulate
@@ -18,6 +20,11 @@ PLAN = Plan(
 )  # fmt: skip
 
 
+@cache
+def _pendulum(trajectories: int, steps: int, h: float) -> Trajectories:
+    return simulate(scene("damped_pendulum"), trajectories=trajectories, steps=steps, h=h, noise=0.01, gaps=0, seed=3)
+
+
 def fake_run(
     trajectories: int = 1,
     steps: int = 60,
@@ -28,8 +35,7 @@ def fake_run(
 ) -> Run:
     """Pendulum data, or an oscillator in the plane for two coordinates."""
     h = 0.2
-    data = simulate(scene("damped_pendulum"), trajectories=trajectories, steps=steps, h=h, noise=0.01, gaps=0, seed=3)
-    rate = 0.201
+    data, rate = _pendulum(trajectories, steps, h), 0.201
     config = ModelConfig(angles=(True,), level=level, rate=rate, potential_width=0)
     if dof == 2:
         config = ModelConfig(
