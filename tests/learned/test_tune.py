@@ -54,7 +54,9 @@ def _a_step_costs_a_step(monkeypatch):
     monkeypatch.setattr("herglotz.tune.search.measure_costs", once)
 
 
-@pytest.mark.parametrize("name", ["damped_pendulum", pytest.param("kepler", marks=pytest.mark.slow), "parachute"])
+@pytest.mark.parametrize(
+    "name", ["damped_pendulum", *(pytest.param(name, marks=pytest.mark.slow) for name in ("kepler", "parachute"))]
+)
 def test_promise_holds_on_held_out_starts(name, pendulum_run):
     # fails if the bound promises too much, or the larger step is not bought by the re-trained correction
     longer = replace(QUICK, iterations=80, pairs=500) if name == "damped_pendulum" else QUICK
