@@ -37,8 +37,8 @@ Setting = dict[str, Any]
 # Angles ("a") and lengths ("l") of a case, and its settings. Terms of one function stand alone in one case and beside
 # others in another one: a sum of one product has shapes of its own.
 CASES: dict[str, tuple[str, Setting]] = {
-    "one wave": ("a", {
-        "level": "forced", "order": 4, "alike": True, "features": ("cos(q1)", "sin(q1) v1^2"),
+    "order 4": ("al", {
+        "level": "forced", "order": 4, "features": ("cos(q1)", "sin(q1) v1^2", "|q2|^3", "cos(q1) v1 v2"),
         "drag": ("|v1| v1", "load 1"), "coulomb": True, "inputs": 1,
     }),
     "powers and functions": ("l", {
@@ -51,7 +51,6 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "forced", "alike": True, "features": ("|q1| q1", "|q1|^3", "q1^4"), "coulomb": True, "sticking": True,
         "order": 4, "inputs": 2, "input_zero": True, "absent": ("friction.viscous",),
     }),
-    "one bent spring, one shared mass": ("la", {"order": 4, "features": ("|q1|^3", "cos(q2) v1 v2")}),
     "joints": ("aa", {
         "level": "forced", "coupled": True, "coulomb": True, "features": ("revolute", "spherical"), "inputs": 1,
         "input_map": (1.0, 0.0),

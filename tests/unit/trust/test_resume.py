@@ -26,7 +26,7 @@ class Interrupted(BaseException):
 
 @pytest.fixture(scope="module")
 def data():
-    return simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.1, noise=1e-3, seed=1)
+    return simulate(scene("damped_pendulum"), trajectories=1, steps=30, h=0.1, noise=1e-3, seed=1)
 
 
 def numbers(run):
