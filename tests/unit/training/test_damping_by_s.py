@@ -59,7 +59,7 @@ def test_the_law_is_found_in_noise():
     assert run.model.config.features == ("q1^2", "q1^4")
     beta, deviation = beta_of(run)
     assert abs(beta - BETA) < 4 * deviation < 0.5 * BETA
-    missed, moved = compared(run)  # by the printed text, which is the model
+    missed, moved = compared(run, parts=2)  # by the printed text, which is the model
     assert moved < missed < 1.2 * 0.005
     test, noisy = recorded(3, 0.0, 100), recorded(3, 0.005, 100)
     ahead = run.predict(noisy, warmup=60)  # fewer samples say little of s at the start
@@ -74,7 +74,7 @@ def test_inputs_do_work_in_s():
     assert abs(beta - BETA) < 4 * deviation < 0.2 * BETA
     (gain,) = [term.value for term in run.equation().terms if term.left == "L" and term.what.startswith("u")]
     assert gain == pytest.approx(GAIN, rel=0.02)
-    missed, moved = compared(run)
+    missed, moved = compared(run, parts=2)
     assert moved < missed < 1.2 * 0.002
 
 

@@ -1,6 +1,7 @@
 """A recording of something else among good ones is left out whole, and named."""
 
 import math
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,6 +27,12 @@ def _drops(seed: int, count: int, samples: int, bad: int, wrong: float = 0.25) -
     return Trajectories.of(t.repeat(count), torch.cat(parts), (samples,) * count, units=("m",), names=("x",))
 
 
+@cache
+def _good():
+    """A fit of good recordings alone."""
+    return fit(_drops(2, 6, 13, bad=-1), progress=False)
+
+
 def test_one_bad_recording_is_left_out_and_named(capsys):
     # fails if the bad recording bends the model of the others, is not named, or takes another one with it
     run = fit(_drops(0, 6, 13, bad=4), progress=False)
@@ -41,9 +48,8 @@ def test_one_bad_recording_is_left_out_and_named(capsys):
 
 def test_good_recordings_all_stay():
     # fails if a recording is left out that differs from the others by its start alone
-    run = fit(_drops(2, 6, 13, bad=-1), progress=False)
-    assert run.metrics["left_out"] == []
-    assert len(run.data) == 6
+    assert _good().metrics["left_out"] == _good().metrics["outlying"] == []
+    assert len(_good().data) == 6
 
 
 def test_a_model_at_the_noise_of_the_others_needs_no_recording_left_out():
@@ -69,12 +75,12 @@ class Fall(torch.nn.Module):
 @pytest.mark.parametrize("given", ["plan", "model"])
 def test_without_a_search_an_outlier_is_named(given, capsys):
     # fails if a bad recording that nobody looks for is not said, or a good one is said to be bad
-    good, data = _drops(2, 6, 13, bad=-1), _drops(0, 6, 13, bad=4)
-    own: dict[str, Any] = {"model": Fall()} if given == "model" else {}
-    found = fit(good, progress=False, **own)
+    data = _drops(0, 6, 13, bad=4)
+    own: dict[str, Any] = {"model": Fall()} if given == "model" else {"plan": _good()}
+    found = fit(_drops(2, 6, 13, bad=-1), progress=False, **own)
     assert not found.metrics["outlying"]
     assert "something else" not in capsys.readouterr().err
-    found = fit(data, progress=False, **(own or {"plan": found}))
+    found = fit(data, progress=False, **own)
     assert [one["recording"] for one in found.metrics["outlying"]] == [4]
     assert "warning: trajectory 4, counted from 0, may be of something else" in capsys.readouterr().err
     assert "fit once more without it" in " ".join(found.summary().split())
@@ -117,15 +123,14 @@ def test_a_recording_that_differs_little_is_left_out():
 def test_a_recording_that_short_segments_do_not_tell_is_left_out(damping, scale, starts):
     # fails if recordings are followed over 20 steps alone: a fifth more damping, or 3 % of scale, bent the model, and
     # the verdict was that the force depends on the past
-    of, t, parts = torch.Generator().manual_seed(1), 0.04 * torch.arange(200).double(), []
-    for b, start in enumerate(starts):
-        bad, x, q = b == 2, torch.tensor(start, dtype=torch.float64), []
-        c = damping if bad else 0.3
-        for _ in range(len(t)):
-            q.append(x[0] * (scale if bad else 1.0))
-            for _ in range(2):
-                x = step(lambda x, c=c: torch.stack([x[1], -9 * x[0].sin() - c * x[1]]), x, 0.02)
-        parts.append(torch.stack(q) + 0.002 * torch.randn(len(t), generator=of, dtype=torch.float64))
+    of, t, q = torch.Generator().manual_seed(1), 0.04 * torch.arange(200).double(), []
+    x = torch.tensor(starts, dtype=torch.float64).T
+    c, factor = torch.tensor([[0.3, 1.0]] * 2 + [[damping, scale]] + [[0.3, 1.0]] * 2, dtype=torch.float64).T
+    for _ in range(len(t)):
+        q.append(x[0] * factor)
+        for _ in range(2):
+            x = step(lambda x: torch.stack([x[1], -9 * x[0].sin() - c * x[1]]), x, 0.02)
+    parts = [one + 0.002 * torch.randn(len(t), generator=of, dtype=torch.float64) for one in torch.stack(q, 1)]
     data = Trajectories.of(t.repeat(5), torch.cat(parts), (len(t),) * 5, angles=(True,))
     run = fit(data, progress=False)
     assert [one["recording"] for one in run.metrics["left_out"]] == [2]

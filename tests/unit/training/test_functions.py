@@ -29,7 +29,7 @@ from tests import runge_kutta
 H, NOISE = 0.05, 0.002
 
 
-def recorded(acceleration, starts, *, angle, steps=160, parts=8, h=H, noise=NOISE):
+def recorded(acceleration, starts, *, angle, steps=160, parts=4, h=H, noise=NOISE):
     """Positions from starts (B, 2) under an acceleration of q and v, by Runge and Kutta, with noise."""
     x, out = np.array(starts, dtype=float).T, []
     rate = lambda x: np.stack([x[1], acceleration(*x)])  # noqa: E731
@@ -373,7 +373,7 @@ def test_functions_join_all_at_once_where_none_does_alone(monkeypatch):
         forces = -slope * v * v - length * np.sin(q) + slope * np.cos(q) - 0.063 * v  # ℓ + ℓ″ = 1
         return forces / (length**2 + slope**2)
 
-    data = recorded(acceleration, [(1.9, 0.3)], angle=True, h=0.14, noise=0.0)
+    data = recorded(acceleration, [(1.9, 0.3)], angle=True, parts=8, h=0.14, noise=0.0)
     search, named = near(data)
     found = with_functions(search, named)
     assert found.at_the_noise
@@ -398,7 +398,7 @@ def test_all_functions_compete_where_none_joins(in_the_well, monkeypatch):
 
 def test_all_functions_do_not_compete_where_they_are_no_better_over_the_shortest_segments():
     # fails if functions are grown to whole recordings of a motion with dry friction, which no sum of waves says better
-    data = recorded(lambda q, v: -q - 0.1 * v - 0.2 * np.sign(v), STARTS, angle=False, noise=0.0)
+    data = recorded(lambda q, v: -q - 0.1 * v - 0.2 * np.sign(v), STARTS, angle=False, parts=8, noise=0.0)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     assert search.flexible is None
     of = next(variant for variant in search.fitters if variant.functions)
