@@ -72,14 +72,16 @@ CASES: dict[str, tuple[str, Setting]] = {
         "level": "forced", "coulomb": True, "sticking": True, "coupled": True, "features": ("q2^4",),
         "drag": ("q2^2 sgn(v2)", "cos(q1) sgn(v1)", "v2^3"), "inputs": 1,
     }),
-    "translations": ("ll", {"translations": ("q1 + q2",), "features": ("(q1 - q2)^2", "(q1 - q2)^4")}),
+    "translations": ("ll", {
+        "level": "conservative", "translations": ("q1 + q2",), "features": ("(q1 - q2)^2", "(q1 - q2)^4"),
+    }),
     "networks": ("al", {
         "level": "affine", "potential_width": 3, "damping_width": 3, "correction_width": 3, "activation": "softplus",
         "features": ("1", "q2^2"),
     }),
-    "full, powers of s, waves": ("a", {
+    "full, waves": ("a", {
         "level": "full", "potential_width": 3, "potential_depth": 2, "mass_width": 2, "action_width": 2,
-        "correction_width": 3, "correction_depth": 1, "activation": "silu", "dissipation": ("s^2", "s^3"),
+        "correction_width": 3, "correction_depth": 1, "activation": "silu",
         "features": ("cos(q1)", "sin(q1)", "cos(2q1)"),
     }),
     "mass, powers of s, forces": ("al", {
