@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from herglotz.training import kernel
-from tests.unoptimised import OPTIMISED, leave_out_optimisation
+from tests.unoptimised import leave_out_optimisation
 
 RELATIVE = 1e-14
 SHAKEN = set()  # digests of what was disturbed
@@ -70,7 +70,7 @@ def pytest_configure():
 def _unoptimised_c():
     with pytest.MonkeyPatch.context() as patch:
         leave_out_optimisation(patch.setattr)
-        yield
+        yield patch
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -112,8 +112,9 @@ def registered_once():
 
 
 @pytest.fixture
-def optimised_c(monkeypatch):
+def optimised_c(_unoptimised_c):
     """C as the package compiles it."""
-    for module, name, value in OPTIMISED:
-        monkeypatch.setattr(module, name, value)
+    _unoptimised_c.undo()
     kernel._kernel.cache_clear()
+    yield
+    leave_out_optimisation(_unoptimised_c.setattr)

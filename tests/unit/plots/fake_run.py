@@ -6,11 +6,11 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Plan, Run
 from herglotz.training.recorded_range import box_of
 
+simulated = cache(simulate)
 TERMS = "cos(q1) explains the data to 0.01"
 START = {"stiffness": (1.0,), "tilt": (0.0,), "rate": (0.2,)}
 PLAN = Plan(
@@ -18,11 +18,6 @@ PLAN = Plan(
     True, 1, (2e-4, 6e-4, 2e-3, 6e-3),
     reasons={"level": TERMS, "objective": "the data are noisy", "features": TERMS, "outliers": ""},
 )  # fmt: skip
-
-
-@cache
-def _pendulum(trajectories: int, steps: int, h: float) -> Trajectories:
-    return simulate(scene("damped_pendulum"), trajectories=trajectories, steps=steps, h=h, noise=0.01, gaps=0, seed=3)
 
 
 def fake_run(
@@ -35,7 +30,8 @@ def fake_run(
 ) -> Run:
     """Pendulum data, or an oscillator in the plane for two coordinates."""
     h = 0.2
-    data, rate = _pendulum(trajectories, steps, h), 0.201
+    data = simulated("damped_pendulum", trajectories=trajectories, steps=steps, h=h, noise=0.01, gaps=0, seed=3)
+    rate = 0.201
     config = ModelConfig(angles=(True,), level=level, rate=rate, potential_width=0)
     if dof == 2:
         config = ModelConfig(
