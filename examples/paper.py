@@ -8,10 +8,10 @@
 from herglotz.plots import plot_fall, plot_printed_map
 from herglotz.plots.parachute import physical_fall, printed_map
 
-plot_printed_map(printed_map()[1])
+plot_printed_map(printed_map())
 
 # %%
-plot_fall(physical_fall()[1])
+plot_fall(physical_fall())
 
 # %% [markdown]
 # A discrete contact Lagrangian has a discrete Hamilton–Jacobi equation: the action along its solutions, S^k,

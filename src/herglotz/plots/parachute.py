@@ -1,4 +1,4 @@
-"""Two figures of the parachute and their numbers: the map that the paper prints, and a fall (erratum E9).
+"""Two figures of the parachute: the map that the paper prints, and a fall (erratum E9).
 
 The paper iterates the printed map (H⁺ without the near-identity part, λ = −0.01) from (q, p, s) = (100, 1, 1). The
 fall is the parachute q̈ = λq̇² − g, λ = +0.01, from the same start, with its exact discrete Lagrangian.
@@ -153,19 +153,15 @@ def start() -> State:
     return State(q[None], p[None], s)
 
 
-def printed_map() -> tuple[dict, PrintedOrbit]:
-    """Return numbers and figure data of the orbit, as printed and with s², while finite; with D2S^k of both."""
-    found, momenta, slopes = {}, {}, {}
-    for name, step in (("printed", PrintedParachute()), ("squared", PrintedParachute(squared=True))):
-        (q, p, s), last = step.orbit(*start(), steps=SHOWN + 6)
-        slopes[name] = [float(S.D2) for S in generating_functions([step] * SHOWN, *start())]
-        momenta[name] = p[: SHOWN + 1, 0].numpy()
-        rows = range(min(last, 9) + 1)
-        points = [{"k": k, "q": float(q[k, 0]), "p": float(p[k, 0]), "s": float(s[k])} for k in rows]
-        found[name] = {"points": points, "dS": slopes[name], "last_finite_k": last}
-    heights = np.array([x["q"] for x in found["printed"]["points"][: SHOWN + 1]])
-    printed, squared = ((momenta[name], np.array(slopes[name])) for name in ("printed", "squared"))
-    return found, PrintedOrbit(heights, *printed, *squared, last=found["printed"]["last_finite_k"])
+def printed_map() -> PrintedOrbit:
+    """Return figure data of the orbit, as printed and with s², with D2S^k of both."""
+    found = []
+    for step in (PrintedParachute(), PrintedParachute(squared=True)):
+        (q, p, _), last = step.orbit(*start(), steps=SHOWN + 6)
+        dS = np.array([float(S.D2) for S in generating_functions([step] * SHOWN, *start())])
+        found.append((q[: SHOWN + 1, 0].numpy(), p[: SHOWN + 1, 0].numpy(), dS, last))
+    (q, p, dS, last), (_, p_squared, dS_squared, _) = found
+    return PrintedOrbit(q, p, dS, p_squared, dS_squared, last)
 
 
 def landing(q0: float, v0: float) -> tuple[float, float]:
@@ -179,19 +175,14 @@ def landing(q0: float, v0: float) -> tuple[float, float]:
     return time, -math.sqrt(G / LAM - (G / LAM - v0 * v0) * math.exp(-2 * LAM * q0))
 
 
-def physical_fall() -> tuple[dict, Fall]:
-    """Return numbers and figure data of the fall.
-
-    The landing is computed twice, in closed form and by an event of the stepper; D2S^k(q_k) is compared with p_k, and
-    the discrete Hamilton–Jacobi equation is evaluated between k and k + 1.
-    """
+def physical_fall() -> Fall:
+    """Return figure data of the fall, the discrete Hamilton–Jacobi equation evaluated between k and k + 1."""
     fall, x = scene("parachute", g=G, lam=LAM), start()
     v0 = float(fall.velocity(*x))
     time, speed = landing(float(x.q), v0)
     steps = int(time / H)
     stepper = Stepper(fall.L_d)
     solution = stepper.rollout(*x, h=H, steps=steps)
-    event = stepper.rollout(*x, h=H, steps=steps + 1, events=[lambda state: state.q[..., 0]]).events[0]
     S = generating_functions([lambda *state: stepper.step(State(*state), H).state] * steps, *x)
     assert fall.H_plus is not None
     residuals = []
@@ -199,17 +190,8 @@ def physical_fall() -> tuple[dict, Fall]:
         H_plus = fall.H_plus(S0.q, S1.D2, S0.s, H)
         residual = hamilton_jacobi_residual(S1.s, S0.s, S1.D2, S1.q, H_plus)
         residuals.append(float(residual.abs() / (S1.s.abs() + S0.s.abs() + H_plus.abs())))
-    p, dS = solution.p[:, 0], torch.stack([x.D2[0] for x in S])
-    numbers = {
-        "landing_time": {"closed_form": time, "event_of_the_stepper": float(event.t[0])},
-        "landing_velocity": {"closed_form": speed, "event_of_the_stepper": float(fall.velocity(*event.state))},
-        "terminal_velocity": -math.sqrt(G / LAM),
-        "h": H,
-        "steps": steps,
-        "worst_dS_minus_p_relative": float(((dS - p[1:]) / p[1:]).abs().max()),
-        "worst_hamilton_jacobi_residual_relative": max(residuals),
-    }
+    dS = torch.stack([x.D2[0] for x in S])
     v = fall.velocity(solution.q, solution.p, solution.s)[:, 0]
     t = H * np.arange(steps + 1)
-    q, v, p, dS = (x.numpy() for x in (solution.q[:, 0], v, p, dS))
-    return numbers, Fall(t, q, v, p, dS, np.array(residuals), time, speed, -math.sqrt(G / LAM))
+    q, v, p, dS = (x.numpy() for x in (solution.q[:, 0], v, solution.p[:, 0], dS))
+    return Fall(t, q, v, p, dS, np.array(residuals), time, speed, -math.sqrt(G / LAM))

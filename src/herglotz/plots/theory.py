@@ -329,6 +329,6 @@ def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None
         raise InputError("with friction or other forces a step is no contact map: there is no S^k to draw")
     drawn = {name: plot(source, h=h) for name, plot in IDENTITIES.items()}
     if getattr(source, "name", "") == "parachute":
-        drawn["parachute_map"] = plot_printed_map(printed_map()[1])
-        drawn["parachute_fall"] = plot_fall(physical_fall()[1])
+        drawn["parachute_map"] = plot_printed_map(printed_map())
+        drawn["parachute_fall"] = plot_fall(physical_fall())
     return save_all(drawn, folder, form)
