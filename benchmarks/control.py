@@ -1,10 +1,11 @@
 """The exported step in control: `python benchmarks/control.py [--quick] [--only PART ...] [--out FOLDER]`.
 
 `nlp`: the swing-up of `examples/mpc_swing_up.py` by IPOPT over 50 intervals of 0.05 s, each of 8 steps; the same step
-as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `l4casadi`: the same by L4CasADi,
-where it is installed (`control_l4casadi.py` says how). `loop`: a real-time iteration in closed loop
-(`control_loop.py`). One thread, processor time; what is compared is timed in turn within each repeat, and a ratio is
-one of a single repeat. Writes control.json and control.md.
+as the file for CasADi (the horizon in one call) and as CasADi's own expressions. `loop`: a real-time iteration
+(`rti.c` of `examples/real_time_iteration`) in closed loop: the true plant of the example from random starts, whose
+positions are read with the noise of the recordings, and a Kalman filter on the learned step that makes states of them.
+One thread, processor time; what is compared is timed in turn within each repeat, and a ratio is one of a single repeat.
+Writes control.json and control.md.
 """
 
 from __future__ import annotations
@@ -15,35 +16,96 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import suppress
-from importlib.util import find_spec
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import torch
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
-from benchmarks.control_loop import (
-    FORCE,
-    FORCE_WEIGHT,
-    INTERVAL,
-    LAST,
-    STEPS,
-    TRACK,
-    UPRIGHT,
-    WEIGHT,
-    N,
-    from_random_starts,
-)  # fmt: skip
-from benchmarks.control_model import H, model, sx_steps
 from herglotz.codegen.c_compiler import compiler
-from herglotz.export import export_casadi
+from herglotz.export import compile_c, export_casadi
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State
+from herglotz.stepping.filter import Belief, KalmanFilter, Noise
 
+# The learned model. The numbers are those that the example learns of its recordings; the fit is not repeated.
+H = 0.00625  # s: the model's own step
+FACTOR = ((1.0, 0.0), (0.00031584926745, 0.23984877))  # C of the mass m = C Cᵀ
+COUPLING, STIFFNESS, RATE = 0.11501273180, 1.12807918135, 0.00105678298
+VISCOUS, DRAG = (0.30569501943, 0.00761698943), -0.00528029567
+INPUTS = (0.76955898360, 0.00029280290)  # input map of the friction term
+ITERATIONS = 3  # of Newton from q1 = q0: a fourth changes a step by rounding alone
+
+N, STEPS = 50, 8  # intervals, and steps in one
+INTERVAL = STEPS * H  # s
+UPRIGHT, WEIGHT = np.array([0.0, np.pi, 0.0, 0.0, 0.0]), np.array([1.0, 2.0, 0.05, 0.5, 0.0])
+FORCE, FORCE_WEIGHT, LAST = 12.0, 0.003, 20.0
+TRACK, BARRIER = 0.9, 10.0  # m to either side; the barrier's weight
+MISS = 1e-3  # m: what the model misses in an interval
+SENSOR = 1e-3  # m and rad: the noise of positions, as in the recordings of the example
+NOISE = Noise((1.04e-3, 1.06e-3), (4.5e-4, 1.0e-4), adaptation=0.02)  # of `noise_of` for its fit
+START = (SENSOR, SENSOR, 0.5, 0.15)  # deviations of x, θ and their momenta over the starts
 NEAR = 0.1  # rad from upright
 FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
 Row = dict[str, Any]
+Plant = Callable[..., np.ndarray]
+
+
+def model() -> ContactLagrangian:
+    """The model."""
+    config = ModelConfig(
+        angles=(False, True), level="forced", scale=(0.55, 2.8), speed=(2.4, 8.5), stiffness=(0.0, STIFFNESS),
+        tilt=(0.0, 0.0), rate=RATE, potential_width=0, inputs=1, features=("cos(q2) v1 v2",), drag=("q1 v1",),
+    )  # fmt: skip
+    made = ContactLagrangian(config)
+    double: Any = {"dtype": torch.float64}
+    numbers = {
+        "kinetic.base.log_diagonal": torch.tensor(FACTOR[1][1], **double).log(),
+        "kinetic.base.off_diagonal": torch.tensor(FACTOR[1][0], **double),
+        "kinetic.sum.coefficient": torch.tensor(COUPLING, **double),
+        "friction.viscous": torch.tensor(VISCOUS, **double),
+        "friction.input_map": torch.tensor(INPUTS, **double),
+        "drag.coefficient": torch.tensor(DRAG, **double),
+    }
+    with torch.no_grad():
+        for name, value in numbers.items():
+            parameter = made.get_parameter(name)
+            parameter.copy_(value.reshape(parameter.shape))
+    return made
+
+
+def _equation(q0: Any, p0: Any, s0: Any, q1: Any, u: Any, h: Any) -> tuple[Any, Any, Any]:
+    """D1 L_d + F⁻ + c p0, p1 = D2 L_d + F⁺ and s1 = s0 + L_d, of SX symbols."""
+    C, delta, middle = ca.DM(FACTOR), q1 - q0, (q0 + q1) / 2
+    v, c = delta / h, ca.exp(-RATE * h)
+    K = ca.dot(v, C @ (C.T @ delta)) / 2 + h * COUPLING * ca.cos(middle[1]) * v[0] * v[1]
+    V0, V1 = (STIFFNESS * (1 - ca.cos(q[1])) for q in (q0, q1))
+    L = (c - 1) * (s0 - h / 2 * V0) + ca.sqrt(c) * K - h / 2 * (V0 + V1)
+    force = ca.DM(INPUTS) * u - ca.DM(VISCOUS) * v - ca.vertcat(DRAG * middle[0] * v[0], 0)
+    return ca.gradient(L, q0) + c * h / 2 * force + c * p0, ca.gradient(L, q1) + h / 2 * force, s0 + L
+
+
+def sx_steps() -> dict[str, ca.Function]:
+    """The step (x, u, h) → x1 in CasADi alone: Newton unrolled in SX, and CasADi's own `fast_newton` on SX."""
+    q0, q1, p0 = (ca.SX.sym(name, 2) for name in ("q0", "q1", "p0"))
+    s0, u, h = (ca.SX.sym(name) for name in ("s0", "u", "h"))
+    residual, p1, s1 = _equation(q0, p0, s0, q1, u, h)
+    x = ca.vertcat(q0, p0, s0)
+    newton = ca.Function("newton", [q1, x, u, h], [q1 - ca.inv(ca.jacobian(residual, q1)) @ residual])
+    end = ca.Function("end", [q1, x, u, h], [ca.vertcat(q1, p1, s1)])
+    q = q0
+    for _ in range(ITERATIONS):
+        q = newton(q, x, u, h)
+    unrolled = ca.Function("unrolled", [x, u, h], [end(q, x, u, h)])
+    root = ca.rootfinder("root", "fast_newton", ca.Function("residual", [q1, x, u, h], [residual]), {"abstol": 1e-13})
+    x, u, h = ca.MX.sym("x", 5), ca.MX.sym("u"), ca.MX.sym("h")
+    return {"unrolled": unrolled, "rootfinder": ca.Function("found", [x, u, h], [end(root(x[:2], x, u, h), x, u, h)])}
 
 
 def built(source: Path, *more: str) -> Path:
@@ -137,43 +199,89 @@ def nlp(quick: bool, folder: Path) -> list[Row]:
     return rows
 
 
-def l4casadi(quick: bool, folder: Path) -> list[Row]:
-    """What all gaps and their Jacobian take, over ours, and what IPOPT makes of them."""
-    from benchmarks.control_l4casadi import interval
+class Controller(ctypes.Structure):
+    """`rti` of `rti.c`."""
 
-    calls, at = [], np.concatenate([np.linspace(np.zeros(5), UPRIGHT, N + 1).ravel(), np.full(N, 0.1)])
-    forms = (exported(folder)[1], interval(N, STEPS, folder))
-    for ahead in forms:
-        of = problem(ahead)[0]
-        calls.append(ca.Function("both", [of["x"], of["p"]], [of["g"], ca.jacobian(of["g"], of["x"])]))
-    (ours, slopes), (theirs, others) = ([np.array(ca.densify(x)) for x in call(at, np.zeros(5))] for call in calls)
-    apart = max(float(abs(ours - theirs).max()), float(abs(slopes - others).max() / abs(slopes).max()))
-    assert apart < 1e-3, apart  # the same functions, in float32
-    ratios, ms = [], []
-    for k in range(15 if quick else 50):
-        taken = []
-        for call, count in zip(calls, (20, 2), strict=True):
-            began = time.process_time()
-            for _ in range(count):
-                call(at, np.zeros(5))
-            taken.append((time.process_time() - began) / count)
-        if k >= 10:  # TorchScript compiles in the first calls
-            ratios.append(taken[1] / taken[0])
-            ms.append(1e3 * taken[1])
-    of, options = problem(forms[1])
-    options["ipopt"] |= {"max_iter": 500}
-    solved = ca.nlpsol("solver", "ipopt", of, options)
-    with suppress(AssertionError):
-        solve(solved)
-    stats = solved.stats()
-    inside = sum(x for key, x in stats.items() if key.startswith("t_proc_nlp"))
-    note = f"{statistics.median(ms):.1f} ms; {min(ratios):.0f} to {max(ratios):.0f}"
-    ended = f"{stats['return_status']}, at a tolerance of 1e-4 in float32; functions took {inside:.1f} s"
-    what = "gaps of the swing-up with their Jacobian, L4CasADi over ours"
-    return [
-        {"what": what, "value": statistics.median(ratios), "target": ">= 10", "note": note},
-        {"what": "iterations of IPOPT on L4CasADi's", "value": stats["iter_count"], "note": ended},
-    ]
+    _fields_ = [
+        ("H", ctypes.c_double), ("X", ctypes.c_double * 5), ("Q", ctypes.c_double * 5), ("E", ctypes.c_double * 5),
+        ("R", ctypes.c_double), ("U", ctypes.c_double), ("B", ctypes.c_double * 5), ("barrier", ctypes.c_double),
+        ("near", ctypes.c_double), ("x", ctypes.c_double * (5 * (N + 1))),
+        ("u", ctypes.c_double * N), ("K", ctypes.c_double * (5 * N)), ("k", ctypes.c_double * N),
+        ("damping", ctypes.c_double), ("cost", ctypes.c_double),
+    ]  # fmt: skip
+
+
+def plant() -> Plant:
+    """The true plant: the first cells of the example."""
+    text = (harness.ROOT / "examples" / "mpc_swing_up.py").read_text(encoding="utf-8")
+    known: dict[str, Any] = {}
+    exec(text[: text.index("# Four recordings")], known)
+    return known["plant"]
+
+
+class Watched:
+    """The plant, and what a filter knows of it from noisy positions."""
+
+    def __init__(self, true: Plant, kalman: KalmanFilter, z: np.ndarray, make: np.random.Generator):
+        self.true, self.kalman, self.z, self.make = true, kalman, z, make  # z = (x, θ, x′, θ′)
+        rest = torch.zeros(2, dtype=torch.float64)
+        self.belief: Belief = kalman.start(State(self._read(), rest, rest[0]), rest.new_tensor(START))
+
+    def move(self, force: float) -> None:
+        """An interval under a force, and the sample at its end."""
+        belief, u = self.belief, torch.tensor([force], dtype=torch.float64)
+        for _ in range(STEPS):
+            belief = self.kalman.predict(belief, H, u)
+        self.z = self.true(self.z, force, INTERVAL, 6)
+        self.belief, _ = self.kalman.update(belief, self._read())
+
+    def _read(self) -> Tensor:
+        return torch.as_tensor(self.z[:2] + SENSOR * self.make.normal(size=2))
+
+
+def closed(library: ctypes.CDLL, seen: Watched, count: int) -> dict[str, Any]:
+    """`count` samples: the angle after each, the largest |x|, ms of both phases, and iterations before the first.
+
+    Two samples without a force tell the filter the velocities.
+    """
+    it, force = Controller(H=INTERVAL, R=FORCE_WEIGHT, U=FORCE, barrier=BARRIER, near=MISS / TRACK), ctypes.c_double()
+    it.B[0] = TRACK
+    it.X[:], it.Q[:], it.E[:] = UPRIGHT, WEIGHT, LAST * WEIGHT
+    it.u[:] = [0.1] * N
+
+    def fed_back() -> int:
+        q, p, _ = seen.belief.state
+        return library.rti_feedback(ctypes.byref(it), (ctypes.c_double * 5)(*q, *p, 0.0), ctypes.byref(force))
+
+    for _ in range(2):
+        seen.move(0.0)
+    failed, first = fed_back(), 0  # the first motion: no law yet
+    while max(map(abs, it.x[::5])) > TRACK and not failed:
+        failed, first = library.rti_prepare(ctypes.byref(it)) | fed_back(), first + 1
+    path, ms = [], []
+    for _ in range(count):
+        times = [time.perf_counter()]
+        failed |= library.rti_prepare(ctypes.byref(it))
+        times.append(time.perf_counter())
+        failed |= fed_back()
+        times.append(time.perf_counter())
+        failed |= library.rti_shift(ctypes.byref(it))
+        assert not failed
+        seen.move(force.value)
+        path.append(seen.z)
+        ms.append([1e3 * (b - a) for a, b in pairwise(times)])
+    x, angles = np.array(path)[:, :2].T
+    return {"angles": angles, "widest": float(abs(x).max()), "ms": np.array(ms), "first": first}
+
+
+def from_random_starts(library: ctypes.CDLL, starts: int, count: int) -> list[dict[str, Any]]:
+    """`closed` from so many starts."""
+    true, kalman = plant(), KalmanFilter(model(), NOISE, stepper=compile_c(model(), h=H))
+    draw, make, found = np.random.default_rng(0), np.random.default_rng(1), []
+    for _ in range(starts):
+        z = np.array([draw.uniform(-0.5, 0.5), draw.uniform(-np.pi, np.pi), *draw.normal(size=2) * [0.5, 2.0]])
+        found.append(closed(library, Watched(true, kalman, z, make), count))
+    return found
 
 
 def loop(quick: bool, folder: Path) -> list[Row]:
@@ -198,7 +306,7 @@ def loop(quick: bool, folder: Path) -> list[Row]:
     ]
 
 
-PARTS = {"nlp": nlp, "l4casadi": l4casadi, "loop": loop}
+PARTS = {"nlp": nlp, "loop": loop}
 
 
 def table(rows: list[Row]) -> str:
@@ -223,9 +331,6 @@ def main(argv: list[str] | None = None) -> None:
     path = harness.json_file(arguments, "control")
     parts = harness.load(path, {"parts": {}})["parts"]
     for name in arguments.only or PARTS:
-        if name == "l4casadi" and find_spec(name) is None:
-            print("l4casadi is not installed: its rows are those of the last run with it")
-            continue
         with tempfile.TemporaryDirectory(prefix="herglotz-bench-") as folder:
             parts[name] = PARTS[name](arguments.quick, Path(folder))
         rows = [row for part in PARTS for row in parts.get(part, [])]
