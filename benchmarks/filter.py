@@ -1,124 +1,44 @@
-"""The Kalman filter of a C header, on a payload that changes and on a measured arm: `python benchmarks/filter.py`.
+"""The Kalman filter on a payload that changes and on a measured arm: `python benchmarks/filter.py`.
 
 * payload: two links with motors, simulated; an encoder of 1 mrad at 100 Hz. After 10 s the second link is 30 % heavier.
   Errors of what is predicted a second ahead, 5 to 8.5 s later, over those of the filter that has the true numbers of
   the heavier arm all the time. One number, `between` the arm and one of twice the second link, wanders by 0.005 a root
   second, or each of the ten numbers that a payload changes by 0.003 of itself.
-* measured: four windows of the UW double pendulum, of all energies, train; the 22 others are followed, of which the
-  filters see every tenth sample (50 Hz). The velocity that they are held beside is that of polynomials of degree 5 over
-  21 samples of the recording (500 Hz). The other filter assumes a constant acceleration, with the noise in its jerk
-  that serves it best. NIS is that of the filter that learns the scale of its noise, and of one that does not.
+* measured: four windows of the UW double pendulum, of all energies, train; `hz.filter` follows the 22 others, of which
+  it sees every tenth sample (50 Hz). The velocity that estimates are held beside is that of polynomials of degree 5
+  over 21 samples of the recording (500 Hz). The other filter assumes a constant acceleration, with the noise in its
+  jerk that serves it best. NIS is the squared innovation over its variance, with a scale of the noise that the filter
+  learns, and with a fixed one.
 
-`--data FOLDER` says where the measured set is; about three minutes of processor time, most of them the fit.
+`--data FOLDER` says where the measured set is.
 """
 
 from __future__ import annotations
 
 import argparse
-import ctypes
 import math
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from herglotz import fit
-from herglotz.codegen.c_compiler import build
+import herglotz as hz
 from herglotz.data import load
-from herglotz.export import export_c, noise_of
+from herglotz.export import compile_c, noise_of
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import chosen, combined, values_of, with_values
+from herglotz.stepping import State
+from herglotz.stepping.filter import KalmanFilter, Noise
 
 Array = np.ndarray[Any, Any]
-LOOP = """
-#include "stepper.h"
-#ifndef arm_P
-#define arm_P 0
-#endif
-int follow(long count, long parts, double h, long ahead, double adaptation, const double *start, const double *std,
-           const double *noises, const double *y, const double *u, double *q, double *v, double *theta,
-           double *surprise, double *predicted) {
-  arm_noise noise;
-  arm_filter filter;
-  arm_state x = arm_start;
-  long k, a, j;
-  int i, status;
-  (void)u;
-  (void)theta;
-  noise.adaptation = adaptation;
-  for (i = 0; i < arm_N; i++) {
-    noise.position[i] = noises[i];
-    noise.momentum[i] = noises[arm_N + i];
-    x.q[i] = start[i];
-    x.p[i] = start[arm_N + i];
-  }
-#if PARAMETERS
-  for (i = 0; i < arm_P; i++) noise.theta[i] = noises[2 * arm_N + i];
-#endif
-  status = arm_filter_start(&filter, &x, THETA(0) std);
-  for (k = 0; k < count; k++) {
-    for (j = 0; k && j < parts; j++) status |= arm_filter_predict(&filter, h, INPUT(k - 1) &noise);
-    if (k) status |= arm_filter_update(&filter, y + k * arm_N, &noise, surprise + k);
-    status |= arm_filter_velocity(&filter, h, INPUT(k) v + k * arm_N, 0);
-    for (i = 0; i < arm_N; i++) q[k * arm_N + i] = filter.x.q[i];
-#if PARAMETERS
-    for (i = 0; i < arm_P; i++) theta[k * arm_P + i] = filter.theta.value[i];
-#endif
-    x = filter.x;
-    for (a = 0; a < ahead && k + ahead < count; a++)
-      for (j = 0; j < parts; j++) status |= arm_step(&x, h, INPUT(k + a) THETA(&filter.theta) 0);
-    for (i = 0; i < arm_N; i++) predicted[k * arm_N + i] = x.q[i];
-  }
-  return status & 15;
-}
-"""
-
-
-class Followed:
-    """What the filter of a header makes of readings y (N, n), with inputs u (N, m)."""
-
-    def __init__(
-        self, model: ContactLagrangian, h: float, parts: int, y: Array, noise: Sequence[float], std: Sequence[float],
-        names: Sequence[str] = (), u: Array | None = None, ahead: int = 0, start: Array | None = None,
-        adaptation: float = 0.0,
-    ):  # fmt: skip
-        library = header(model, h / parts, tuple(names), u is not None)
-        count, n = y.shape
-        sizes = {"q": n, "v": n, "theta": max(1, len(noise) - 2 * n), "surprise": 1, "predicted": n}
-        found = {name: np.full((count, size), np.nan) for name, size in sizes.items()}
-        begin = np.concatenate([y[0], np.zeros(n)]) if start is None else start
-        rows = [np.ascontiguousarray(x, dtype=float) for x in (begin, std, noise, y, y if u is None else u)]
-        numbers = ctypes.c_long(count), ctypes.c_long(parts), ctypes.c_double(h / parts), ctypes.c_long(ahead)
-        numbers = (*numbers, ctypes.c_double(adaptation))
-        status = library.follow(*numbers, *(ctypes.c_void_p(x.ctypes.data) for x in (*rows, *found.values())))
-        assert status == 0, status
-        self.q, self.v, self.theta, surprise, self.predicted = found.values()
-        self.surprise = surprise[:, 0]
-
-
-LIBRARIES: dict[Any, Any] = {}
-
-
-def header(model: ContactLagrangian, h: float, names: tuple[str, ...], driven: bool) -> Any:
-    """The compiled filter of a model."""
-    key = (id(model), h, names)
-    if key not in LIBRARIES:
-        with tempfile.TemporaryDirectory() as folder:
-            text = export_c(model, Path(folder) / "stepper.h", h=h, name="arm", parameters=names, extras=["filter"])
-            loop = LOOP.replace("PARAMETERS", str(int(bool(names))))
-            for word, there in (("THETA", bool(names)), ("INPUT", driven)):
-                with_argument = "argument," if word == "THETA" else "u + (argument) * arm_M,"
-                loop = f"#define {word}(argument) {with_argument if there else ''}\n{loop}"
-            LIBRARIES[key] = model, build(text.read_text(), loop)
-    return LIBRARIES[key][1]
-
-
 # The simulated arm: two links of point masses, 0.3 m each; the first weighs 1 kg.
 G, LENGTH, FIRST, SECOND, VISCOUS = 9.81, 0.3, 1.0, 0.8, (0.02, 0.01)
-DT, CHANGE, COUNT, AHEAD, SENSOR = 0.01, 1000, 1950, 100, 1e-3
+DT, PARTS, SENSOR = 0.01, 2, 1e-3  # s between samples; model steps in it; noise of a reading in rad
+# The sample at which the load comes; those whose predictions count; how far these go.
+CHANGE, FROM, TO, AHEAD = 1000, 1500, 1850, 100
 MOVED = ("kinetic.base.log_diagonal", "kinetic.sum.coefficient", "potential.stiffness", "friction.viscous",
          "friction.input_map")  # fmt: skip
 
@@ -160,9 +80,28 @@ def simulated(u: Array) -> Array:
     return np.array(found)
 
 
+def ahead(
+    model: ContactLagrangian, y: Tensor, u: Tensor, noise: Noise, std: Tensor, names: Sequence[str]
+) -> Tensor:  # fmt: skip
+    """What the filter predicts for `AHEAD` samples after each of the samples `FROM` to `TO`."""
+    h, found, zero = DT / PARTS, [], torch.zeros(2, dtype=torch.float64)
+    stepper = compile_c(model, h=h, parameters=names)
+    kalman = KalmanFilter(model, noise, names, stepper=stepper)
+    belief = kalman.start(State(y[0], zero, zero[0]), std)
+    for k in range(1, TO):
+        for _ in range(PARTS):
+            belief = kalman.predict(belief, h, u[k - 1])
+        belief, _ = kalman.update(belief, y[k])
+        if k >= FROM:
+            own = stepper.with_parameters(dict(zip(kalman.names, belief.theta.tolist(), strict=True)))
+            inputs = u[k : k + AHEAD].repeat_interleave(PARTS, 0)
+            found.append(own.rollout(*belief.state, h=h, steps=PARTS * AHEAD, inputs=inputs).q[-1])
+    return torch.stack(found)
+
+
 def payload(seed: int) -> dict[str, float]:
     """Errors a second ahead, 5 to 8.5 s after the load came, over those with the true numbers."""
-    make, t = np.random.default_rng(seed), DT * np.arange(COUNT)
+    make, t = np.random.default_rng(seed), DT * np.arange(TO + AHEAD)
     waves = [(a, make.uniform(0.2, 2.0), make.uniform(0, 2 * np.pi)) for a in (0.3, 0.12) for _ in range(6)]
     parts = np.array([a * np.sin(2 * np.pi * f * t + phase) for a, f, phase in waves])
     u = np.stack([parts[:6].sum(0), parts[6:].sum(0)], -1)
@@ -174,10 +113,9 @@ def payload(seed: int) -> dict[str, float]:
     each = np.maximum(np.abs(values_of(before, names)), 1.0)
 
     def error(model: ContactLagrangian, names: Sequence[str], wander: Sequence[float], std: Sequence[float]) -> float:
-        noise, first = [SENSOR, SENSOR, 0.01, 0.01, *wander], [SENSOR, SENSOR, 0.05, 0.05, *std]
-        found = Followed(model, DT, 2, y, noise, first, names, u, AHEAD)
-        rows = np.arange(CHANGE + 500, CHANGE + 850)
-        return float(np.sqrt(np.mean((found.predicted[rows] - q[rows + AHEAD]) ** 2)))
+        noise, first = Noise([SENSOR] * 2, [0.01] * 2, wander), [SENSOR, SENSOR, 0.05, 0.05, *std]
+        predicted = ahead(model, torch.from_numpy(y), torch.from_numpy(u), noise, torch.tensor(first).double(), names)
+        return float((predicted - torch.from_numpy(q[FROM + AHEAD : TO + AHEAD])).square().mean().sqrt())
 
     best = error(after, (), (), ())
     return {
@@ -188,7 +126,9 @@ def payload(seed: int) -> dict[str, float]:
     }
 
 
-TRAIN, STRIDE, WINDOW = (0, 7, 14, 21), 10, 21  # windows; samples a reading; samples of a polynomial
+# Windows that train; samples of the recording a sample of the filter; samples of a polynomial; samples before the
+# first that counts.
+TRAIN, STRIDE, WINDOW, LATE = (0, 7, 14, 21), 10, 21, 10
 
 
 def reference(q: Array, h: float) -> Array:
@@ -223,25 +163,22 @@ def accelerated(y: Array, h: float, sensor: Array, jerk: float) -> Array:
 def measured(folder: Path) -> dict[str, Any]:
     """NIS and errors of velocities over the windows that did not train."""
     data = load(folder / "uw_double_pendulum" / "uw_double_pendulum_estimation.csv", show=False)
-    run = fit(data.select(TRAIN), train_fraction=1.0, progress=False)
+    run = hz.fit(data.select(TRAIN), train_fraction=1.0, progress=False)
     test = [data.select([b]).q.double().numpy() for b in range(len(data)) if b not in TRAIN]
-    h = data.typical_step
-    model, steps, noise = run.model.double(), round(STRIDE * h / run.h), noise_of(run)
-    sensor = np.array(noise.position)
+    h, noise = data.typical_step, noise_of(run)
+    seen = data.select(b for b in range(len(data)) if b not in TRAIN).thinned(STRIDE)
+    sensor, late = np.array(noise.position), slice(LATE, -2)
 
-    def followed(q: Array, adaptation: float) -> Followed:
-        y, v = q[::STRIDE], (q[1] - q[0]) / h
-        p = model.velocity_derivatives(torch.tensor(q[:1]), torch.tensor(v)[None], torch.zeros(1).double())[0][0]
-        start = np.concatenate([y[0], p.detach().numpy()])
-        std = [*sensor, 0.1, 0.1, *([0.0] * model.s_enters_motion)]
-        return Followed(model, STRIDE * h, steps, y, [*sensor, *noise.momentum], std, start=start,
-                        adaptation=adaptation)  # fmt: skip
+    def followed(noise: Noise) -> tuple[list[Array], list[Array]]:
+        """Squared innovations and velocities of each window, without the first samples."""
+        found = hz.filter(run, seen, noise=noise)
+        windows = [slice(a + LATE, a + k) for a, k in zip(seen.offsets, seen.lengths, strict=True)]
+        return [found.surprise[w].numpy() for w in windows], [found.v[w][:-2].numpy() for w in windows]
 
-    fixed, learned = ([followed(q, x).surprise[10:] for q in test] for x in (0.0, noise.adaptation))
+    (fixed, _), (learned, velocities) = followed(noise._replace(adaptation=0.0)), followed(noise)
     found = np.concatenate(learned)
     truth = [reference(q, h)[::STRIDE] for q in test]
-    late = slice(10, -2)
-    ours = np.concatenate([(followed(q, noise.adaptation).v - v)[late] for q, v in zip(test, truth, strict=True)])
+    ours = np.concatenate([v - x[late] for v, x in zip(velocities, truth, strict=True)])
     rms: dict[float, float] = {}
     for jerk in 10.0 ** np.arange(1.0, 6.01, 0.25):
         rivals = [accelerated(q[::STRIDE], STRIDE * h, sensor, jerk) for q in test]
