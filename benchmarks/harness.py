@@ -113,6 +113,17 @@ def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.process_ti
     return clock() - begin
 
 
+class Absent(ValueError):
+    """Data that a row needs are not here."""
+
+
+def there(path: Path) -> Path:
+    """The path of a measured set. Raise Absent where it is not here; data/README.md says where to get it."""
+    if not path.exists():
+        raise Absent(f"no {path.name} in {path.parent.name}")
+    return path
+
+
 def load(path: Path, empty: dict[str, Any]) -> dict[str, Any]:
     """What earlier runs stored, or `empty`."""
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else empty

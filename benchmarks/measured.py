@@ -132,10 +132,12 @@ def main(argv: list[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
     path, names = harness.json_file(arguments, "measured"), []
     for name in harness.chosen(parser, arguments.only, ROWS, "set"):
-        if absent := [file for file in ROWS[name][0] if not (arguments.data / file).exists()]:
-            print(f"{name}: skipped, no {absent[0]} in {arguments.data}")
-        else:
+        try:
+            for file in ROWS[name][0]:
+                harness.there(arguments.data / file)
             names.append(name)
+        except harness.Absent as reason:
+            print(f"{name}: skipped, {reason}")
     jobs = {name: (lambda seed, one=measure: one(seed, arguments.data)) for name, (_, measure) in ROWS.items()}
     rows = harness.by_seed(path, jobs, names, arguments.seeds, table)
     if "coverage_simulated" in rows:

@@ -31,7 +31,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
-from benchmarks.judging.job import Absent
+from benchmarks.harness import Absent
 from herglotz.data import Trajectories, load
 from herglotz.errors import InputError
 from herglotz.training import FitConfig, Run, fit

@@ -14,10 +14,6 @@ from typing import Any
 NAME = "job.json"
 
 
-class Absent(Exception):
-    """Data that a row needs are not here."""
-
-
 @dataclass(frozen=True)
 class Trial:
     """A recording from an unseen start, or windows of one."""

@@ -7,6 +7,7 @@ import warnings
 from importlib import import_module
 from pathlib import Path
 
+from benchmarks.harness import Absent
 from benchmarks.judging import job
 from benchmarks.judging.catalogue import named
 
@@ -25,7 +26,7 @@ def main(name: str, folder: str) -> int:
         job.write(
             Path(folder), getattr(import_module(f"benchmarks.judging.{module}"), function)(Path(folder), *row.given)
         )
-    except job.Absent as reason:
+    except Absent as reason:
         print(reason, file=sys.stderr)
         return ABSENT
     return 0

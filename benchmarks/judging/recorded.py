@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.judging.job import Absent, Job, Trial
+from benchmarks.harness import there
+from benchmarks.judging.job import Job, Trial
 from herglotz.data import Trajectories, load, save
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,17 +45,11 @@ WHIRLING = {"windows": 16, "horizon": 2.0}
 POSITIONS = {"train_current": ["current_position"], "train_motor": ["motor_position"], "train_rate": ["angle"]}
 
 
-def _here(path: Path) -> Path:
-    if not path.exists():
-        raise Absent(f"no {path.name} in {path.parent.name}")
-    return path
-
-
 def case(_folder: Path, name: str, train: str) -> Job:
     """A recording that failed once: default flags, errors over those of the true equation with fitted numbers."""
     home, stem = CASES / name, f"train{train}"
-    expected = json.loads(_here(home / "expected.json").read_text(encoding="utf-8"))
-    _here(home / f"{stem}.csv")
+    expected = json.loads(there(home / "expected.json").read_text(encoding="utf-8"))
+    there(home / f"{stem}.csv")
     degrees = "unseen_start_rms_deg" in expected
     if f"{name}/{stem}" in OTHER:
         return Job(str(home / f"{stem}.csv"), unit="rad")
@@ -97,12 +92,12 @@ def demo(_folder: Path) -> Job:
 
 def as_it_is(_folder: Path, path: str, unit: str) -> Job:
     """A measured set whose last third is predicted."""
-    return Job(str(_here(DATA / path)), unit=unit)
+    return Job(str(there(DATA / path)), unit=unit)
 
 
 def rows(path: Path, which: slice) -> Trajectories:
     """These rows of a table, as a user would give them: as a table of its own."""
-    head, *lines = _here(path).read_text(encoding="utf-8").splitlines()
+    head, *lines = there(path).read_text(encoding="utf-8").splitlines()
     with tempfile.TemporaryDirectory() as made:
         part = Path(made) / "rows.csv"
         part.write_text("\n".join([head, *lines[which]]), encoding="utf-8")
@@ -118,7 +113,7 @@ def one_motor(folder: Path) -> Job:
     """Two runs of the torque-driven pendulum train, at about 20 ms; windows of the third are predicted."""
     every = (4, 6, 4)
     runs = [
-        load(_here(DATA / name), angles="position", show=False).thinned(m)
+        load(there(DATA / name), angles="position", show=False).thinned(m)
         for name, m in zip(ONE_MOTOR, every, strict=True)
     ]
     save(folder / "test.csv", runs[2])
@@ -148,14 +143,14 @@ def parted_windows(data: Trajectories, seed: int) -> tuple[Trajectories, Traject
 
 def two_joints(folder: Path, seed: int) -> Job:
     """21 windows of the double pendulum train, five are predicted."""
-    train, test = parted_windows(load(_here(DATA / TWO_JOINTS), show=False), seed)
+    train, test = parted_windows(load(there(DATA / TWO_JOINTS), show=False), seed)
     save(folder / "test.csv", test)
     return Job(_saved(folder, "train", [train]), [Trial("test.csv")], flags=EVERYTHING, unit="rad")
 
 
 def two_joints_whole(_folder: Path) -> Job:
     """All 26 windows train: verdict, time and memory alone."""
-    return Job(str(_here(DATA / TWO_JOINTS)), flags=EVERYTHING, later=False)
+    return Job(str(there(DATA / TWO_JOINTS)), flags=EVERYTHING, later=False)
 
 
 def two_motors(folder: Path, every: int) -> Job:
@@ -171,5 +166,5 @@ def all_runs(folder: Path, which: str) -> Job:
     names, flags = (ONE_MOTOR, ("--angles", "position")) if which == "one" else (TWO_MOTORS, ())
     (folder / "runs").mkdir(exist_ok=True)
     for name in names:
-        shutil.copy(_here(DATA / name), folder / "runs")
+        shutil.copy(there(DATA / name), folder / "runs")
     return Job("runs", flags=(*EVERYTHING, *flags), later=False)

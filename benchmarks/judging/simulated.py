@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.harness import there
 from benchmarks.judging.job import Job, Trial
 from herglotz.data import Trajectories, save, simulate
 from herglotz.scenes import scene
@@ -156,9 +157,9 @@ def double_pendulum(folder: Path, seed: int) -> Job:
 def ibm(folder: Path) -> Job:
     """The measured chaotic double pendulum at 100 Hz: runs 2 and 3 train, windows of run 4 are predicted for 0.5 s."""
     from benchmarks.ibm_double_pendulum import read_ibm_double_pendulum
-    from benchmarks.judging.recorded import DATA, _here
+    from benchmarks.judging.recorded import DATA
 
-    files = (_here(DATA / "ibm_double_pendulum" / f"{k}.csv") for k in (2, 3, 4))
+    files = (there(DATA / "ibm_double_pendulum" / f"{k}.csv") for k in (2, 3, 4))
     runs = [read_ibm_double_pendulum(file).thinned(4) for file in files]
     save(folder / "train.csv", Trajectories.cat(runs[:2]))
     save(folder / "test.csv", runs[2])

@@ -14,10 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.harness import DATA
+from benchmarks.harness import DATA, there
 from benchmarks.ibm_double_pendulum import read_ibm_double_pendulum
 from herglotz.data import load, simulate
-from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit
 
@@ -218,9 +217,7 @@ def real_pendulum(history: int = 40) -> Problem:
     path, h = DATA / "schmidt_lipson_2009" / "real_pend_h_1.txt", 1 / 6
 
     def parts() -> tuple[Tensor, Tensor, int]:
-        if not path.is_file():
-            raise InputError(f"{path}: not here; data/README.md says where to get it, or leave real_pendulum out")
-        data = load(path).unwrapped()
+        data = load(there(path)).unwrapped()
         index = ((data.t - data.t[0]) / h).round().long()
         return index, data.q, round(0.667 * len(index))
 
@@ -254,10 +251,7 @@ def ibm() -> Problem:
     h, checks = IBM_EVERY / 400, {"0.1 s": 10, "0.25 s": 25, "0.5 s": 50}
 
     def run(number: int) -> Tensor:
-        path = DATA / "ibm_double_pendulum" / f"{number}.csv"
-        if not path.is_file():
-            raise InputError(f"{path}: not here; data/README.md says where to get it, or leave ibm out")
-        q = read_ibm_double_pendulum(path).q
+        q = read_ibm_double_pendulum(there(DATA / "ibm_double_pendulum" / f"{number}.csv")).q
         # The known equation needs 0 to hang down. Where the first arm comes to rest says which quarter turn that is.
         late = q[-800:, 0]
         rest = torch.atan2(late.sin().mean(), late.cos().mean())

@@ -267,7 +267,7 @@ def test_rows_have_names_of_their_own():
 def test_a_case_is_tested_by_what_belongs_to_it(tmp_path, monkeypatch):
     # fails if a recording is judged by the test of another reading of it, or absent data are an error
     monkeypatch.setattr(recorded, "CASES", tmp_path)
-    with pytest.raises(job.Absent, match=r"no expected\.json in c"):
+    with pytest.raises(harness.Absent, match=r"no expected\.json in c"):
         recorded.case(tmp_path, "c", "")
     home = tmp_path / "c"
     home.mkdir()

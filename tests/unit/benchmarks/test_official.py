@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks import official
-from benchmarks.judging.job import Absent
+from benchmarks.harness import Absent
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 
