@@ -26,9 +26,9 @@ with the current u1 has u1² v.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -43,18 +43,8 @@ _PAIR = r"v\d+ - v\d+"
 _SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
 _WAVE = r"(?P<wave>cos|sin)\((?:(?P<rate>\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?)?"
 _AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
-_DRIVEN = rf"u(?P<input>\d+)(?: {_AT}(?: on q(?P<driven>\d+))?|(?:\^(?P<power>\d+))? (?P<braked>v\d+))"
-_TEXTS = [
-    re.compile(text)
-    for text in (
-        rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_PAIR})\| )?{_SPEED}(?:\^(?P<c>\d+))?",
-        rf"(?P<of_speed>){_WAVE}{_SPEED}\)",
-        rf"{_AT} sgn\((?P<dry>v\d+)\)",
-        r"load (?P<load>\d+)",
-        r"\|(?P<even>v\d+)\|",
-        _DRIVEN,
-    )
-]
+_INPUTS = (rf"u(?P<input>\d+) {_AT}(?: on q(?P<driven>\d+))?", r"u(?P<input>\d+)(?:\^(?P<power>\d+))? (?P<braked>v\d+)")
+
 AIR = "|v| v"
 
 
@@ -70,9 +60,9 @@ class DragFeature:
 
     on: int
     at: int
-    a: int
-    b: int
-    c: int
+    a: int = 0
+    b: int = 0
+    c: int = 0
     of: int | None = None
     air: bool = False
     dry: bool = False
@@ -119,58 +109,102 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     plain, n = " ".join(text.split()), len(angles)
     if plain == AIR:
         refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
-        return DragFeature(0, 0, 0, 1, 1, air=True)
-    found = _parts(text, plain)
-    of_speed, dry = "of_speed" in found, "dry" in found
-    speed = found["v"] or found["pair"]
-    place = found["angle"] or found["q"]
-    own = speed or found["dry"] or found["load"] or found["even"] or found["driven"] or found["braked"] or place
-    on, *of = map(int, re.findall(r"\d+", own))
-    at, given = int(place or on), int(found["input"]) - 1 if found["input"] else None
-    a, c = int(found["a"] or 1) if found["q"] else 0, int(found["c"] or 1) if speed and not of_speed else 0
-    power = int(found["power"] or 1) if found["braked"] else 0
-    rate, b, second = float(found["rate"] or 1), int(bool(found["size"] or found["even"])), of[0] - 1 if of else None
+        return DragFeature(0, 0, b=1, c=1, air=True)
+    f = _read(text, plain)
+    powers = map(int, re.findall(r"\^(\d+)", plain))
     refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
-        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
-        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in ("", speed),
-        f"drag '{text}': inputs are numbered from 1": given == -1,
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not {f.on, f.at, f.of} <= {None, *range(n)},
+        f"drag '{text}': v{f.on + 1} - v{f.on + 1} is 0; name two coordinates": f.of == f.on,
+        f"drag '{text}': inputs are numbered from 1": f.input == -1,
+        f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not all(1 <= k <= MAX_POWER for k in powers),
     })  # fmt: skip
-    feature = DragFeature(
-        on - 1, at - 1, a, b, c, second, dry=dry, wave=found["wave"], rate=rate, of_speed=of_speed, input=given,
-        power=power,
-    )  # fmt: skip
-    _check_periods(text, feature, angles[at - 1])
-    _check_powers(text, feature, of_a_speed=bool(speed))
-    return feature
-
-
-def _parts(text: str, plain: str) -> Mapping[str, str]:
-    """The named parts of the text of a force, "" for those that it does not have."""
-    match = next(filter(None, (pattern.fullmatch(plain) for pattern in _TEXTS)), None)
-    if match is None:
-        raise InputError(
-            f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1', "
-            "'cos(q1) sgn(v1)', 'u1 cos(q1)' or 'u1^2 v1'"
-        )
-    return defaultdict(str, {name: part for name, part in match.groupdict().items() if part is not None})
-
-
-def _check_periods(text: str, f: DragFeature, angle: bool) -> None:
-    """Raise InputError if a force does not repeat with every turn of an angle."""
     refuse({
-        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{f.at + 1})' instead": f.a and angle,
+        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{f.at + 1})' instead": angles[f.at] and f.a,
         f"drag '{text}': a wave of an angle is periodic; write a whole number before q{f.at + 1}":
-            angle and f.rate % 1 and not f.of_speed,
+            angles[f.at] and f.rate % 1 and not f.of_speed,
     })  # fmt: skip
+    return f
 
 
-def _check_powers(text: str, f: DragFeature, *, of_a_speed: bool) -> None:
-    """Raise InputError if a power of a position or of a speed is too high, or 0."""
-    of_the_speed = 1 <= f.c <= MAX_POWER or not of_a_speed or f.of_speed
-    by_position = f.dry or (f.input is not None and not f.power)
-    fit = max(f.a, f.power) <= MAX_POWER and (f.a >= 1 or bool(f.wave) if by_position else of_the_speed)
-    refuse({f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not fit})
+# The parts of a text by name, "" for those that the text does not have, and the whole `text`.
+Parts = dict[str, str]
+
+
+def _read(text: str, plain: str) -> DragFeature:
+    for pattern, read in _FORMS:
+        if match := pattern.fullmatch(plain):
+            return read(match.groupdict("") | {"text": text})
+    raise InputError(
+        f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'sin(2.5 v1)', 'load 1', "
+        "'cos(q1) sgn(v1)', 'u1 cos(q1)' or 'u1^2 v1'"
+    )
+
+
+def _joints(speed: str) -> tuple[int, int | None]:
+    """The coordinate of a speed, and the second one of a relative speed."""
+    on, *of = (int(k) - 1 for k in re.findall(r"\d+", speed))
+    return on, of[0] if of else None
+
+
+def _place(found: Parts) -> dict[str, Any]:
+    """The factor of a position."""
+    if found["angle"]:
+        return {"at": int(found["angle"]) - 1, "wave": found["wave"], "rate": float(found["rate"] or 1)}
+    return {"at": int(found["q"]) - 1, "a": int(found["a"] or 1)}
+
+
+def _power_of_speed(found: Parts) -> DragFeature:
+    speed = found["v"] or found["pair"]
+    if found["size"] not in ("", speed):
+        raise InputError(f"drag '{found['text']}': |v| and v are one speed; write '|{speed}|' before it")
+    on, of = _joints(speed)
+    place: dict[str, Any] = _place(found) if found["angle"] or found["q"] else {"at": on}
+    return DragFeature(on, **place, b=int(bool(found["size"])), c=int(found["c"] or 1), of=of)
+
+
+def _wave_of_speed(found: Parts) -> DragFeature:
+    on, of = _joints(found["v"] or found["pair"])
+    return DragFeature(on, on, of=of, wave=found["wave"], rate=float(found["rate"] or 1), of_speed=True)
+
+
+def _dry(found: Parts) -> DragFeature:
+    return DragFeature(_joints(found["dry"])[0], **_place(found), dry=True)
+
+
+def _load(found: Parts) -> DragFeature:
+    on, _ = _joints(found["load"])
+    return DragFeature(on, on)
+
+
+def _even(found: Parts) -> DragFeature:
+    on, _ = _joints(found["even"])
+    return DragFeature(on, on, b=1)
+
+
+def _driven(found: Parts) -> DragFeature:
+    place = _place(found)
+    on = int(found["driven"]) - 1 if found["driven"] else place["at"]
+    return DragFeature(on, **place, input=int(found["input"]) - 1)
+
+
+def _braked(found: Parts) -> DragFeature:
+    on, _ = _joints(found["braked"])
+    return DragFeature(on, on, input=int(found["input"]) - 1, power=int(found["power"] or 1))
+
+
+# Each form of a force, and the function that reads the form.
+_FORMS: tuple[tuple[re.Pattern[str], Callable[[Parts], DragFeature]], ...] = tuple(
+    (re.compile(pattern), read)
+    for pattern, read in (
+        (rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_PAIR})\| )?{_SPEED}(?:\^(?P<c>\d+))?", _power_of_speed),
+        (rf"{_WAVE}{_SPEED}\)", _wave_of_speed),
+        (rf"{_AT} sgn\((?P<dry>v\d+)\)", _dry),
+        (r"load (?P<load>\d+)", _load),
+        (r"\|(?P<even>v\d+)\|", _even),
+        (_INPUTS[0], _driven),
+        (_INPUTS[1], _braked),
+    )
+)
 
 
 class Drag(nn.Module):
@@ -261,12 +295,12 @@ class Drag(nn.Module):
 
 def input_forces(texts: Iterable[str]) -> tuple[str, ...]:
     """Return those of these texts that are forces of inputs."""
-    return tuple(text for text in texts if re.fullmatch(_DRIVEN, text))
+    return tuple(text for text in texts if any(re.fullmatch(form, text) for form in _INPUTS))
 
 
 def input_columns(terms: Iterable[str]) -> tuple[str, ...]:
     """Return those of these terms of inputs that are functions of the inputs alone, further columns of u."""
-    return tuple(term for term in terms if not re.fullmatch(_DRIVEN, term))
+    return tuple(term for term in terms if not input_forces([term]))
 
 
 def _power(x: Tensor, k: int) -> Tensor:
