@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import (
     KICKS,
@@ -19,6 +20,9 @@ from herglotz.cli.common import (
 from herglotz.cli.flags import FORCE
 from herglotz.errors import InputError, refuse
 from herglotz.formats import FORMATS, endings, of_ending
+
+if TYPE_CHECKING:
+    from herglotz.training import Run
 
 KNOWN = "\n".join(f"  {name:8}{form.words}" for name, form in FORMATS.items())
 DESCRIPTION = f"""\
@@ -68,13 +72,6 @@ def run(arguments: argparse.Namespace) -> int:
     assert form is not None
     kicks = arguments.source / KICKS
     if kicks.is_file() and form == "c":
-        refuse({
-            "--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out":
-                arguments.name is not None,
-            "--dtype: tune chose the dtype of its kicks; leave --dtype out": arguments.dtype is not None,
-            "--parameters, --extras: kicks that tune chose have neither; leave them out":
-                arguments.parameters is not None or arguments.extras is not None,
-        })  # fmt: skip
         return _copy_kicks(arguments, kicks)
     import_torch()
 
@@ -93,40 +90,43 @@ def run(arguments: argparse.Namespace) -> int:
         run = between(run, name, load_run(Path(other)))
 
     warn_of_misfit(run, "the file will not step as the recorded system does")
-    export_run(
-        run,
-        arguments.out,
-        form,
-        h_range=arguments.h_range,
-        name=arguments.name,
-        dtype=arguments.dtype,
-        parameters=parsed(arguments.parameters or ()),
-        extras=arguments.extras or (),
-        unroll=arguments.unroll,
-    )
-    in_c = FORMATS[form].is_c
+    settings = {name: getattr(arguments, name) for name in ("h_range", "name", "dtype", "unroll")}
+    settings |= {"parameters": parsed(arguments.parameters or ()), "extras": arguments.extras or ()}
+    export_run(run, arguments.out, form, **settings)
     # C is read, not compiled, so that this machine needs no compiler.
-    metadata = read_header(arguments.out)[1] if in_c else load_exported(arguments.out).metadata
-    size = arguments.out.stat().st_size
+    is_c = FORMATS[form].is_c
+    metadata = read_header(arguments.out)[1] if is_c else load_exported(arguments.out).metadata
     if arguments.json:
-        print_json({"file": str(arguments.out), "bytes": size, "metadata": metadata})
+        print_json({"file": str(arguments.out), "bytes": arguments.out.stat().st_size, "metadata": metadata})
     else:
-        dof = f"{metadata['dof']} coordinate{'' if metadata['dof'] == 1 else 's'}"
-        print(f"{arguments.out}: {size / 1024:.0f} KiB, {metadata['dtype']}, {dof}, h {run.h:g}")
-        if kicks.is_file():
-            print(f"tune chose kicks, which exist in C only (--format c); {arguments.out} holds the run's own model")
-        if not in_c and (tol := run.setting.get("tol")):
-            print(f"The tolerance {tol:g} of tune applies to PyTorch and C only; this file solves to rounding")
-        if form == "c":
-            say(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
-        print_next(["verify", arguments.out, "--against", arguments.source])
+        _report(run, form, metadata, arguments)
     return 0
+
+
+def _report(run: Run, form: str, metadata: dict[str, Any], arguments: argparse.Namespace) -> None:
+    """Print size and kind of the file, what it leaves out of the choice of `herglotz tune`, and the next command."""
+    out: Path = arguments.out
+    dof = f"{metadata['dof']} coordinate{'' if metadata['dof'] == 1 else 's'}"
+    print(f"{out}: {out.stat().st_size / 1024:.0f} KiB, {metadata['dtype']}, {dof}, h {run.h:g}")
+    if (arguments.source / KICKS).is_file():
+        print(f"tune chose kicks, which exist in C only (--format c); {out} holds the run's own model")
+    if not FORMATS[form].is_c and (tol := run.setting.get("tol")):
+        print(f"The tolerance {tol:g} of tune applies to PyTorch and C only; this file solves to rounding")
+    if form == "c":
+        say(f"The example at the top of {out} compiles with cc -O3 -march=native")
+    print_next(["verify", out, "--against", arguments.source])
 
 
 def _copy_kicks(arguments: argparse.Namespace, kicks: Path) -> int:
     """Copy the header of kicks that `herglotz tune` wrote; return the exit code 0."""
     from herglotz.data.files import write_atomically
 
+    refuse({
+        "--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out": arguments.name is not None,
+        "--dtype: tune chose the dtype of its kicks; leave --dtype out": arguments.dtype is not None,
+        "--parameters, --extras: kicks that tune chose have neither; leave them out":
+            arguments.parameters is not None or arguments.extras is not None,
+    })  # fmt: skip
     text = kicks.read_bytes()
     write_atomically(arguments.out, text)
     if arguments.json:

@@ -49,37 +49,40 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"columns are chosen in a data file, and {source} is none: leave out {flags}")
     if arguments.animate and (theory or not source.is_dir()):
         raise InputError(f"--animate draws a run; {source} is none: fit it first, and leave out --theory")
-    if theory:
-        from herglotz.plots import save_theory_figures
-
-        written = save_theory_figures(str(source), folder, form=arguments.format)
-    elif source.is_dir():
-        from herglotz.training import load_run
-
-        result = load_run(source)
-
-        from herglotz.plots import save_animation, save_figures
-
-        if arguments.animate:
-            folder.mkdir(parents=True, exist_ok=True)
-            save_animation(result, folder / "animation.gif")
-            print(folder / "animation.gif")
-            return 0
-        written = save_figures(result, folder, form=arguments.format)
-    else:
-        from herglotz.data import load
-
-        data = load(source, **columns_of(arguments))
-
-        from herglotz.plots import plot_data, save_figure
-
-        figure = plot_data(data)
-        folder.mkdir(parents=True, exist_ok=True)
-        written = [folder / f"{source.stem}.{arguments.format}"]
-        save_figure(figure, written[0])
-    for path in written:
+    draw = _of_theory if theory else _of_run if source.is_dir() else _of_data
+    for path in draw(source, folder, arguments):
         print(path)
     return 0
+
+
+def _of_theory(source: Path, folder: Path, arguments: argparse.Namespace) -> list[Path]:
+    from herglotz.plots import save_theory_figures
+
+    return save_theory_figures(str(source), folder, form=arguments.format)
+
+
+def _of_run(source: Path, folder: Path, arguments: argparse.Namespace) -> list[Path]:
+    from herglotz.training import load_run
+
+    result = load_run(source)
+
+    from herglotz.plots import save_animation, save_figures
+
+    if not arguments.animate:
+        return save_figures(result, folder, form=arguments.format)
+    folder.mkdir(parents=True, exist_ok=True)
+    return [save_animation(result, folder / "animation.gif").path]
+
+
+def _of_data(source: Path, folder: Path, arguments: argparse.Namespace) -> list[Path]:
+    from herglotz.data import load
+
+    data = load(source, **columns_of(arguments))
+
+    from herglotz.plots import plot_data
+    from herglotz.plots.style import save_all
+
+    return save_all({source.stem: plot_data(data)}, folder, arguments.format)
 
 
 def _is_scene(source: Path) -> bool:

@@ -23,6 +23,7 @@ from herglotz.cli.flags import FORCE, READING, columns_of
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
+    from herglotz.training import Run
     from herglotz.training.predict import Prediction
 
 # A copy of the default of `Run.predict`, so that help does not import PyTorch; a test compares both.
@@ -78,7 +79,6 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.training import load_run
     from herglotz.training.fitted_run import as_recorded
     from herglotz.training.predict import missed_from_best_start
-    from herglotz.training.recorded_range import warning
 
     result = load_run(arguments.source)
     data = as_recorded(result, arguments.data, **columns_of(arguments))
@@ -103,15 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
         _report(found, arguments, best)
         if written:
             print(f"Written: {', '.join(map(str, written))}")
-    if drifts := (result.metrics.get("plan") or {}).get("drifts"):
-        names, time = zip(found.data.names, found.data.units, strict=True), found.data.time_unit
-        rates = ", ".join(f"{name} {x:.4g} {unit}/{time}" for (name, unit), x in zip(names, drifts, strict=True))
-        say(f"herglotz: note: its sensors are taken to drift as those of the fit did: {rates}", sys.stderr)
-    if found.failed_steps > 0:
-        share = f"{100 * found.failed_steps:.3g} % of the predicted samples were not reached: a step failed"
-        say(f"herglotz: note: {share}; the RMS is over the others", sys.stderr)
-    if found.beyond:
-        say(f"herglotz: note: {warning(found.beyond, found.data.time_unit)}", sys.stderr)
+    _tell_of_limits(found, result)
     return 0
 
 
@@ -122,6 +114,21 @@ def _tell_of_names(names: tuple[str, ...], known: tuple[str, ...]) -> None:
         say(f"herglotz: note: {names[0]} is taken for {known[0]}, the run's only coordinate", sys.stderr)
     elif others:
         say(f"herglotz: note: the run has no coordinate {', '.join(others)}: left aside", sys.stderr)
+
+
+def _tell_of_limits(found: Prediction, result: Run) -> None:
+    """Say on stderr what the errors assume or leave out."""
+    from herglotz.training.recorded_range import warning
+
+    if drifts := (result.metrics.get("plan") or {}).get("drifts"):
+        names, time = zip(found.data.names, found.data.units, strict=True), found.data.time_unit
+        rates = ", ".join(f"{name} {x:.4g} {unit}/{time}" for (name, unit), x in zip(names, drifts, strict=True))
+        say(f"herglotz: note: its sensors are taken to drift as those of the fit did: {rates}", sys.stderr)
+    if found.failed_steps > 0:
+        share = f"{100 * found.failed_steps:.3g} % of the predicted samples were not reached: a step failed"
+        say(f"herglotz: note: {share}; the RMS is over the others", sys.stderr)
+    if found.beyond:
+        say(f"herglotz: note: {warning(found.beyond, found.data.time_unit)}", sys.stderr)
 
 
 def _report(found: Prediction, arguments: argparse.Namespace, best: tuple[float, ...] | None) -> None:

@@ -8,7 +8,6 @@ from herglotz.export.c_wrappers import (
     export_fmu as export_fmu,
 )
 from herglotz.export.compare import compare as compare
-from herglotz.export.differences import DifferencedStepper as DifferencedStepper
 from herglotz.export.exported import ExportedStepper as ExportedStepper
 from herglotz.export.filtering import Filtered as Filtered, filter as filter, noise_of as noise_of
 from herglotz.export.load import (

@@ -16,38 +16,36 @@ WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
 
 
-class LinearisedStepper:
-    """A stepper whose `step` gives autograd the derivative of `linearise` (`ExportedStepper.linearise`).
+def differentiable(stepper: Any, slopes: Callable[[State, float], Tensor]) -> Callable[[State, float], Step]:
+    """The step of a stepper, with `slopes` for autograd: the derivative (..., m, m) by (q, p, s), not by h.
 
-    For verification only. `stepper` has `step(state, h) -> Step` and `linearise(state, h) -> Linearised`.
+    For verification only. `stepper` has `step(state, h) -> Step`.
     """
 
-    def __init__(self, stepper: Any):
-        self.stepper = stepper
+    def step(state: State, h: float) -> Step:
+        x = state.joined
+        found = stepper.step(state_of(x.detach()), h)
+        if not (torch.is_grad_enabled() and x.requires_grad):
+            return found
+        y = _Given.apply(x, found.state.joined, slopes(state_of(x.detach()), h))
+        return Step(state_of(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
 
-    def step(self, state: State, h: float) -> Step:
-        """One step; differentiable in the state, not in h."""
-        return _differentiable(self.stepper, state, h, lambda x: self.stepper.linearise(state_of(x), h).by_state)
+    return step
 
 
-class DifferencedStepper:
-    """A stepper whose `step` gives autograd a derivative by central differences, 8 (2n + 1) further steps.
+def differenced(stepper: Any, sticks: bool = False) -> Callable[[State, float], Step]:
+    """The step of a stepper with a derivative by central differences, 8 (2n + 1) further steps.
 
-    For verification only. The relative error is about 1e-12 in float64 where the map is smooth over 4 % of its
-    arguments, and about 1e-4 in float32. `stepper` has `step(state, h) -> Step`; `sticks` says whether dry friction can
-    hold a coordinate (`central_differences`).
+    The relative error is about 1e-12 in float64 where the map is smooth over 4 % of its arguments, and about 1e-4 in
+    float32. `sticks` says whether dry friction can hold a coordinate (`central_differences`).
     """
 
-    def __init__(self, stepper: Any, sticks: bool = False):
-        self.stepper, self.sticks = stepper, sticks
-
-    def step(self, state: State, h: float) -> Step:
-        """One step; differentiable in the state, not in h."""
-        return _differentiable(self.stepper, state, h, lambda x: self._slopes(x, h))
-
-    def _slopes(self, x: Tensor, h: float) -> Tensor:
+    def slopes(state: State, h: float) -> Tensor:
+        x = state.joined
         offset = OFFSET[x.dtype] * (1 + x.abs())
-        return central_differences(lambda y: stepped(self.stepper.step, y, h), x, offset, self.sticks)
+        return central_differences(lambda y: stepped(stepper.step, y, h), x, offset, sticks)
+
+    return differentiable(stepper, slopes)
 
 
 def stepped(step: Callable[[State, float], Step], x: Tensor, h: float) -> Tensor:
@@ -78,16 +76,6 @@ def directions(x: Tensor, y: Tensor) -> Tensor:
     """The sign of each coordinate's move in a step from x to y, (..., 2n+1) each; 0 where it stands still."""
     n = x.shape[-1] // 2
     return (y - x)[..., :n].sign()
-
-
-def _differentiable(stepper: Any, state: State, h: float, slopes: Callable[[Tensor], Tensor]) -> Step:
-    """One step, with `slopes` (q, p, s) → DΦ̃ for autograd where it asks for a derivative."""
-    x = state.joined
-    found = stepper.step(state_of(x.detach()), h)
-    if not (torch.is_grad_enabled() and x.requires_grad):
-        return found
-    y = _Given.apply(x, found.state.joined, slopes(x.detach()))
-    return Step(state_of(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
 
 
 class _Given(torch.autograd.Function):

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from herglotz.data.simulate import uniform
 from herglotz.errors import InputError, did_you_mean
-from herglotz.export import DifferencedStepper, ExportedStepper, load_exported
+from herglotz.export import ExportedStepper, load_exported
 from herglotz.export.compare import draw
-from herglotz.export.differences import LinearisedStepper
+from herglotz.export.differences import differenced, differentiable
 from herglotz.mechanics import DiscreteLagrangian, momentum_minus, partials
 from herglotz.mechanics.contact import Flow
 from herglotz.models import ContactLagrangian, capabilities
@@ -72,7 +72,7 @@ def _drawn(
     return State(q[good], p[good], s[good])
 
 
-# Bounds on identities whose derivatives are central differences of order 8 (`DifferencedStepper`). A step has a
+# Bounds on identities whose derivatives are central differences of order 8 (`differenced`). A step has a
 # rounding error of 10–100 eps and an offset is 0.01 (float32: 0.1) of 1 + |x|, so a derivative has a rounding error of
 # 1e-13–1e-12 (float32: 1e-5). The truncation error, offset⁸ f⁽⁹⁾/630, is smaller where f is smooth over the offsets.
 # Products of such derivatives over k steps and divisions by ∂q1/∂p0 ~ h multiply the error by 10–1000. Null models
@@ -198,8 +198,8 @@ def _file(target: ExportedStepper, states: State, h: float) -> Subject:
     if target.differentiable:
         return whole
     if "linearise" in target.programs:
-        return replace(whole, step=LinearisedStepper(target).step)
-    return replace(whole, step=DifferencedStepper(target, whole.sticks).step, differenced=True)
+        return replace(whole, step=differentiable(target, lambda state, h: target.linearise(state, h).by_state))
+    return replace(whole, step=differenced(target, whole.sticks), differenced=True)
 
 
 def _pair(source: Any, states: Any, h: float | None) -> Subject:

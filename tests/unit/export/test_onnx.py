@@ -8,7 +8,8 @@ import torch
 from export_models import BOX, model_of, states_of
 
 from herglotz.errors import InputError
-from herglotz.export import DifferencedStepper, compare, export_onnx, load_onnx, weights_digest
+from herglotz.export import compare, export_onnx, load_onnx, weights_digest
+from herglotz.export.differences import differenced
 from herglotz.mechanics import flow_derivative, partials, step_derivative
 from herglotz.stepping import State, Status, Stepper
 
@@ -107,7 +108,7 @@ def test_differences_are_the_derivative(written):
     # fails if a weight of the difference formula, an offset or the order of the columns is wrong
     model, _, exported = written
     q, p, s = states_of(2, 5)
-    (q1, _, _), D = flow_derivative(lambda *x: DifferencedStepper(exported).step(State(*x), 0.1).state, q, p, s)
+    (q1, _, _), D = flow_derivative(lambda *x: differenced(exported)(State(*x), 0.1).state, q, p, s)
     with torch.no_grad():
         exact = step_derivative(partials(model, q, q1, s, 0.1, 2), p)
     torch.testing.assert_close(D, exact, rtol=1e-9, atol=1e-9)
