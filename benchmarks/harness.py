@@ -172,13 +172,15 @@ def table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:
     return lines + [f"| {' | '.join(str(x).replace('|', '/') for x in row)} |" for row in rows]
 
 
-def spread(values: Iterable[float | None]) -> str:
-    """Median and range over the seeds, the median alone of one seed, or "failed"."""
+def spread(values: Iterable[float | None], form: str = ".1e", without: str = "failed") -> str:
+    """Median and range over the seeds, the median alone of one seed, and how many are None, which are `without`."""
+    values = list(values)
     known = [x for x in values if x is not None]
     if not known:
-        return "failed"
-    middle = f"{statistics.median(known):.1e}"
-    return middle if len(known) == 1 else f"{middle} ({min(known):.1e} – {max(known):.1e})"
+        return without
+    text, lost = f"{statistics.median(known):{form}}", len(values) - len(known)
+    text += "" if len(known) == 1 else f" ({min(known):{form}} – {max(known):{form}})"
+    return f"{text}, {lost} {without}" if lost else text
 
 
 def by_seed(

@@ -196,26 +196,12 @@ def measure(name: str, train: Trajectories, tests: dict[str, Trajectories], seed
         row |= {"equation": str(run.equation()), "cpu_seconds": fitted, "rms": {}}
         for test, data in tests.items():
             row["rms"][test] = score(run, data, PROTOCOLS[name])
-            print(f"  {test}: {said(row['rms'][test])} {PROTOCOLS[name].unit} ({fitted} s to fit)", flush=True)
+            error = harness.spread([row["rms"][test]], ".3g")
+            print(f"  {test}: {error} {PROTOCOLS[name].unit} ({fitted} s to fit)", flush=True)
         rows.append(row)
         if named:
             break
     return rows
-
-
-def said(value: float | None) -> str:
-    return "failed" if value is None else f"{value:.3g}"
-
-
-def over_seeds(rows: list[dict[str, Any]], test: str) -> str:
-    """Median and range, or the one value of a fit that draws nothing."""
-    values = [row["rms"][test] for row in rows]
-    known = [x for x in values if x is not None]
-    if not known:
-        return "failed"
-    failed = f", {len(values) - len(known)} failed" if len(known) < len(values) else ""
-    span = "" if len(known) == 1 else f" ({min(known):.3g} – {max(known):.3g})"
-    return said(statistics.median(known)) + span + failed
 
 
 def table(stored: dict[str, Any]) -> str:
@@ -227,7 +213,13 @@ def table(stored: dict[str, Any]) -> str:
         cpu = statistics.median(one["cpu_seconds"] for one in seeds)
         for test, samples in row["tests"].items():
             published = PUBLISHED.get((name, test), "")
-            shown = f"{over_seeds(seeds, test)} {protocol.unit}", drawn, published, f"{cpu:.0f} s", seeds[0]["verdict"]
+            shown = (
+                f"{harness.spread((one['rms'][test] for one in seeds), '.3g')} {protocol.unit}",
+                drawn,
+                published,
+                f"{cpu:.0f} s",
+                seeds[0]["verdict"],
+            )
             lines.append([row["set"], test, row["train"], samples, protocol.warmup, *shown, row["commit"]])
     head = ("set", "test", "training samples", "test samples", "warm-up", "RMS error", "seeds", "published", "fit, CPU",
             "verdict", "commit")  # fmt: skip

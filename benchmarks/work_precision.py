@@ -93,20 +93,12 @@ def study_table(name: str, result: dict[str, Any]) -> list[str]:
         rows = []
         for row in wanted:
             found = row["seeds"]
-            cells = [middle([r[k] for r in found]) if found else "" for k in ("error", "us_per_time", *names)]
+            columns = ("error", "us_per_time", *names)
+            cells = [harness.spread((r[k] for r in found), ".3g", "not reached") if found else "" for k in columns]
             rows.append([f"{row['wanted']:g}", f"{len(found)} of {result['seeds']}", *cells])
         lines += ["", f"By the {'median start' if error == 'median' else '95 % start'}:", ""]
         lines += harness.table(("wanted", "seeds", "error", "µs per time", *names), rows)
     return lines
-
-
-def middle(values: list[float | None]) -> str:
-    """Median and range, or how many never get there."""
-    known = [v for v in values if v is not None]
-    if not known:
-        return "not reached"
-    text = f"{statistics.median(known):.3g} ({min(known):.3g} … {max(known):.3g})"
-    return text if len(known) == len(values) else f"{text}, not reached by {len(values) - len(known)}"
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -24,7 +24,7 @@ EXTRAS = {
     "gymnasium": ("environment.py",),
 }
 # These stand above the rooms, or are written in onnxscript, and are loaded where they are asked for.
-ABOVE = ("environment.py", "regressor.py", "onnx_graph.py", "onnx_operations.py")
+ABOVE = ("environment.py", "regressor.py", "onnx_operations.py")
 FILES = sorted(SOURCE.rglob("*.py"))
 
 

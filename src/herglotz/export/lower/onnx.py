@@ -67,7 +67,7 @@ def graph_of(
 ) -> bytes:
     """A program as a serialised ONNX model; K steps and B samples are free sizes.
 
-    The traced graphs of the program are operators (`herglotz.export.inline.opaque`), which `onnx_graph.translated`
+    The traced graphs of the program are operators (`herglotz.export.inline.opaque`), which `onnx_operations.translated`
     writes: torch.onnx would evaluate every operation three times with symbolic shapes.
     """
     import torch.onnx
@@ -75,8 +75,7 @@ def graph_of(
     from onnx_ir import Shape, passes
     from onnx_ir.passes import common
 
-    from herglotz.export.lower.onnx_graph import translated
-    from herglotz.export.lower.onnx_operations import OPERATIONS
+    from herglotz.export.lower.onnx_operations import OPERATIONS, translated
 
     # No operation around the graphs needs a decomposition; torch would trace both loops twice more to find this out.
     program.run_decompositions = lambda _: program  # pyright: ignore[reportAttributeAccessIssue]
