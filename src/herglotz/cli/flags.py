@@ -247,10 +247,7 @@ RUN = (
 
 def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `load` that the flags of `READING` give."""
-    names = (
-        "angles", "degrees", "polar", "input_terms", "sensor_zeros", "sensor_scales", "time", "coordinates", "inputs",
-        "drop", "group",
-    )  # fmt: skip
+    names = [one[0][0].removeprefix("--").replace("-", "_") for one in READING if not isinstance(one, str)]
     return {name: value for name in names if (value := getattr(arguments, name)) is not None}
 
 

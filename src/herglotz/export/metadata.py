@@ -117,17 +117,8 @@ def describe(
 
     Raise InputError if h, box, units or further entries are not usable.
     """
-    if not isinstance(model, ContactLagrangian | OwnLagrangian):
-        name = type(model).__name__
-        raise InputError(f"export takes a model, got a {name}; of an L_d of your own, OwnLagrangian(L_d, dof=n)")
+    _refuse_unusable(model, h, units, newton_iterations)
     dtype, n = next(model.parameters()).dtype, model.config.dof
-    wrong_dtype = dtype not in (torch.float32, torch.float64)
-    refuse({
-        f"export needs a float32 or float64 model, got {dtype}; convert it with .double()": wrong_dtype,
-        f"h must be a finite number > 0, got {h}": not 0 < float(h) < float("inf"),
-        f"units needs one entry a coordinate ({n}), got {list(units)}": units and len(units) != n,
-        f"newton_iterations must be at least 2, got {newton_iterations}; 30 suits most models": newton_iterations < 2,
-    })  # fmt: skip
     entries: dict[str, Any] = {
         "format": FORMAT,
         "herglotz_version": herglotz.__version__,
@@ -153,6 +144,20 @@ def describe(
         given = ", ".join(f"{x:g}" for x in span)
         raise InputError(f"h_range must be (low, high) with 0 < low <= h = {h:g} <= high, got [{given}]")
     return entries
+
+
+def _refuse_unusable(model: object, h: float, units: Sequence[str], newton_iterations: int) -> None:
+    if not isinstance(model, ContactLagrangian | OwnLagrangian):
+        name = type(model).__name__
+        raise InputError(f"export takes a model, got a {name}; of an L_d of your own, OwnLagrangian(L_d, dof=n)")
+    dtype, n = next(model.parameters()).dtype, model.config.dof
+    wrong_dtype = dtype not in (torch.float32, torch.float64)
+    refuse({
+        f"export needs a float32 or float64 model, got {dtype}; convert it with .double()": wrong_dtype,
+        f"h must be a finite number > 0, got {h}": not 0 < float(h) < float("inf"),
+        f"units needs one entry a coordinate ({n}), got {list(units)}": units and len(units) != n,
+        f"newton_iterations must be at least 2, got {newton_iterations}; 30 suits most models": newton_iterations < 2,
+    })  # fmt: skip
 
 
 def input_labels(entries: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -70,19 +70,7 @@ def export_run(
     asked = {key: value for key, value in given.items() if value not in (None, (), [], {})}
     refuse({f"{path}: the setting {key} is of {_taking(key)} only, not of {kind}; leave it out": key not in form.takes
             for key in asked})  # fmt: skip
-    (q, p, s), t = run.last_fitted()
-    low, high = h_range or _steps(run)
-    span = [low * (1 - ROUNDING), high * (1 + ROUNDING)]
-    metadata = {
-        "names": list(run.data.names),
-        "time_unit": run.data.time_unit,
-        "degrees": list(run.data.degrees),
-        "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t},
-        "metrics": run.metrics,
-        "card": model_card(run, (low, high)),
-        "h_range": span,
-        **_of_inputs(run),
-    }
+    metadata = _metadata(run, h_range or _steps(run))
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and form.is_c and dtype in (None, run.setting["dtype"]):
         # The tolerance of `herglotz tune` is for the dtype that tune chose.
@@ -94,6 +82,22 @@ def export_run(
         metadata["noise"] = {key: x if isinstance(x, float) else list(x) for key, x in noise.items()}
     form.write(run.model, path, **described)
     return path
+
+
+def _metadata(run: Run, h_range: tuple[float, float]) -> dict[str, Any]:
+    """The entries of the run in a file's metadata."""
+    (q, p, s), t = run.last_fitted()
+    low, high = h_range
+    return {
+        "names": list(run.data.names),
+        "time_unit": run.data.time_unit,
+        "degrees": list(run.data.degrees),
+        "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t},
+        "metrics": run.metrics,
+        "card": model_card(run, h_range),
+        "h_range": [low * (1 - ROUNDING), high * (1 + ROUNDING)],
+        **_of_inputs(run),
+    }
 
 
 def _taking(setting: str) -> str:
