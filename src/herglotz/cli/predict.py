@@ -150,15 +150,20 @@ def _report(found: Prediction, arguments: argparse.Namespace, best: tuple[float,
         every = zip(best, found.data.names, found.data.units, strict=True)
         rows.append(("from best start", ", ".join(size(x, unit, name in degrees, 4) for x, name, unit in every)))
     rows.append(("failed steps", f"{100 * found.failed_steps:.3g} %"))
-    steps = f"at most {found.most_substeps} model steps in a recorded step" if found.most_substeps > 1 else ""
-    if found.every > 1:
-        steps = f"every {found.every} samples of the recording are one step"
-    if found.outside > 0:
-        steps += f"{'; ' if steps else ''}{100 * found.outside:.3g} % are outside of the steps of the training data"
     if found.zeros:
         zeros = zip(found.data.names, found.zeros, found.data.units, strict=True)
         rows.append(("sensors at 0", ", ".join(f"{name} {size(x, unit, name in degrees)}" for name, x, unit in zeros)))
-    print_table([*rows, *([("steps", steps)] if steps else [])])
+    rows += [("steps", steps)] if (steps := _steps(found)) else []
+    print_table(rows)
+
+
+def _steps(found: Prediction) -> str:
+    """How recorded steps were crossed, and whether they are those of the training data; empty if one by one."""
+    said = f"at most {found.most_substeps} model steps in a recorded step" if found.most_substeps > 1 else ""
+    if found.every > 1:
+        said = f"every {found.every} samples of the recording are one step"
+    outside = f"{100 * found.outside:.3g} % are outside of the steps of the training data" if found.outside > 0 else ""
+    return "; ".join(filter(None, (said, outside)))
 
 
 def _write(found: Prediction, out: Path, momenta: bool) -> list[Path]:

@@ -57,7 +57,6 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.against is not None:
         raise InputError(f"--against compares an exported file with a run; {target} is no file")
 
-    from herglotz.training import load_run
     from herglotz.verify import symmetries, verify
 
     if arguments.plots is not None:
@@ -66,12 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         check_output_folder(arguments.plots)
         save_theory_figures(arguments.target, arguments.plots, h=arguments.h)
     settings = {name: getattr(arguments, name) for name in ("h", "samples", "steps", "seed")}
-    model = None if arguments.against is None else load_run(arguments.against).model.to(target.dtype)
-    if model is not None and (model.dof, model.inputs) != (target.dof, target.inputs):
-        raise InputError(
-            f"--against {arguments.against}: the run has {model.dof} coordinate(s) and {model.inputs} input(s), "
-            f"{arguments.target} has {target.dof} and {target.inputs}; give the run that the file was exported from"
-        )
+    model = _model_of(target, arguments)
     report = verify(target, model=model, **settings)
     found = symmetries(target, h=arguments.h, seed=arguments.seed) if arguments.symmetries else None
     agreement = None if arguments.against is None else _agreement(target, arguments)
@@ -83,6 +77,21 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(_text(report, found, agreement, arguments))
     return int(not passed)
+
+
+def _model_of(target: Any, arguments: argparse.Namespace) -> Any:
+    """The model of the run of --against; None without one, InputError if that is not the run of the file."""
+    from herglotz.training import load_run
+
+    if arguments.against is None:
+        return None
+    model = load_run(arguments.against).model.to(target.dtype)
+    if (model.dof, model.inputs) != (target.dof, target.inputs):
+        raise InputError(
+            f"--against {arguments.against}: the run has {model.dof} coordinate(s) and {model.inputs} input(s), "
+            f"{arguments.target} has {target.dof} and {target.inputs}; give the run that the file was exported from"
+        )
+    return model
 
 
 def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: argparse.Namespace) -> str:

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import torch
@@ -248,23 +249,32 @@ def filter(
     if len(kalman.names) != len(chosen):
         raise InputError(f"{', '.join(chosen)} stand for several numbers of the model; name each of them")
     std = torch.tensor([first for first, _ in chosen.values()], dtype=torch.float64)
-    beliefs, surprises, steps, longest = [], [], [], run.h_range[1]
     _check_lengths(data, lag)
-    for first, length in zip(data.offsets, data.lengths, strict=True):
-        belief, surprise = _started(kalman, data, first, std), math.nan
-        for row in range(first, first + length):
-            h = float(data.t[row] - data.t[row - 1]) if row > first else float(data.t[row + 1] - data.t[row])
-            if row > first:
-                belief = kalman.remember(belief, lag) if lag else belief
-                before = _predicted(kalman, data, belief, row, h, longest)
-                belief, surprise = kalman.update(before, data.q[row])
-            beliefs.append(kalman.smoothed(belief, 0))
-            # The sample `lag` before this one; at the end of the trajectory all that are left.
-            for back in range(1, lag + 1) if row + 1 == first + length else [lag] * (lag <= row - first):
-                beliefs[row - back] = kalman.smoothed(belief, back)
-            surprises.append(surprise)
-            steps.append(min(h, longest))
-    return _filtered(kalman, data, beliefs, surprises, steps)
+    rows = [
+        _followed(kalman, data, first, length, std, run.h_range[1], lag)
+        for first, length in zip(data.offsets, data.lengths, strict=True)
+    ]
+    return _filtered(kalman, data, *(list(chain(*column)) for column in zip(*rows, strict=True)))
+
+
+def _followed(
+    kalman: KalmanFilter, data: Trajectories, first: int, length: int, std: Tensor, longest: float, lag: int
+) -> tuple[list[Belief], list[float], list[float]]:  # fmt: skip
+    """The beliefs, surprises and steps of one trajectory, which starts at row `first`."""
+    h = float(data.t[first + 1] - data.t[first])
+    belief = _started(kalman, data, first, std)
+    beliefs, surprises, steps = [kalman.smoothed(belief, 0)], [math.nan], [min(h, longest)]
+    for k in range(1, length):
+        h = float(data.t[first + k] - data.t[first + k - 1])
+        belief = kalman.remember(belief, lag) if lag else belief
+        belief, surprise = kalman.update(_predicted(kalman, data, belief, first + k, h, longest), data.q[first + k])
+        beliefs.append(kalman.smoothed(belief, 0))
+        # The sample `lag` before this one; at the end of the trajectory all that are left.
+        for back in range(1, lag + 1) if k + 1 == length else [lag] * (lag <= k):
+            beliefs[k - back] = kalman.smoothed(belief, back)
+        surprises.append(surprise)
+        steps.append(min(h, longest))
+    return beliefs, surprises, steps
 
 
 def _check_lengths(data: Trajectories, lag: int) -> None:
