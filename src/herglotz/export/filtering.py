@@ -25,8 +25,9 @@ from herglotz.export.c_wrappers import header_of
 from herglotz.export.exported import ExportedStepper
 from herglotz.export.lower.c_parameters import without_parameters
 from herglotz.mechanics import legendre_minus
+from herglotz.mechanics.newton import find_root
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import State
+from herglotz.stepping import State, Stepper
 from herglotz.stepping.filter import Belief, KalmanFilter, Noise
 from herglotz.stepping.linearise import forward_slopes
 from herglotz.training.fitted_run import FittedRun, as_recorded
@@ -36,7 +37,7 @@ from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.smoother import process_noise
 
 # The scale of the noise is learned from about the last 50 samples. Windows of the measured UW double pendulum then have
-# a mean surprise of 1.2 to 2.3, where 2 is right, and of 0.6 to 3.3 with a fixed scale (`benchmarks/filter.py`).
+# a mean surprise of 1.2 to 2.7, where 2 is right, and of 0.6 to 3.3 with a fixed scale (`benchmarks/filter.py`).
 ADAPTATION = 0.02
 
 
@@ -85,8 +86,13 @@ def input_at(model: ContactLagrangian, data: Trajectories, row: int, part: Tenso
     return u[0]
 
 
-def momentum_at(model: ContactLagrangian, data: Trajectories, row: int) -> tuple[Tensor, Tensor]:
-    """The momentum FL⁻ (n,) of a sample and the next sample, and its derivative (n, n) by the next sample."""
+def momentum_at(
+    model: ContactLagrangian, data: Trajectories, row: int, longest: float
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The momentum (n,) with which the model moves to the next sample, and its derivative (n, n) by the next sample.
+
+    FL⁻ of both samples is the momentum of a single step; it also counts where no motion of `parts_of` steps arrives.
+    """
     q0, q1, h = data.q[row], data.q[row + 1], data.t[row + 1] - data.t[row]
     u = input_at(model, data, row, torch.tensor(0.5, dtype=torch.float64))
     zero = torch.zeros((), dtype=torch.float64)
@@ -95,7 +101,21 @@ def momentum_at(model: ContactLagrangian, data: Trajectories, row: int) -> tuple
         return legendre_minus(model if u is None else model.at(u), q0, q1, zero, h)[1]
 
     with torch.no_grad():
-        return momentum(q1), forward_slopes(momentum, q1)
+        p, by_q1 = momentum(q1), forward_slopes(momentum, q1)
+    parts, stepper, n = parts_of(float(h), longest), Stepper(model), len(q0)
+
+    def missed(p: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the motion with the momentum p ends from the next sample, and the derivative by p."""
+        state, by_start = State(q0, p, zero), torch.eye(2 * n + 1, dtype=q0.dtype)
+        for k in range(parts):
+            u = input_at(model, data, row, torch.tensor((k + 0.5) / parts, dtype=torch.float64))
+            found = stepper.linearise(state, h / parts, u)
+            state, by_start = found.step.state, found.by_state @ by_start
+        return state.q - q1, by_start[:n, n : 2 * n]
+
+    if parts > 1 and bool((found := find_root(missed, p)).converged):
+        return found.x, torch.linalg.inv(found.J)
+    return p, by_q1
 
 
 def parts_of(h: float, longest: float) -> int:
@@ -117,10 +137,11 @@ def _likelihood(run: FittedRun) -> Callable[[Tensor], float]:
     data = complete(run.data).unwrapped().to(dtype=torch.float64, device="cpu")
     header = header_of(model, "noise", {"h": run.h, "extras": ["filter"]})
     library = build(header, re.sub(r"\bhz_", "noise_", without_parameters(runtime("innovations.c"))))
-    parts, rows, places, steps = _parts(data, run.h_range[1])
+    longest = run.h_range[1]
+    parts, rows, places, steps = _parts(data, longest)
     starts, slopes = [], []
     for first in data.offsets:
-        p, by_q = momentum_at(model, data, first)
+        p, by_q = momentum_at(model, data, first, longest)
         starts.append(torch.cat([data.q[first], p]))
         slopes.append(by_q)
     zero = torch.zeros(1, dtype=torch.float64)
@@ -205,8 +226,8 @@ def filter(
     With a `lag` the estimate of each sample also uses the `lag` samples after it, as far as the trajectory has them:
     fixed-lag smoothing.
 
-    Each trajectory starts at its first two samples. A C header exported with `extras=["filter"]` has the same filter
-    (`docs/c.md`).
+    Each trajectory starts at its first two samples, with the momentum that moves the model from one to the other. A C
+    header exported with `extras=["filter"]` has the same filter (`docs/c.md`).
 
     Parameters
     ----------
@@ -250,8 +271,9 @@ def filter(
         raise InputError(f"{', '.join(chosen)} stand for several numbers of the model; name each of them")
     std = torch.tensor([first for first, _ in chosen.values()], dtype=torch.float64)
     _check_lengths(data, lag)
+    longest = run.h_range[1]
     rows = [
-        _followed(kalman, data, first, length, std, run.h_range[1], lag)
+        _followed(kalman, data, first, length, std, longest, lag)
         for first, length in zip(data.offsets, data.lengths, strict=True)
     ]
     return _filtered(kalman, data, *(list(chain(*column)) for column in zip(*rows, strict=True)))
@@ -262,7 +284,7 @@ def _followed(
 ) -> tuple[list[Belief], list[float], list[float]]:  # fmt: skip
     """The beliefs, surprises and steps of one trajectory, which starts at row `first`."""
     h = float(data.t[first + 1] - data.t[first])
-    belief = _started(kalman, data, first, std)
+    belief = _started(kalman, data, first, std, longest)
     beliefs, surprises, steps = [kalman.smoothed(belief, 0)], [math.nan], [min(h, longest)]
     for k in range(1, length):
         h = float(data.t[first + k] - data.t[first + k - 1])
@@ -333,10 +355,10 @@ def _flat(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
     return torch.cat([q, p, s[None]]), belief.theta, belief.covariance
 
 
-def _started(kalman: KalmanFilter, data: Trajectories, row: int, std: Tensor) -> Belief:
-    """The belief at the first sample, with the momentum FL⁻ of the first two: its standard deviation is m √2 σ/h."""
+def _started(kalman: KalmanFilter, data: Trajectories, row: int, std: Tensor, longest: float) -> Belief:
+    """The belief at the first sample, with the momentum of the first two: its standard deviation is m √2 σ/h."""
     n, q0, zero = kalman.n, data.q[row], torch.zeros((), dtype=torch.float64)
-    p, by_q1 = momentum_at(kalman.model, data, row)
+    p, by_q1 = momentum_at(kalman.model, data, row, longest)
     own = q0.new_tensor(kalman.noise.position)
     spread = torch.cat([own, 2**0.5 * (by_q1.square() @ own.square()).sqrt(), zero.expand(kalman.kept - 2 * n), std])
     return kalman.start(State(q0, p, zero), spread)

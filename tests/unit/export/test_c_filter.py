@@ -451,6 +451,19 @@ def test_a_recording_is_followed_with_the_noise_of_the_fit():
     torch.testing.assert_close(hz.filter(run, table).state.q, hz.filter(run, data.select([0])).state.q)
 
 
+def test_the_start_takes_the_steps_of_the_model():
+    # fails if the momentum of the start is that of one step where the model takes ten: innovations of a motion without
+    # noise are then far above its rounding
+    model = ContactLagrangian(ModelConfig((True,), "linear", (1.0,), (2.0,), (4.0,), (0.0,), 0.2, potential_width=0))
+    start = torch.tensor([[1.0], [-0.6]], dtype=torch.float64)
+    with torch.no_grad():
+        y = Stepper(model).rollout(start, 0 * start, 0 * start[:, 0], h=H, steps=80).q[:, ::10].reshape(-1, 1)
+    t = (10 * H * torch.arange(9, dtype=torch.float64)).repeat(2)
+    data = Trajectories.of(t, y, (9, 9), names=("a",), units=("rad",), angles=(True,))
+    found = hz.filter(run_of(model, data, 1e-4), data, noise=Noise([1e-4], [1e-4]))
+    assert float(found.surprise.nan_to_num().max()) <= 1e-12
+
+
 def test_the_noise_of_a_fit_is_that_of_its_recording():
     # fails if the levels are those that the fit assumed (a tenth of the noise of readings, and next to no forces), the
     # spread of the start is not that of the filter, or an input does not act
