@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.data import simulate
+from herglotz.data import Trajectories, simulate
 from herglotz.data.simulate import uniform
 from herglotz.scenes import scene
 from herglotz.stepping import State
@@ -104,9 +104,9 @@ class Timed:
 
 
 def costs(timed: list[Timed]) -> list[dict]:
-    """The points with their costs: the least of all rounds, in turn, and how far the middle one lies above it."""
+    """The points with their costs: the least of all rounds, in turn."""
     measured = zip(timed, measure_costs([one.timing for one in timed], ROUNDS), strict=True)
-    return [{**t.point, "us_per_time": c.step_us / t.h, "spread": c.spread_us / t.h} for t, c in measured]
+    return [{**t.point, "us_per_time": c.step_us / t.h} for t, c in measured]
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,7 @@ class Case:
     """One scene with its data, its fitted model, unseen starts and their truth."""
 
     setup: Setup
+    data: Trajectories  # with the states, which the neural ODEs get
     run: Run
     entry: State  # the starts in the learned model's own momenta
     start: State  # the same in the scene's
@@ -135,7 +136,7 @@ def prepare(setup: Setup, seed: int = 0) -> Case:
     start = State(*system.flow(*first, setup.h))
     with torch.no_grad():
         entry = State(*(x.detach() for x in run.stepper.init(first.q, start.q, None, setup.h)))
-    return Case(setup, run, entry, start, exact_motion(setup, start), took, seed)
+    return Case(setup, data, run, entry, start, exact_motion(setup, start), took, seed)
 
 
 def motions_of(case: Case) -> State:
@@ -162,9 +163,8 @@ def _timed(case: Case, stepper: CompiledKicks, h: float, setting: str, dtype: st
     start = State(*(x.to(number).contiguous() for x in case.entry))
     with torch.no_grad():
         q = stepper.rollout(*start, h=h, steps=steps).q[:, 1:]
-    point = {"kind": "learned kicks", "setting": setting, "h": h, "dtype": dtype}
     errors = judged(q[:, steps // CHECKS - 1 :: steps // CHECKS], case.truth)
-    return Timed({**point, **errors}, timed_stepping(stepper, start, h, steps), h)
+    return Timed({"kind": "learned kicks", "setting": setting, **errors}, timed_stepping(stepper, start, h, steps), h)
 
 
 def kicks(case: Case) -> list[Timed]:

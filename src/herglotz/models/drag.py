@@ -43,7 +43,7 @@ _PAIR = r"v\d+ - v\d+"
 _SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
 _WAVE = r"(?P<wave>cos|sin)\((?:(?P<rate>\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?)?"
 _AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
-_INPUTS = (rf"u(?P<input>\d+) {_AT}(?: on q(?P<driven>\d+))?", r"u(?P<input>\d+)(?:\^(?P<power>\d+))? (?P<braked>v\d+)")
+_INPUTS = (rf"u(?P<input>\d+) {_AT}(?: on q(?P<on>\d+))?", r"u(?P<input>\d+)(?:\^(?P<power>\d+))? v(?P<on>\d+)")
 
 AIR = "|v| v"
 
@@ -167,42 +167,28 @@ def _wave_of_speed(found: Parts) -> DragFeature:
     return DragFeature(on, on, of=of, wave=found["wave"], rate=float(found["rate"] or 1), of_speed=True)
 
 
-def _dry(found: Parts) -> DragFeature:
-    return DragFeature(_joints(found["dry"])[0], **_place(found), dry=True)
-
-
-def _load(found: Parts) -> DragFeature:
-    on, _ = _joints(found["load"])
-    return DragFeature(on, on)
-
-
-def _even(found: Parts) -> DragFeature:
-    on, _ = _joints(found["even"])
-    return DragFeature(on, on, b=1)
-
-
-def _driven(found: Parts) -> DragFeature:
+def _of_an_input(found: Parts) -> DragFeature:
     place = _place(found)
-    on = int(found["driven"]) - 1 if found["driven"] else place["at"]
+    on = int(found["on"]) - 1 if found["on"] else place["at"]
     return DragFeature(on, **place, input=int(found["input"]) - 1)
 
 
-def _braked(found: Parts) -> DragFeature:
-    on, _ = _joints(found["braked"])
-    return DragFeature(on, on, input=int(found["input"]) - 1, power=int(found["power"] or 1))
+def _on_a_joint(found: Parts, **more: Any) -> DragFeature:
+    on = int(found["on"]) - 1
+    return DragFeature(on, **{"at": on, **more})
 
 
-# Each form of a force, and the function that reads the form.
+# Each form of a force, and what reads the form.
 _FORMS: tuple[tuple[re.Pattern[str], Callable[[Parts], DragFeature]], ...] = tuple(
     (re.compile(pattern), read)
     for pattern, read in (
         (rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_PAIR})\| )?{_SPEED}(?:\^(?P<c>\d+))?", _power_of_speed),
         (rf"{_WAVE}{_SPEED}\)", _wave_of_speed),
-        (rf"{_AT} sgn\((?P<dry>v\d+)\)", _dry),
-        (r"load (?P<load>\d+)", _load),
-        (r"\|(?P<even>v\d+)\|", _even),
-        (_INPUTS[0], _driven),
-        (_INPUTS[1], _braked),
+        (rf"{_AT} sgn\(v(?P<on>\d+)\)", lambda found: _on_a_joint(found, **_place(found), dry=True)),
+        (r"load (?P<on>\d+)", _on_a_joint),
+        (r"\|v(?P<on>\d+)\|", lambda found: _on_a_joint(found, b=1)),
+        (_INPUTS[0], _of_an_input),
+        (_INPUTS[1], lambda x: _on_a_joint(x, input=int(x["input"]) - 1, power=int(x["power"] or 1))),
     )
 )
 
