@@ -30,6 +30,7 @@ from herglotz.tune.cost import Timed as Timing
 TIMED, PER = 16, 4e-3  # motions and seconds of one timing, at least: far above the resolution of the clock
 # Numbers of SYSTEM in work_precision.c.
 SYSTEMS = {"damped_pendulum": 0, "double_pendulum": 1}
+# The same for a network.
 NETWORK = 2
 # Numbers of work_precision.c.
 METHODS = {"RK4": 0, "DOP853": 1, "leapfrog": 2, "DOP853 fixed": 3}

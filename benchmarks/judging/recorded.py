@@ -30,7 +30,6 @@ DUFFING_CIRCUIT = "silverbox/silverbox_estimation.csv"
 TWO_JOINTS = "uw_double_pendulum/uw_double_pendulum_estimation.csv"
 WINDOWS, LEFT_OUT, CIRCUIT = 120, 5, 10_000
 EVERYTHING = ("--train-fraction", "1")
-# What a recording of a case is to be read as, where the fit may read something else.
 # Recordings of another system than the tests in their folder: their own held-out time is predicted.
 OTHER = ("torsion_turns/train_two",)
 # Unstable motion is missed by far more than the noise. What the true equation misses of it from the same warm-up, in
@@ -41,7 +40,9 @@ ATTAINED = {
     "closed_loop/train_tenth": 0.0338, "closed_loop/train_nod": 0.0101, "closed_loop/train_dither": 0.0074,
     "furuta/train_big": 0.0147,
 }  # fmt: skip
+# How the arm that whirls is judged.
 WHIRLING = {"windows": 16, "horizon": 2.0}
+# What a recording of a case is to be read as, where the fit may read something else.
 POSITIONS = {"train_current": ["current_position"], "train_motor": ["motor_position"], "train_rate": ["angle"]}
 
 

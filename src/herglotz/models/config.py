@@ -117,7 +117,8 @@ class ModelConfig:
     def __post_init__(self):
         for name, value in vars(self).items():
             if isinstance(value, list):
-                object.__setattr__(self, name, tuple(value))  # so that a configuration can be a key
+                # A configuration can then be a key.
+                object.__setattr__(self, name, tuple(value))
         self._check_sizes()
         self._check_forces()
         self._check_structure()
