@@ -37,7 +37,7 @@ from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.smoother import process_noise
 
 # The scale of the noise is learned from about the last 50 samples. Windows of the measured UW double pendulum then have
-# a mean surprise of 1.2 to 2.7, where 2 is right, and of 0.6 to 3.3 with a fixed scale (`benchmarks/filter.py`).
+# a mean surprise of 1.2 to 2.7, where 2 is right, and of 0.6 to 3.4 with a fixed scale (`benchmarks/filter.py`).
 ADAPTATION = 0.02
 
 
@@ -70,9 +70,10 @@ def noise_of(run: FittedRun, theta: tuple[float, ...] = ()) -> Noise:
         raise InputError("the run's metrics have no noise (sigma) > 0; give noise to the filter")
     levels = torch.cat([problem.deviations.expand(n), momentum.expand(n)]).double()
     if n <= MAX_DERIVATIVES and _compiles():
-        # The descent starts at forces so large that the filter follows any motion.
-        levels[n:] = problem.mass * problem.speed / math.sqrt(h)
-        levels = _descended(_likelihood(run), levels.log()).exp()
+        # One descent starts at what the fit assumes, one at forces so large that the filter follows any motion.
+        large = torch.cat([levels[:n], (problem.mass * problem.speed / math.sqrt(h)).expand(n).double()])
+        cost = _likelihood(run)
+        levels = min((_descended(cost, start.log()) for start in (levels, large)), key=cost).exp()
     return Noise(levels[:n].tolist(), levels[n:].tolist(), theta, ADAPTATION)
 
 

@@ -19,7 +19,7 @@ from herglotz.codegen.c_compiler import build
 from herglotz.data import Trajectories
 from herglotz.data.gaps import with_missing
 from herglotz.errors import InputError
-from herglotz.export import export_c, noise_of
+from herglotz.export import export_c, filtering, noise_of
 from herglotz.export.filtering import _parts
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of
@@ -490,6 +490,28 @@ def test_the_noise_of_a_fit_is_that_of_its_recording():
             hz.filter(run, replace(data, u=wrong), noise=found)
     with pytest.raises(InputError, match="filter takes a run, got str; load_run"):
         hz.filter("runs/arm", data)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_noise_of_a_fit_is_the_likelier_of_two_ends(monkeypatch):
+    # fails if the descent starts at large forces alone: of a cart with a pendulum it then ends where noise of 1e-11 rad
+    # and large forces explain readings of 0.001 rad
+    config = ModelConfig((True,), "linear", (1.0,), (2.0,), (4.0,), (0.0,), 0.2, potential_width=0)
+    t = (H * torch.arange(9)).double()
+    data = Trajectories.of(t, t.sin()[:, None], (9,), names=("a",), units=("rad",), angles=(True,))
+    ends = []
+
+    def likelihood(_run):
+        def cost(x):
+            # The force x_1 has two ends: a likely one at e^-6, and one above, where every descent from above ends.
+            ends.append(float(x[1]))
+            return min(float((x[1] + 6) ** 2), float((x[1] - 2) ** 2) + 1)
+
+        return cost
+
+    monkeypatch.setattr(filtering, "_likelihood", likelihood)
+    found = noise_of(run_of(ContactLagrangian(config), data, 1e-3))
+    assert math.log(found.momentum[0]) == pytest.approx(-6, abs=0.1)
+    assert max(ends) >= 2  # the large forces are tried, too
 
 
 def test_the_steps_that_lead_to_each_sample():
