@@ -49,6 +49,6 @@ def with_sticking(search: Any, trial: Trial) -> Trial:
         name: max(x, breakaway.get(name.split("[")[0], -math.inf)) if x != 0 else x for name, x in trial.values.items()
     }
     sticking = fitter.fit(trial.taken, values, trial.length, trial, 2 * ITERATIONS)
-    if sticking is None or trial.replaces(sticking):
-        return trial
-    return search.settled(search.finer(sticking))
+    # A step in which the joint stops is less accurate than the steps of the smooth model.
+    sticking = sticking and search.finer(sticking)
+    return trial if sticking is None or trial.replaces(sticking) else search.settled(sticking)

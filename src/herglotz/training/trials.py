@@ -18,7 +18,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import input_terms_of
 from herglotz.data.noise import AT_THE_NOISE, coarse, precision, relative_spread
-from herglotz.data.smoothing import smoothed
+from herglotz.data.smoothing import slopes, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import keys_of
@@ -236,7 +236,9 @@ class Fitter:
         terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
-        first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(data)}
+        known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
+        self.known = self.smooth, self.precision, self.spread = known
+        first = {"damping.rate": (base.rate,), "kinetic.base.log_diagonal": masses(self.smooth)}
         base = started(base, data, first, settings)
         self.base, self.settings = base, settings
         model = build_model(base, settings, "none")
@@ -262,8 +264,6 @@ class Fitter:
         self.grids = Grids(data) if like is None else like.grids
         self.floor = ALIKE * EXACT["float64"] * max(base.scale)
         self.offered = len(every_offer)
-        known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
-        self.known = self.smooth, self.precision, self.spread = known
         self.compared: list[Compared] = []
 
     @property
@@ -389,9 +389,14 @@ def is_precise(data: Trajectories) -> bool:
 
 
 def masses(data: Trajectories) -> tuple[float, ...]:
-    """Start of log √m_i for all masses but the first, which is 1, so that all q_i/balance_i weigh the same."""
-    balance = data.balance.double()
-    return tuple((balance[0] / balance[1:]).log().tolist())
+    """Start of log √m_i for all masses but the first, which is 1: √m_i q̈_i has the same spread for all coordinates.
+
+    Positions would not do, because a coordinate that drifts goes far without a force. Accelerations count as at least
+    the spread of the positions over the squared duration, so that no mass is infinite.
+    """
+    least = data.balance.double() / max(float(one.t[-1] - one.t[0]) for one in data) ** 2
+    spread = slopes(data, slopes(data, data.q.double())).std(0).maximum(least)
+    return tuple((spread[0] / spread[1:]).log().tolist())
 
 
 def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
