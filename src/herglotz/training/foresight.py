@@ -3,7 +3,8 @@
 Held-out time says nothing about longer motion. Around the fit the cost is quadratic with A = JᵀJ: start states and
 parameters have the covariance A⁻¹, and a free run with sensitivities Z changes by Z δ. A term that the fit does not
 have may act all the same. The Bayesian information criterion leaves a term out if the cost would fall by less than
-½ log N: the term may be as large as √(log N) of its standard deviations, and all other unknowns follow.
+½ log N: the term may be as large as √(log N) of its standard deviations, and all other unknowns follow. Unseen samples
+that a free run meets to the noise count in A: a force that they would show is no larger.
 
 Free runs go on from the end of the training part for `TURNS` turns of the motion or over the whole unseen part,
 whichever is longer; recorded inputs are repeated where there are no more. Samples do not count where the uncertainty of
@@ -20,12 +21,14 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.checks import MIN_SAMPLES
+from herglotz.data.noise import AT_THE_NOISE
 from herglotz.models import ContactLagrangian
 from herglotz.models.config import POWERS
 from herglotz.models.drag import input_forces
 from herglotz.progress import beat
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
+from herglotz.training.following import HALF, unexplained
 from herglotz.training.free_run import continued
 from herglotz.training.look import Look
 from herglotz.training.named_terms import (
@@ -120,10 +123,13 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     if ahead is None or path is None:
         return Foresight(math.inf, math.inf, 0.0, "", runs.horizon, False)
     spread = task.data.q.std(0, correction=0).clamp_min(1e-300)
-    Z = ahead.slopes_at_samples(theta, path) / spread[:, None]
+    A, Z = dense(A).double(), ahead.slopes_at_samples(theta, path).double()
     q = ahead.grid.at_samples(path.x[..., : problem.n])
     inside = ((q >= low) & (q <= high)).all(-1)
-    return _summary(dense(A).double(), Z.double(), problem, runs, absent, inside)
+    # Under a controller the unseen part is more of the same: no rest of the inputs tells what they do.
+    free = seen.data.u is None or unexplained(seen.data, states) >= HALF
+    told = A + _of_unseen(Z, q, problem, runs, seen.data) if free else A
+    return _summary(A, told, Z / spread[:, None], problem, runs, absent, inside)
 
 
 @dataclass(frozen=True)
@@ -245,30 +251,57 @@ def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> Named
     return replace(every, one_rate=every.one_rate and c.level != "forced")
 
 
-def _summary(
-    A: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]], inside: Tensor
-) -> Foresight:
-    """The variances of free runs from A of all unknowns and their sensitivities Z, (N, n, P + d), over the spread.
+def _of_unseen(Z: Tensor, q: Tensor, problem: ShootingProblem, runs: _Ahead, data: Trajectories) -> Tensor:
+    """JᵀJ of those unseen samples of `data` that free runs, at q with sensitivities Z (N, n, P + d), meet to the noise.
 
-    Only samples `inside` the recorded range, (N,) bool, count.
+    A run that misses more shows that a force is missing.
     """
+    found = Z.new_zeros(2 * [problem.P + problem.grid.segments * problem.d])
+    unseen = runs.beyond.to(q.device) & (runs.rows >= 0)
+    for segment, rows in zip(runs.segments, torch.arange(len(q)).split(list(runs.data.lengths)), strict=True):
+        rows = rows[unseen[rows].cpu()]
+        at = runs.rows[rows]
+        there = torch.ones_like(q[rows]) if data.observed is None else data.observed[at]
+        r = there * (q[rows] - data.q[at]) / problem.deviations
+        if float(r.square().sum()) <= AT_THE_NOISE**2 * float(there.sum()):
+            J = (Z[rows] * (there / problem.deviations)[..., None]).flatten(0, 1)
+            own = _own(problem, segment)
+            found[own[:, None], own] += J.T @ J
+    return found
+
+
+def _own(problem: ShootingProblem, segment: int) -> Tensor:
+    """Places of the parameters and of the start state of a segment among the unknowns."""
     P, d = problem.P, problem.d
+    return torch.cat([torch.arange(P), torch.arange(P + segment * d, P + (segment + 1) * d)])
+
+
+def _summary(
+    A: Tensor, told: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]],
+    inside: Tensor,
+) -> Foresight:  # fmt: skip
+    """The variances of free runs from their sensitivities Z (N, n, P + d) over the spread, and JᵀJ of all unknowns.
+
+    A is JᵀJ of the training part, `told` that with the unseen samples. Only samples `inside` the recorded range, (N,)
+    bool, count.
+    """
+    P = problem.P
     names = [name for name, at in absent.items() for _ in at]
-    C, follow = _open(A, absent, problem)
+    C, follow = _open(told, absent, problem)
     start, parameters, hidden = [], [], []
     for segment, z in zip(runs.segments, Z.split(list(runs.data.lengths)), strict=True):
-        own = torch.cat([torch.arange(P), torch.arange(P + segment * d, P + (segment + 1) * d)])
+        own = _own(problem, segment)
         state = inverse_of(A[own[P:]][:, own[P:]])
         start.append(((z[..., P:] @ state) * z[..., P:]).sum(-1).mean(-1))
         parameters.append(((z @ C[own][:, own]) * z).sum(-1).mean(-1))
         hidden.append((z @ follow[own]).square().mean(1))
     of_start, of_all, by_term = torch.cat(start), torch.cat(parameters), torch.cat(hidden)
-    told = runs.beyond & inside & (of_start.sqrt() < UNCERTAIN)
-    by_term = by_term[told].sum(0) / max(1, int(told.sum()))
+    counts = runs.beyond & inside & (of_start.sqrt() < UNCERTAIN)
+    by_term = by_term[counts].sum(0) / max(1, int(counts.sum()))
     worst = int(by_term.argmax()) if names else -1
     unseen = runs.beyond & (runs.rows >= 0)
     return Foresight(
-        start=_root(of_start[unseen]), parameters=_root(of_all[told]), horizon=runs.horizon, reached=True,
+        start=_root(of_start[unseen]), parameters=_root(of_all[counts]), horizon=runs.horizon, reached=True,
         hidden=float(by_term[worst].sqrt()) if names else 0.0, name=names[worst] if names else "",
     )  # fmt: skip
 

@@ -26,6 +26,32 @@ def test_a_recording_that_is_too_short_says_so(steps, verdict):
     assert run.metrics["verdict"].startswith(verdict), run.metrics["verdict"]
 
 
+def _driven_axis(seed: int, count: int = 150, h: float = 0.09) -> Trajectories:
+    """x″ = −0.76 x′ + 0.6 u in three recordings, u three sines, held; exact steps with noise of 2 % of the spread."""
+    make, k = torch.Generator().manual_seed(seed), torch.arange(count, dtype=torch.float64)
+    random = lambda: torch.rand(3, generator=make, dtype=torch.float64)  # noqa: E731
+    inputs, parts, decay = [], [], math.exp(-0.76 * h)
+    for _ in range(3):
+        u = 0.5 * torch.sin((0.5 + 2.5 * random()) * (k * h)[:, None] + 6.28 * random()).sum(1)
+        x, v, q = 0.0, 0.0, []
+        for to in (0.6 / 0.76 * u).tolist():
+            q.append(x)
+            x, v = x + to * h + (v - to) * (1 - decay) / 0.76, to + (v - to) * decay
+        inputs.append(u)
+        parts.append(torch.tensor(q).double() + 0.0065 * torch.randn(count, generator=make, dtype=torch.float64))
+    return Trajectories.of((k * h).repeat(3), torch.cat(parts), 3 * (count,), u=torch.cat(inputs)[:, None], hold="zero")
+
+
+def test_unseen_samples_that_are_met_tell_of_hidden_forces(monkeypatch):
+    # fails if a force that the unseen part would show may still act: a servo axis, met to the noise over all unseen
+    # time, was refused with exit code 3 for a force x⁵ that nothing shows
+    data = _driven_axis(5)
+    assert fit(data, progress=False).metrics["verdict"].startswith("fits to the noise")
+    # The unseen part is missed, and counts for nothing.
+    monkeypatch.setattr(foresight, "AT_THE_NOISE", 0.0)
+    assert fit(data, progress=False).metrics["verdict"].startswith("does not fit: too little was recorded")
+
+
 def test_runs_that_go_on_by_one_sample_are_followed():
     # fails if a run of two samples, the last known one and the next, is taken for a trajectory: the fit then ended with
     # "trajectory 0 has 2 samples, at least 3 are needed" (27 samples at h = 1)
