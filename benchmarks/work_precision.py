@@ -1,12 +1,16 @@
-"""Error against cost of learned steppers in C: `python benchmarks/work_precision.py [--scenes a,b] [--seeds 5]`.
+"""Error against cost of learned steppers in C: `python benchmarks/work_precision.py [--scenes a,b]`.
 
-Two scenes over several training seeds, into headline.json and .md: learned kicks on the damped pendulum and a learned
-equation on the double pendulum, in float64 and float32; beside them neural ODEs trained on the same motions (stepped by
-RK4 and DOP853), and RK4, DOP853 (adaptive and with equal steps) and leapfrog on the true equations. Needs scipy. A seed
-draws the training motions and the first weights of every network.
+Of eight scenes the fitted model, and the same data with terms more and less: error and cost of a step of each.
+Written after each scene, beside those of earlier runs: work_precision.json and .md. `--page` only puts the table into
+docs/work_precision.md, where it stands between `<!-- terms -->` and `<!-- /terms -->`; nothing there is typed in.
 
 Error: largest |q − exact| at 4 times up to T, of motions from unseen starts (median, and 95 % of them), in units of q.
-Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn). Of each
+Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn).
+
+`--headline` measures two scenes over several training seeds instead, into headline.json and .md: learned kicks on the
+damped pendulum and a learned equation on the double pendulum, in float64 and float32; beside them neural ODEs trained
+on the same motions (stepped by RK4 and DOP853), and RK4, DOP853 (adaptive and with equal steps) and leapfrog on the
+true equations. Needs scipy. A seed draws the training motions and the first weights of every network. Of each
 starting set the first half chooses a setting, the second half judges it; what it is compared with is the cheapest rival
 that is as accurate on the judging half itself, a choice no user can make.
 """
@@ -20,11 +24,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
 from benchmarks.work_precision_rivals import classical, equation, neural
-from benchmarks.work_precision_ways import SETUPS, Timed, costs, kicks, prepare
+from benchmarks.work_precision_ways import SETUPS, TOLD, Timed, costs, kicks, learned, prepare
 
+PAGE = harness.ROOT / "docs" / "work_precision.md"
 WANTED = {"damped_pendulum": (1e-2, 1e-3, 1e-4, 2e-5), "double_pendulum": (2e-2, 5e-3, 1e-3)}  # errors of the headline
 RIVALS = (
     ("neural ODE", lambda p: p["kind"].startswith("neural ODE")),
@@ -35,13 +42,57 @@ RIVALS = (
 )
 
 
+# What a fit with another set of terms lacks or has besides, where its label does not say it.
+CHANGED = {"level conservative": "no damping", "level linear": "one rate, no drag",
+           "level affine": "drag besides, with its network"}  # fmt: skip
+TERMS = {
+    "damped_oscillator": "K, V quadratic, γ, correction",
+    "damped_pendulum": "K, V network, γ, correction",
+    "double_pendulum": "K(q) network, V network, γ, correction",
+    "parachute": "K, V, γ, λ, drag network, correction",
+    "kepler": "K, V of r, γ, correction",
+    "chain": "K, V of stretches, γ",
+    "driven_pendulum": "K, V network, γ, friction, input, correction",
+    "rigid_body": "K(q) network, V network, γ, correction",
+}
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The results file."""
+    measured = f"Commit {result['commit']}, {result['machine']['cores']} cores, one thread."
+    return "\n".join(["# What a term costs and brings", "", measured, "", *terms(result["scenes"])])
+
+
+def terms(scenes: dict[str, list[dict]]) -> list[str]:
+    """Each scene's own model at the step of its data, the first point, and what other terms cost and bring."""
+    rows = []
+    for name, (own, *others) in scenes.items():
+        rows.append([f"**{name}**", f"**{TERMS[name]}**", f"{own['us_per_time'] * own['h']:.2g}", _error(own), ""])
+        for p in others:
+            label = p["kind"].removeprefix("learned, ")
+            worse = f"{p['median'] / own['median']:.2g}" if p["median"] and own["median"] else "–"
+            # A stored point that has no C was stepped by PyTorch.
+            cost = f"{p['us_per_time'] * p['h']:.2g}{' (PyTorch)' if p['artefact'] == 'eager' else ''}"
+            times = f"{p['us_per_time'] / own['us_per_time']:.2g}, {worse}"
+            rows.append(["", CHANGED.get(label, label), cost, _error(p), times])
+    head = ("scene", "terms", "µs a step", "median error", "times the scene's own: cost, error")
+    return harness.table(head, rows)
+
+
+def _error(p: dict) -> str:
+    return "fails" if p["median"] is None else f"{p['median']:.2g}"
+
+
 def study(name: str, seeds: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Every seed's learned and neural settings and the classical ones, timed together; the ratios of each seed."""
+    setup = SETUPS[name]
+    if name == "double_pendulum":
+        setup = replace(setup, fit={**setup.fit, **TOLD})
     timed: list[Timed] = []
     seconds = []
     for seed in range(seeds):
         say(f"seed {seed}")
-        case = prepare(SETUPS[name], seed)
+        case = prepare(setup, seed)
         mine = kicks(case) + equation(case) + neural(case)
         timed += [replace(t, point={**t.point, "seed": seed}) for t in mine]
         seconds.append(case.seconds)
@@ -49,7 +100,7 @@ def study(name: str, seeds: int, say: Callable[[str], None]) -> dict[str, Any]:
             timed += classical(case)
     found = costs(timed)
     rows = {e: [chosen(found, e, w, seeds) for w in WANTED[name]] for e in ("median", "q95")}
-    return {"seeds": seeds, "seconds": seconds, "rows": rows}
+    return {"seeds": seeds, "seconds": seconds, "rows": rows, "points": found}
 
 
 def chosen(points: list[dict], error: str, wanted: float, seeds: int) -> dict[str, Any]:
@@ -101,18 +152,53 @@ def study_table(name: str, result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def main(argv: list[str] | None = None) -> None:
-    parser = harness.parser(__doc__)
-    parser.add_argument("--scenes", help="with commas (default: both)")
-    parser.add_argument("--seeds", type=int, default=5, help="training seeds (default 5)")
-    arguments = parser.parse_args(argv)
-    path = harness.json_file(arguments, "headline")
+def measure_headline(path: Path, names: list[str], seeds: int) -> None:
+    """Two scenes over several seeds, into headline.json and .md; the points themselves are not stored."""
     scenes = harness.load(path, {"scenes": {}})["scenes"]
-    for name in harness.chosen(parser, arguments.scenes, SETUPS, "scene"):
-        found = study(name, arguments.seeds, lambda what, name=name: print(name, what, flush=True))
-        scenes[name] = found | {"measured": harness.conditions()}
+    for name in names:
+        found = study(name, seeds, lambda what, name=name: print(name, what, flush=True))
+        scenes[name] = {k: v for k, v in found.items() if k != "points"} | {"measured": harness.conditions()}
         tables = [line for scene, one in scenes.items() for line in study_table(scene, one)]
         harness.store(path, {"scenes": scenes}, "\n".join(["# Cost of the others over the learned stepper's", *tables]))
+
+
+def measure_scene(name: str, result: dict[str, Any], say: Callable[[str], None]) -> None:
+    """The models of a scene, into the result."""
+    say("fit")
+    timed = learned(prepare(SETUPS[name]))
+    say("timing")
+    result["scenes"][name] = costs(timed)
+
+
+def page() -> str:
+    """docs/work_precision.md with the table of terms as the stored results have it."""
+    begin, end = "<!-- terms -->\n", "<!-- /terms -->\n"
+    before, rest = PAGE.read_text().split(begin)
+    lines = terms(harness.load(harness.RESULTS / "work_precision.json", {})["scenes"])
+    return before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1]
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__)
+    parser.add_argument("--scenes", help="with commas (default: all)")
+    parser.add_argument("--headline", action="store_true", help="two scenes, several training seeds")
+    parser.add_argument("--seeds", type=int, default=5, help="training seeds of the headline (default 5)")
+    parser.add_argument("--page", action="store_true", help="only write the table of terms into the page")
+    arguments = parser.parse_args(argv)
+    if arguments.page:
+        PAGE.write_text(page())
+        return
+    names = harness.chosen(parser, arguments.scenes, WANTED if arguments.headline else SETUPS, "scene")
+    path = harness.json_file(arguments, "headline" if arguments.headline else "work_precision")
+    if arguments.headline:
+        measure_headline(path, names, arguments.seeds)
+        return
+    result = {**harness.conditions(), "scenes": harness.load(path, {"scenes": {}})["scenes"]}
+    with tqdm(names, disable=None) as bar:
+        for name in bar:
+            measure_scene(name, result, lambda what, name=name: bar.set_postfix_str(f"{name}: {what}"))
+            result["scenes"] = {name: result["scenes"][name] for name in SETUPS if name in result["scenes"]}
+            harness.store(path, result, markdown(result))
 
 
 if __name__ == "__main__":

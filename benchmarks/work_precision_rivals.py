@@ -23,6 +23,7 @@ from benchmarks.harness import compiled, seconds
 from benchmarks.peers.rollouts import rk4
 from benchmarks.work_precision_ways import CHECKS, Case, Setup, Timed, judged
 from herglotz.codegen.c_compiler import FLAGS
+from herglotz.data import simulate
 from herglotz.stepping import State
 from herglotz.training import levenberg_marquardt
 from herglotz.tune.cost import Timed as Timing
@@ -30,7 +31,6 @@ from herglotz.tune.cost import Timed as Timing
 TIMED, PER = 16, 4e-3  # motions and seconds of one timing, at least: far above the resolution of the clock
 # Numbers of SYSTEM in work_precision.c.
 SYSTEMS = {"damped_pendulum": 0, "double_pendulum": 1}
-# The same for a network.
 NETWORK = 2
 # Numbers of work_precision.c.
 METHODS = {"RK4": 0, "DOP853": 1, "leapfrog": 2, "DOP853 fixed": 3}
@@ -229,7 +229,8 @@ def classical(case: Case) -> list[Timed]:
         # Leapfrog is a method for separable Hamiltonians.
         for method in METHODS if name == "damped_pendulum" else [m for m in METHODS if m != "leapfrog"]:
             for x in _settings(method, dtype):
-                point = {"kind": f"{method}, true equations", "setting": _label(method, x, setup, dtype)}
+                label = _label(method, x, setup, dtype)
+                point = {"kind": f"{method}, true equations", "setting": label, "dtype": dtype}
                 found.append(_classic(point, library, case, y, method, x))
     return found
 
@@ -259,16 +260,18 @@ def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x
 def neural(case: Case) -> list[Timed]:
     """Neural ODEs of several sizes, by RK4 and DOP853."""
     setup = case.setup
+    size = {"trajectories": setup.trajectories, "steps": setup.steps, "h": setup.h, "seed": case.seed}
+    data = simulate(setup.scene, **size, keep_state=True)
     y = torch.cat([case.start.q, setup.scene.velocity(*case.start)], -1)
     found, began = [], time.process_time()
     for width, layers in setup.neural:
-        weights = train_neural_ode(case.data, setup, width, layers, setup.neural_iterations, case.seed)
+        weights = train_neural_ode(data, setup, width, layers, setup.neural_iterations, case.seed)
         for dtype in ("float64", "float32"):
             library = Native(setup.name, dtype, weights, setup.scene.dof)
             for method in ("RK4", "DOP853"):
                 for x in _settings(method, dtype)[:7]:
                     label = f"{width} × {layers}, {_label(method, x, setup, dtype)}"
-                    point = {"kind": f"neural ODE, {method}", "setting": label}
+                    point = {"kind": f"neural ODE, {method}", "setting": label, "dtype": dtype}
                     found.append(_classic(point, library, case, y, method, x))
     case.seconds["neural ODE"] = time.process_time() - began
     return found
@@ -280,7 +283,7 @@ def equation(case: Case) -> list[Timed]:
     For two links told as such; the entry is the learned model's, from two positions.
     """
     setup, model = case.setup, case.run.model
-    if setup.name != "double_pendulum":
+    if setup.name != "double_pendulum" or not case.run.decided.features:
         return []
     constants, found = constants_of(model), []
     y = torch.cat([case.entry.q, _velocity(constants, case.entry)], -1)
@@ -289,7 +292,7 @@ def equation(case: Case) -> list[Timed]:
         sizes = {"RK4": (4, 5, 6, 7, 8, 10, 12, 16), "DOP853 fixed": (2, 3, 4)}
         for method, x in ((method, x) for method, steps in sizes.items() for x in steps):
             h, words = setup.T / CHECKS / x, method.replace(" fixed", ", equal steps")
-            point = {"kind": "learned equation", "setting": f"{words}, h {h:.3g}, C {dtype}"}
+            point = {"kind": "learned equation", "setting": f"{words}, h {h:.3g}, C {dtype}", "dtype": dtype, "h": h}
             found.append(_classic(point, library, case, y, method, x))
     return found
 

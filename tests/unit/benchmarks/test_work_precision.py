@@ -121,3 +121,26 @@ def test_the_learned_equation_is_that_of_the_model():
     plain = rivals.Native("double_pendulum", "float64", dof=2)
     other, _ = rivals.Motions(plain, torch.cat([q, v], -1), 0.1, 1, "RK4", 100).made()
     assert float((other - wanted).abs().max()) > 1e-3
+
+
+def test_the_page_holds_what_the_results_hold():
+    # fails if results are stored anew and `work_precision.py --page` is not run, or a number is typed in
+    assert work_precision.PAGE.read_text() == work_precision.page(), "run python benchmarks/work_precision.py --page"
+
+
+def test_what_a_term_costs_is_against_the_scenes_own():
+    # fails if a ratio is turned over, or another scene's model is compared with
+    def point(kind, us, error, **more):
+        return {"kind": kind, "setting": kind[9:] + ", h 0.5, C float64", "us_per_time": us, "median": error, "h": 0.5,
+                "dtype": "float64", "artefact": "C", **more}  # fmt: skip
+
+    own = {"setting": "own model"}
+    scenes = {
+        "kepler": [point("learned", 4.0, 1e-3, **own), point("learned, level conservative", 2.0, 0.1),
+                   point("learned, no correction", 1.0, None)],
+        "chain": [point("learned", 8.0, 1e-2, **own), point("learned, level conservative", 4.0, 0.1)],
+    }  # fmt: skip
+    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in work_precision.terms(scenes)[2:]]
+    assert [row[1] for row in rows if not row[0]] == ["no damping", "no correction", "no damping"]
+    assert [row[2:] for row in rows] == [["2", "0.001", ""], ["1", "0.1", "0.5, 1e+02"], ["0.5", "fails", "0.25, –"],
+                                         ["4", "0.01", ""], ["2", "0.1", "0.5, 10"]]  # fmt: skip
