@@ -42,13 +42,14 @@ def _driven_axis(seed: int, count: int = 150, h: float = 0.09) -> Trajectories:
     return Trajectories.of((k * h).repeat(3), torch.cat(parts), 3 * (count,), u=torch.cat(inputs)[:, None], hold="zero")
 
 
-def test_unseen_samples_that_are_met_tell_of_hidden_forces(monkeypatch):
+@pytest.mark.parametrize(("name", "value"), [("AT_THE_NOISE", 0.0), ("unexplained", lambda *_: 0.0)])
+def test_unseen_samples_that_are_met_tell_of_hidden_forces(name, value, monkeypatch):
     # fails if a force that the unseen part would show may still act: a servo axis, met to the noise over all unseen
-    # time, was refused with exit code 3 for a force x⁵ that nothing shows
+    # time, was refused with exit code 3 for a force x⁵ that nothing shows; or if that counts where it tells nothing
     data = _driven_axis(5)
     assert fit(data, progress=False).metrics["verdict"].startswith("fits to the noise")
-    # The unseen part is missed, and counts for nothing.
-    monkeypatch.setattr(foresight, "AT_THE_NOISE", 0.0)
+    # The unseen part is missed, or its inputs follow from the state as under a controller, and counts for nothing.
+    monkeypatch.setattr(foresight, name, value)
     assert fit(data, progress=False).metrics["verdict"].startswith("does not fit: too little was recorded")
 
 
