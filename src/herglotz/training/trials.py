@@ -389,13 +389,13 @@ def is_precise(data: Trajectories) -> bool:
 
 
 def masses(data: Trajectories) -> tuple[float, ...]:
-    """Start of log √m_i for all masses but the first, which is 1: √m_i q̈_i has the same spread for all coordinates.
+    """Start of log √m_i for all masses but the first, which is 1: √m_i q̇_i has the same spread for all coordinates.
 
-    Positions would not do, because a coordinate that drifts goes far without a force. Accelerations count as at least
-    the spread of the positions over the squared duration, so that no mass is infinite.
+    Positions would not do, because a coordinate that drifts goes far without a force. Velocities count as at least the
+    spread of the positions over the duration, so that no mass is infinite.
     """
-    least = data.balance.double() / max(float(one.t[-1] - one.t[0]) for one in data) ** 2
-    spread = slopes(data, slopes(data, data.q.double())).std(0).maximum(least)
+    least = data.balance.double() / max(float(one.t[-1] - one.t[0]) for one in data)
+    spread = slopes(data, data.q.double()).std(0).maximum(least)
     return tuple((spread[0] / spread[1:]).log().tolist())
 
 
