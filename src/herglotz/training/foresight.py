@@ -142,6 +142,11 @@ class _Ahead:
     beyond: Tensor  # (N,) bool: after the training part
     horizon: float
 
+    @property
+    def unseen(self) -> Tensor:
+        """Samples of the unseen part, (N,) bool."""
+        return self.beyond & (self.rows >= 0)
+
     @classmethod
     def of(cls, train: Trajectories, data: Trajectories, problem: ShootingProblem, turn: float) -> _Ahead:
         """Runs over the rest of the data, and on for two turns of the motion."""
@@ -257,9 +262,9 @@ def _of_unseen(Z: Tensor, q: Tensor, problem: ShootingProblem, runs: _Ahead, dat
     A run that misses more shows that a force is missing.
     """
     found = Z.new_zeros(2 * [problem.P + problem.grid.segments * problem.d])
-    unseen = runs.beyond.to(q.device) & (runs.rows >= 0)
-    for segment, rows in zip(runs.segments, torch.arange(len(q)).split(list(runs.data.lengths)), strict=True):
-        rows = rows[unseen[rows].cpu()]
+    every = torch.arange(len(q), device=q.device).split(list(runs.data.lengths))
+    for segment, rows in zip(runs.segments, every, strict=True):
+        rows = rows[runs.unseen[rows]]
         at = runs.rows[rows]
         there = torch.ones_like(q[rows]) if data.observed is None else data.observed[at]
         r = there * (q[rows] - data.q[at]) / problem.deviations
@@ -299,9 +304,8 @@ def _summary(
     counts = runs.beyond & inside & (of_start.sqrt() < UNCERTAIN)
     by_term = by_term[counts].sum(0) / max(1, int(counts.sum()))
     worst = int(by_term.argmax()) if names else -1
-    unseen = runs.beyond & (runs.rows >= 0)
     return Foresight(
-        start=_root(of_start[unseen]), parameters=_root(of_all[counts]), horizon=runs.horizon, reached=True,
+        start=_root(of_start[runs.unseen]), parameters=_root(of_all[counts]), horizon=runs.horizon, reached=True,
         hidden=float(by_term[worst].sqrt()) if names else 0.0, name=names[worst] if names else "",
     )  # fmt: skip
 
