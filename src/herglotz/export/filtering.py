@@ -87,9 +87,7 @@ def input_at(model: ContactLagrangian, data: Trajectories, row: int, part: Tenso
     return u[0]
 
 
-def momentum_at(
-    model: ContactLagrangian, data: Trajectories, row: int, longest: float
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+def momentum_at(model: ContactLagrangian, data: Trajectories, row: int, longest: float) -> tuple[Tensor, Tensor]:
     """The momentum (n,) with which the model moves to the next sample, and its derivative (n, n) by the next sample.
 
     FL⁻ of both samples is the momentum of a single step; it also counts where no motion of `parts_of` steps arrives.
