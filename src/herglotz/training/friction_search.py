@@ -1,4 +1,6 @@
-"""The dry friction of a model that a search has found: no friction injects energy, and friction can hold a joint still.
+"""The dissipation of a model that a search has found.
+
+No dry friction injects energy, dry friction can hold a joint still, and damping may depend on s.
 
 `search` is a `herglotz.training.search.Search`.
 """
@@ -9,10 +11,12 @@ import math
 from dataclasses import replace
 from typing import Any
 
+from herglotz.models.config import POWERS
+from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.named_terms import DRY
 from herglotz.training.offers import standing
 from herglotz.training.task import LEAST_GRIP
-from herglotz.training.trials import ITERATIONS, Trial
+from herglotz.training.trials import ITERATIONS, Trial, Variant
 
 # Amplitude of Stribeck friction: the excess of breakaway over Coulomb friction.
 EXCESS = "friction.breakaway"
@@ -52,3 +56,26 @@ def with_sticking(search: Any, trial: Trial) -> Trial:
     # A step in which the joint stops is less accurate than the steps of the smooth model.
     sticking = sticking and search.finer(sticking)
     return trial if sticking is None or trial.replaces(sticking) else search.settled(sticking)
+
+
+@inside()
+def with_dissipation(search: Any, found: Trial, best: Trial) -> Trial:
+    """A model whose damping depends on s if held-out time asks for it, otherwise `found`.
+
+    A search is worth its time where s² makes a better model of `best`, the best model by the score, or where `best`
+    follows nothing for long. The second search starts with s²: where s and its coefficient are 0, the motion changes
+    with neither.
+    """
+    if found.at_the_noise or search.config.translations or search.config.sticking:
+        return found
+    part(MORE_TERMS)
+    fitter, lowest = search.fitter(Variant(2, dissipation=tuple(POWERS))), next(iter(POWERS))
+    asked = fitter.fit(best.taken | {lowest}, best.values, best.length, best, 2 * ITERATIONS)
+    if best.whole and (asked is None or not asked.replaces(best)):
+        return found
+    for taken in (fitter.simple, fitter.simple | {lowest}):
+        if (other := search.climbed(fitter, taken, {})) is not None:
+            found = search.better(found, other) or found
+            if other.at_the_noise:
+                break
+    return found

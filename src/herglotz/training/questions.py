@@ -15,13 +15,11 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from herglotz.models.config import POWERS
 from herglotz.models.drag import input_columns
-from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.acting_inputs import asked_terms, taken_terms
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
-from herglotz.training.trials import ITERATIONS, Trial, Variant
+from herglotz.training.trials import Trial
 
 
 class Questions:
@@ -47,12 +45,12 @@ class Questions:
             asked = self.best is not None and self.best.whole
             if asked and any([self.zeros(), self.how_inputs_hold(by_residuals=True)]):
                 self.read.full = self.best
-        self.best = _searched(self.read)
+        self.best = self.read.run()
         # Terms that made up for zeros or another hold are searched anew.
         if not asked and self.zeros():
-            self.best = self.read.better(self.best, _searched(self.read))
+            self.best = self.read.better(self.best, self.read.run())
         if not asked and self.how_inputs_hold():
-            self.best = self.read.better(self.best, _searched(self.read))
+            self.best = self.read.better(self.best, self.read.run())
 
     def zeros(self) -> bool:
         """Find zeros of sensors that differ between recordings; True if the model is better with them."""
@@ -92,7 +90,7 @@ class Questions:
             return
         recorded = self.wanted, self.read
         read = self.read.driven_by(terms)
-        found = _searched(read)
+        found = read.run()
         if found is None or not found.replaces(self.best):
             return
         self._drive(terms, self.wanted, read, found)
@@ -107,7 +105,7 @@ class Questions:
         for hold, left in tried:
             wanted, read = (x.of(replace(x.data, hold=hold)) for x in recorded)
             read = read.driven_by(left)
-            if (found := _searched(read)) and self.read.better(self.best, found) is found:
+            if (found := read.run()) and self.read.better(self.best, found) is found:
                 self.hold = hold
                 self._drive(left, wanted, read, found)
 
@@ -132,31 +130,3 @@ class Questions:
         if longer and self.best is not None and (hold := self.read.better_hold(self.best, self.holds)):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
-
-
-def _searched(search: Search) -> Trial | None:
-    """The model of a search, with damping that depends on s if that is better."""
-    found = search.run()
-    return found and with_dissipation(search, found)
-
-
-@inside()
-def with_dissipation(search: Search, best: Trial) -> Trial:
-    """A model whose damping depends on s, where held-out time asks for it.
-
-    A search is worth its time where s² makes a better model of this one, or this one follows nothing for long. One
-    starts with s²: where s and its coefficient are 0, the motion changes with neither.
-    """
-    if best.at_the_noise or search.config.translations or search.config.sticking:
-        return best
-    part(MORE_TERMS)
-    fitter, lowest = search.fitter(Variant(2, dissipation=tuple(POWERS))), next(iter(POWERS))
-    asked = fitter.fit(best.taken | {lowest}, best.values, best.length, best, 2 * ITERATIONS)
-    if best.whole and (asked is None or not asked.replaces(best)):
-        return best
-    for taken in (fitter.simple, fitter.simple | {lowest}):
-        if (other := search.climbed(fitter, taken, {})) is not None:
-            best = search.better(best, other) or best
-            if other.at_the_noise:
-                break
-    return best

@@ -24,7 +24,7 @@ from herglotz.progress import FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.following import HALF, unexplained
-from herglotz.training.friction_search import with_sticking, without_injecting_friction
+from herglotz.training.friction_search import with_dissipation, with_sticking, without_injecting_friction
 from herglotz.training.functions import bands
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_terms import start_of
@@ -156,21 +156,21 @@ class Search:
 
     @cached_property
     def flexible(self) -> Trial | None:
-        """The model of all functions but those of the mass, over the longest segments that the model follows.
+        """The model of all functions, over the longest segments that the model follows.
 
-        None if all named terms miss the shortest segments, over which the motion is almost linear in the forces, by
-        more than the noise, and functions foretell no better. Fits of short segments may find a mass that is negative
-        somewhere, with which no longer segment is followed.
+        Functions of the mass join later, as other offers do: the first fit could find a mass that is negative somewhere
+        and follows no longer segment. None if all named terms miss the shortest segments, over which the motion is
+        almost linear in the forces, by more than the noise, and functions foretell no better.
         """
         if (fitter := self.fitter_of_functions(Variant(self.order))) is None:
             return None
         taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
         trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        named = self._every_term
+        trial, named = trial and self.joined(trial), self._every_term
         if trial is None or (named is not None and not named.segments_at_the_noise and not trial.foretells(named)):
             return None
-        while (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
-            trial = longer
+        while (longer := trial.fitter.longer(trial)) is not None:
+            trial = self.joined(longer)
         return trial
 
     @inside()
@@ -189,7 +189,8 @@ class Search:
             best = self.better(best, end)
         if best is None:
             return None
-        return with_sticking(self, without_injecting_friction(self, self.finalist(best, ends)))
+        found = with_sticking(self, without_injecting_friction(self, self.finalist(best, ends)))
+        return with_dissipation(self, found, best)
 
     def of_part(self, found: Trial | None, differ: tuple[Tensor, Tensor] | None) -> Zeroed:
         """The model found in `part`, fitted to all data and settled there.

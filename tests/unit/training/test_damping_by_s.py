@@ -3,7 +3,7 @@
 import math
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from printed_check import compared
 from herglotz.data import Trajectories, simulate
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.questions import with_dissipation
+from herglotz.training.friction_search import with_dissipation
 from herglotz.training.search import Search
 from tests import runge_kutta
 
@@ -92,10 +92,10 @@ def test_it_is_found_where_no_model_without_s_follows_the_data():
     data = recorded(8, 0.0, 0, steps=27, s0=1.5)
     config = FitConfig().resolved(data)
     search = Search(data, estimate_baseline(data), config)
-    first = search.run()
-    assert first is not None
-    assert not first.whole
-    found = with_dissipation(search, first)
+    assert search.first is not None
+    assert not search.first.whole
+    found = search.run()
+    assert found is not None
     assert found.at_the_noise
     assert found.taken >= {"q1^2", "q1^4", "s^2"}
 
@@ -110,5 +110,19 @@ def test_damping_of_a_plain_kind_is_left_as_it_is():
 
 def test_no_damping_by_s_is_asked_for_beside_friction_that_holds():
     # fails if a search begins that can only end in a model of both, which there is none of
-    best, config = SimpleNamespace(at_the_noise=False), SimpleNamespace(translations=(), sticking=True)
-    assert with_dissipation(cast(Any, SimpleNamespace(config=config)), cast(Any, best)) is best
+    found: Any = SimpleNamespace(at_the_noise=False)
+    config = SimpleNamespace(translations=(), sticking=True)
+    assert with_dissipation(SimpleNamespace(config=config), found, found) is found
+
+
+def test_the_best_model_by_the_score_is_asked_for_it():
+    # fails if the model that free runs chose is asked, which may be so poor that s² makes no better model of it
+    data = recorded(3, 0.003, 0, driven=True, steps=60)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    best = search.full
+    assert best is not None
+    assert best.whole
+    poor = best.fitter.fit(best.fitter.simple, {}, best.length, None)
+    assert poor is not None
+    assert with_dissipation(search, poor, poor) is poor
+    assert "s^2" in with_dissipation(search, poor, best).taken

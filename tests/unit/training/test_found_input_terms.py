@@ -222,7 +222,6 @@ class Asked:
 def test_terms_that_stood_for_a_hold_leave(monkeypatch, left):
     # fails if terms stay whose gains were errors of a hold that is no longer the hold, or columns of u and forces of
     # the position are taken for one another
-    monkeypatch.setattr(questions, "with_dissipation", lambda _, found: found)
     monkeypatch.setattr(questions, "asked_terms", lambda search, best: search.input_terms(best))
     asked: Any = object.__new__(questions.Questions)
     asked.wanted = asked.read = Asked(Trajectories.of(*np.ones((2, 9)).cumsum(1), u=np.ones(9), hold="zero"), left=left)

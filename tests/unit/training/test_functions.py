@@ -397,12 +397,29 @@ def test_all_functions_compete_where_none_joins(in_the_well, monkeypatch):
 
 
 def test_all_functions_do_not_compete_where_they_are_no_better_over_the_shortest_segments():
-    # fails if functions are grown to whole recordings of a motion with dry friction, which no sum of waves says better
-    data = recorded(lambda q, v: -q - 0.1 * v - 0.2 * np.sign(v), STARTS, angle=False, parts=8, noise=0.0)
+    # fails if functions are grown to whole recordings of a motion under random kicks, which no sum of waves says better
+    make = np.random.default_rng(0)
+    kicked = lambda q, v: -q - 0.1 * v + make.standard_normal(q.shape)  # noqa: E731
+    data = recorded(kicked, STARTS, angle=False, parts=1, noise=0.0)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     assert search.flexible is None
     of = next(variant for variant in search.fitters if variant.functions)
     assert list(search.fitters[of].problems) == [search.fitters[of].lengths[0]]
+
+
+def test_masses_join_the_functions_that_are_fitted_all_at_once():
+    # fails if the model of all functions has no mass: that of a slider-crank turns with the angle, and no force of the
+    # position and velocity alone has the term v² M′/2 with its sign
+    def acceleration(q, v):
+        slope, bend = np.sin(q) + 0.5 * np.sin(2 * q), np.cos(q) + np.cos(2 * q)
+        return (-slope * bend * v * v - 0.6 * np.sin(q) - 0.05 * v) / (0.5 + slope**2)
+
+    data = recorded(acceleration, STARTS, angle=True, parts=8, h=0.1, noise=0.0)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    every = search.flexible
+    assert every is not None
+    assert every.at_the_noise
+    assert {"mass(q1) 1", "mass(q1) 2"} <= every.taken
 
 
 def test_no_functions_where_named_terms_are_at_the_noise(monkeypatch):

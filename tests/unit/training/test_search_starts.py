@@ -199,7 +199,6 @@ def asked(monkeypatch):
         seen = []
         monkeypatch.setattr(module, "Search", partial(Asked, told=told, seen=seen))
         monkeypatch.setattr(questions, "with_functions", lambda search, best: search.with_functions(best))
-        monkeypatch.setattr(questions, "with_dissipation", lambda _, found: found)
         monkeypatch.setattr(questions, "asked_terms", lambda search, best: search.input_terms(best))
         monkeypatch.setattr(module, "drifts", lambda search: search.answer("drifts"))
         return search(data, base, config, outliers=False, holds=["first", "smooth"]), seen
