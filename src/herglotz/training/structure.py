@@ -134,17 +134,19 @@ def _nothing_named(c: FitConfig) -> bool:
 
 
 def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
-    """The whole dictionary and, for coordinates without an angle, the springs between them alone.
+    """The whole dictionary and, for coordinates without an angle, two smaller ones.
 
-    Springs alone need fewer samples. A dictionary takes part where the samples suffice for its coefficients and where
-    the derivatives take no more than `MAX_NUMBERS`: at 200 samples the whole dictionary up to 14 coordinates, springs
-    up to 22.
+    These are the dictionary of coupled pairs, if the samples tell the pairs, and the springs between all coordinates
+    alone. A dictionary takes part where the samples suffice for its coefficients and where the derivatives take no more
+    than `MAX_NUMBERS`: at 200 samples the whole dictionary up to 14 coordinates, springs up to 22.
     """
     if any(data.angles):
         return [tuple(revolute(data.angles))]
     away = distances(data)
     names = tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
-    return [names, tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))]
+    springs = tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))
+    coupled = coupled_pairs(data) if data.dof > MOST else None
+    return [names, *([] if coupled is None else [terms_between(coupled, data.angles)]), springs]
 
 
 def kept_structure(
