@@ -211,8 +211,8 @@ def search(
 def search_of_many(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
     """The named terms of many coordinates at the noise of whole trajectories; unchanged if no terms are.
 
-    Offers are the dictionary `lengths` of those pairs of coordinates between which a force acts (`coupled_pairs`), and
-    leave the model of all offers.
+    Offers are the dictionary `lengths` and a damper of those pairs of coordinates between which a force acts
+    (`coupled_pairs`), the latter if a kernel can have so many numbers. Offers leave the model of all offers.
     """
 
     def without(reason: str) -> Structure:
@@ -221,9 +221,11 @@ def search_of_many(data: Trajectories, base: Baseline, config: FitConfig, *, out
     data, own = data.to(torch.float64, "cpu"), replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
     if (coupled := coupled_pairs(data)) is None:
         return without("too few samples to find which coordinates are coupled")
-    offered = replace(config, dtype="float64", device="cpu", features=terms_between(coupled, data.angles))
-    wanted = Search(data, own, offered, outliers=outliers)
-    if len(wanted.fitter(Variant(wanted.order)).start) > MAX_PARAMETERS:
+    terms, dampers = terms_between(coupled, data.angles), tuple(f"(v{i + 1} - v{j + 1})" for i, j in coupled)
+    offered = replace(config, dtype="float64", device="cpu", level="forced", features=terms)
+    tried = (Search(data, own, replace(offered, drag=drag), outliers=outliers) for drag in (dampers, ()))
+    wanted = next((x for x in tried if len(x.fitter(Variant(x.order)).start) <= MAX_PARAMETERS), None)
+    if wanted is None:
         return without("too many forces act between coordinates")
     found = wanted.part.full
     found = found and wanted.part.settled(found)
@@ -231,7 +233,7 @@ def search_of_many(data: Trajectories, base: Baseline, config: FitConfig, *, out
         found = wanted.of_part(found, None)[1]
     if found is None or not found.at_the_noise:
         return without("the terms of one coordinate and of two miss the data by more than the noise")
-    return _of_trial(found, data, offered, config, base, wanted.part)
+    return _of_trial(found, data, wanted.config, config, base, wanted.part)
 
 
 def _of_trial(

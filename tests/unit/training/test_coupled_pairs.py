@@ -4,14 +4,32 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import pytest
 import torch
 
-from herglotz.data import simulate
+from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, structure
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.coupled_pairs import coupled_pairs, terms_between
+from herglotz.training.search import Search
 from herglotz.training.structure import many_are_free, search_of_many
+from herglotz.training.trials import Variant
+
+
+def with_dampers(noise=0.003, trajectories=10, steps=40, h=0.1):
+    """Four bodies between two walls, joined by springs and dampers: exact motion by exp(hA), with noise."""
+    make, eye = torch.Generator().manual_seed(0), torch.eye(4, dtype=torch.float64)
+    stretch = torch.cat([eye, 0 * eye[:1]]) - torch.cat([0 * eye[:1], eye])
+    K, C = stretch.mT @ stretch, 0.2 * stretch[1:-1].mT @ stretch[1:-1]
+    step = torch.linalg.matrix_exp(h * torch.cat([torch.cat([0 * eye, eye], 1), torch.cat([-K, -C], 1)]))
+    x = [torch.rand(trajectories, 8, generator=make, dtype=torch.float64) - 0.5]
+    for _ in range(steps):
+        x.append(x[-1] @ step.mT)
+    q = torch.stack(x, 1)[..., :4].flatten(0, 1)
+    q = q + noise * torch.randn(q.shape, generator=make, dtype=q.dtype)
+    t = (h * torch.arange(steps + 1, dtype=torch.float64)).repeat(trajectories)
+    return Trajectories.of(t, q, (steps + 1,) * trajectories)
 
 
 @cache
@@ -87,10 +105,21 @@ def test_terms_that_miss_by_more_than_the_noise_are_no_result():
     assert "miss the data by more than the noise" in found.reason
 
 
-def test_more_numbers_than_a_kernel_takes_are_no_result(monkeypatch):
-    # fails if a search without a kernel begins, whose fits take minutes
-    monkeypatch.setattr(structure, "MAX_PARAMETERS", 30)
+def test_dampers_between_bodies_are_found():
+    # fails if a damper between two bodies is no offer, or if the settings of the fit do not have it
+    damped = with_dampers()
+    found = search_of_many(damped, estimate_baseline(damped), FitConfig().resolved(damped), outliers=False)
+    assert found.config.drag == ("(v1 - v2)", "(v2 - v3)", "(v3 - v4)")
+
+
+@pytest.mark.parametrize(("most", "taken"), [(36, 36), (35, 33), (32, None)])
+def test_numbers_that_a_kernel_takes_are_offered(monkeypatch, most, taken):
+    # fails if a search without a kernel begins, whose fits take minutes, or if terms go with dampers that are too many
+    offered = []
+    monkeypatch.setattr(structure, "MAX_PARAMETERS", most)
+    monkeypatch.setattr(Search, "full", property(lambda self: offered.append(len(self.fitter(Variant(2)).start))))
     data = chain(4)
     found = search_of_many(data, estimate_baseline(data), FitConfig().resolved(data), outliers=False)
     assert found.sigma is None
-    assert "too many forces" in found.reason
+    assert offered == ([] if taken is None else [taken])
+    assert ("too many forces" in found.reason) is (taken is None)
