@@ -30,6 +30,7 @@ def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
     None if there are too few independent samples for the n + 2 coefficients of a coordinate. Samples that share half a
     smoothing window are dependent: their number is divided by the overlap.
     """
+    data = data.to(torch.float64, "cpu")
     local = local_polynomials(data)
     if local is None:
         return None
@@ -43,9 +44,9 @@ def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
     for i in range(n):
         X = torch.cat([q, torch.ones_like(half), v[:, i, None]], 1)
         x = least_squares(X, a[:, i, None])[:, 0]
-        variance = (a[:, i] - X @ x).square().mean() / (1 - (n + 2) / count)
+        variance = float((a[:, i] - X @ x).square().mean()) / (1 - (n + 2) / count)
         others = torch.tensor([j for j in range(n) if j != i])
-        kept[i, prune(X.T @ X / variance / overlap, x, others, worth)[0]] = True
+        kept[i, prune(X.T @ X, x, others, worth * overlap * variance)[0]] = True
     return [(i, j) for i, j in combinations(range(n), 2) if bool(kept[i, j] | kept[j, i])]
 
 
