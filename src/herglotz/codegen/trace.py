@@ -78,7 +78,7 @@ def traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph
     """The function as a graph without classes, repetitions and constant parts, for any batch size.
 
     The function takes and returns tensors whose batch is axis 0, and may differentiate by `torch.func`; `arguments` are
-    examples, with a batch from `example_batch`.
+    examples, with a batch from `example_batch`. Of examples with a batch of 1 the graph holds for one sample alone.
     """
     recorder = Recorder(arguments)
     with torch.no_grad():
@@ -291,9 +291,10 @@ class Recorder(TorchDispatchMode):
         return self.size if x == self.batch else self._called(operator.mul, (self.size, x // self.batch))
 
     def _is_size(self, x: Any) -> bool:
-        """Whether x is a multiple of the example's batch."""
+        """Whether x is a multiple of the example's batch, unless that is 1."""
         return (
-            isinstance(x, int)
+            self.batch > 1
+            and isinstance(x, int)
             and not isinstance(x, bool)
             and 0 < x <= MAX_MULTIPLE * self.batch
             and x % self.batch == 0

@@ -101,6 +101,14 @@ class HeldOut:
 
     def _steps(self, equations: Tensor, sets: Sequence[Sequence[int]]) -> Tensor:
         """Steps of all numbers, (B, C, P), for each of the equations (B, P, P + 1) and each of C sets."""
+        joined = sorted(set().union(*sets))
+        left_out = [[x for x in joined if x not in own] for own in map(frozenset, sets)]
+        most, k, count = max(map(len, left_out)), len(joined), len(sets)
+        # Products of one inverse, from which the solutions of all sets follow, or of a Cholesky factor for each set.
+        if k**3 + count * most**2 * k < count * k**3 / 3:
+            found = self._steps_without(equations, joined, left_out)
+            if found is not None:
+                return found
         P, index = self.rows.shape[-1] - 1, self._index(sets)
         inside = torch.zeros(len(sets), P + 1, dtype=torch.bool, device=index.device).scatter_(1, index, True)[:, :P]
         moved = torch.where(inside, 0.0, self.leaving)  # (C, P)
@@ -108,6 +116,36 @@ class HeldOut:
         b = (equations[..., P, None] + equations[..., :P] @ moved.T).mT.gather(2, at)  # (B, C, k)
         x = -torch.cholesky_solve((b / size)[..., None], factor)[..., 0] / size
         return moved.repeat(len(equations), 1, 1).scatter_add(2, at, torch.where(index < P, x, 0.0))
+
+    def _steps_without(
+        self, equations: Tensor, joined: Sequence[int], left_out: Sequence[Sequence[int]]
+    ) -> Tensor | None:
+        """Steps of all numbers, (B, C, P), in C sets that lack few numbers of a `joined` set; None if that is singular.
+
+        A number that is left out is held at its step `leaving` by a multiplier, the force of a constraint.
+        """
+        own, places = torch.tensor(joined, device=equations.device), {x: i for i, x in enumerate(joined)}
+        (A,), (size,), _ = (x.movedim(1, 0) for x in _scaled(equations, own[None]))  # (B, k, k), (B, k)
+        factor, info = torch.linalg.cholesky_ex(A)
+        if bool(info.any()):
+            return None
+        moved = self.leaving.clone()
+        moved[own] = 0.0
+        b = (equations[..., -1] + equations[..., :-1] @ moved)[:, own] / size
+        inverse = torch.cholesky_inverse(factor)
+        x = -(inverse @ b[..., None])[..., 0]
+        # Places of the numbers that are left out, (C, r), padded with k, which is no place.
+        k, width = len(own), max(map(len, left_out))
+        out = [[*(places[number] for number in numbers), *[k] * (width - len(numbers))] for numbers in left_out]
+        at = torch.tensor(out, device=own.device).reshape(len(left_out), width)
+        response = pad(inverse, (0, 1, 0, 1))[:, at]  # (B, C, r, k + 1)
+        own_response = response.gather(3, at[:, None].expand(*response.shape[:3], width))
+        own_response = own_response + torch.diag_embed((at == k).to(x))
+        wanted = pad(size * self.leaving[own] - x, (0, 1))[:, at]
+        force = torch.linalg.solve_ex(own_response, wanted)[0]  # (B, C, r)
+        found = moved.repeat(len(equations), len(at), 1)
+        found[..., own] = (x[:, None] + (force[..., None, :] @ response)[..., 0, :-1]) / size[:, None]
+        return found
 
     def told(self, sets: Sequence[Sequence[int]]) -> Tensor:
         """The effective share of each number, (C, P): 1 − σ²/τ² for a wave with prior and posterior deviations τ and σ.
@@ -135,6 +173,13 @@ def _factors(equations: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     The factor is NaN if the curvature is not positive definite.
     """
+    A, size, at = _scaled(equations, index)
+    factor, info = torch.linalg.cholesky_ex(A)
+    return torch.where((info == 0)[..., None, None], factor, torch.nan), size, at
+
+
+def _scaled(equations: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Curvatures (B, C, k, k) of sets scaled to a unit diagonal, the scales, and the places."""
     P = equations.shape[1]
     A = equations[..., :P]
     size = A.diagonal(dim1=-2, dim2=-1)
@@ -142,9 +187,7 @@ def _factors(equations: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     A = pad((A / size[..., None] / size[..., None, :]).nan_to_num(nan=-1.0), (0, 1, 0, 1))
     A, there = A[:, index[:, :, None], index[:, None, :]], index < P
     A.diagonal(dim1=-2, dim2=-1).add_(torch.where(there, RIDGE, 1.0))
-    factor, info = torch.linalg.cholesky_ex(A)
-    factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
-    return factor, pad(size, (0, 1), value=1.0)[:, index], index.clamp(max=P - 1).expand(len(A), *index.shape)
+    return A, pad(size, (0, 1), value=1.0)[:, index], index.clamp(max=P - 1).expand(len(A), *index.shape)
 
 
 def blocks(data: Trajectories) -> Tensor:

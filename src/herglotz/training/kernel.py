@@ -55,8 +55,6 @@ SOURCE_PACKAGES = ("models", "mechanics", "stepping", "codegen")
 SOURCE_FILES = ("kernel.py", "parameter_vector.py", "rates.py")
 # Arguments of the C functions that `hz_prepare` sets.
 PREPARED_ARGUMENTS = ("const char *restrict gate", "const double *restrict fixed")
-# Batch sizes for a trace: the first prime above the number of parameters differs from every other axis.
-BATCHES = (101, 211, 431, 1021)
 
 
 class Placed(NamedTuple):
@@ -356,8 +354,10 @@ class _Traced:
 
 
 def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:
-    """Example arguments of these sizes for a trace; θ and `constants` have no batch, and a size of 0 is a scalar."""
-    batch = next(prime for prime in BATCHES if prime > given["theta"])
+    """Example arguments of these sizes for a trace of one sample, because a kernel steps one.
+
+    θ and `constants` have no batch, and a size of 0 is a scalar.
+    """
     make = torch.Generator().manual_seed(0)
     random = lambda *shape: torch.rand(*shape, generator=make, dtype=torch.float64)  # noqa: E731
     found = []
@@ -365,5 +365,5 @@ def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:
         if name in ("theta", "constants"):
             found.append(0.1 + random(size) / 10)
         else:
-            found.append(0.1 + random(batch, size) / 10 if size else 0.1 + random(batch) / 10)
+            found.append(0.1 + random(1, size) / 10 if size else 0.1 + random(1) / 10)
     return tuple(found)

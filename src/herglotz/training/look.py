@@ -30,7 +30,9 @@ from herglotz.training.stages import Stages
 from herglotz.training.structure import (
     Structure,
     kept_structure,
+    many_are_free,
     search,
+    search_of_many,
     start_of_features,
     structure_is_free,
     structured,
@@ -238,9 +240,15 @@ def _with_terms(
 ) -> Look:
     """The look with named terms that follow trajectories, with a dictionary of features, or with the baseline alone."""
     kept, base, settings = seen.kept, seen.base, seen.settings
-    if terms_are_free(kept, user_settings):
+    few, many = terms_are_free(kept, user_settings), many_are_free(kept, user_settings)
+    if few or many:
         plain = replace(settings, sticking=user_settings.sticking)
-        find = lambda: known or search(kept, base, plain, outliers=seen.outliers, holds=holds)  # noqa: E731
+
+        def find() -> Structure:
+            if few:
+                return known or search(kept, base, plain, outliers=seen.outliers, holds=holds)
+            return search_of_many(kept, base, plain, outliers=seen.outliers)
+
         found = kept_structure("terms", find, base, settings, stages)
         seen = replace(seen, structure=found.reason, found=found)
         # Where angles were found to be positions on a line, `look` looks again.

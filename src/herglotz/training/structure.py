@@ -1,13 +1,13 @@
 """The terms of several coordinates, found from the data.
 
-`search` finds named terms of one to three coordinates, which whole trajectories ask for. Where no search is made, or it
-finds none, `structured` takes a dictionary of features. Every planar chain of revolute joints, in absolute or relative
-angles, has its mass and its weight in the dictionary `revolute` (`herglotz.models.features`); coordinates without an
-angle among them have constant masses of their own, and springs, powers and distances in the dictionary `lengths`.
-Either starts as a linear problem (`linear_start`). For joints the problem with a constant mass is solved too, without a
-fifth of the data at a time; the mass that depends on the angles is taken where it predicts that fifth better, beyond
-the spread of the fifths. A short one-step fit then leaves out the features that the data do not need, and tells noise
-from the error of the rule.
+`search` finds named terms of one to three coordinates, which whole trajectories ask for, and `search_of_many` those of
+more noisy lengths. Where no search is made, or it finds none, `structured` takes a dictionary of features. Every planar
+chain of revolute joints, in absolute or relative angles, has its mass and its weight in the dictionary `revolute`
+(`herglotz.models.features`); coordinates without an angle among them have constant masses of their own, and springs,
+powers and distances in the dictionary `lengths`. Either starts as a linear problem (`linear_start`). For joints the
+problem with a constant mass is solved too, without a fifth of the data at a time; the mass that depends on the angles
+is taken where it predicts that fifth better, beyond the spread of the fifths. A short one-step fit then leaves out the
+features that the data do not need, and tells noise from the error of the rule.
 """
 
 from __future__ import annotations
@@ -28,9 +28,11 @@ from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.coupled_pairs import coupled_pairs, terms_between
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.distributed import of_first
 from herglotz.training.found_model import settings as settings_of_trial
+from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_start import SHARED, LinearFit
 from herglotz.training.named_terms import MOVING, by_term, distances, holders, places, started, values_of
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
@@ -45,7 +47,7 @@ from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
 from herglotz.training.trades import listed
-from herglotz.training.trials import Trial, compared_models
+from herglotz.training.trials import Trial, Variant, compared_models, is_precise
 
 # Most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n².
 MOST = 3
@@ -120,23 +122,31 @@ def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
     return few and alone and _nothing_named(replace(c, translations=()))
 
 
+def many_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
+    """Whether `search_of_many` may choose: more coordinates than `search` takes, no angle, noise, and nothing named."""
+    c = user_settings
+    return structure_is_free(data, c) and data.dof > MOST and c.objective == "auto" and not is_precise(data)
+
+
 def _nothing_named(c: FitConfig) -> bool:
     plain = (c.level, c.order, c.supervision, c.optimiser) == ("auto", 2, "q", "lm") and c.objective != "raw"
     return plain and not any(getattr(c, name) for name in NAMED)
 
 
 def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
-    """The whole dictionary and, for coordinates without an angle, the springs between them alone.
+    """The whole dictionary and, for coordinates without an angle, two smaller ones.
 
-    Springs alone need fewer samples. A dictionary takes part where the samples suffice for its coefficients and where
-    the derivatives take no more than `MAX_NUMBERS`: at 200 samples the whole dictionary up to 14 coordinates, springs
-    up to 22.
+    These are the dictionary of coupled pairs, if the samples tell the pairs, and the springs between all coordinates
+    alone. A dictionary takes part where the samples suffice for its coefficients and where the derivatives take no more
+    than `MAX_NUMBERS`: at 200 samples the whole dictionary up to 14 coordinates, springs up to 22.
     """
     if any(data.angles):
         return [tuple(revolute(data.angles))]
     away = distances(data)
     names = tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
-    return [names, tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))]
+    springs = tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))
+    coupled = coupled_pairs(data) if data.dof > MOST else None
+    return [names, *([] if coupled is None else [terms_between(coupled, data.angles)]), springs]
 
 
 def kept_structure(
@@ -185,9 +195,6 @@ def search(
     found, differ, zeros = asked.best, asked.differ, ()
     if found is None:
         return Structure(config, base, "no dictionary of terms: what follows a part of the data does not follow all")
-    settings, found_base = settings_of_trial(found, asked.wanted.config)
-    settings = replace(settings, dtype=config.dtype, device=config.device)
-    base = replace(found_base, low=base.low, high=base.high)
     if asked.hold:
         better = "the data are missed by less, or met with fewer terms"
         why["hold"] = f"with hold {asked.hold} {better} than with {data.hold}"
@@ -195,11 +202,53 @@ def search(
         why["input_terms"] = "held-out blocks of time are missed by less with them"
     if differ is not None:
         zeros, why["zeros"] = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
+    plain = _of_trial(found, data, asked.wanted.config, config, base, asked.read)
+    return plain._replace(
+        hold=asked.hold, input_terms=asked.input_terms, zeros=zeros, drifts=rates, why=tuple(why.items())
+    )
+
+
+def search_of_many(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
+    """The named terms of many coordinates at the noise of whole trajectories; unchanged if no terms are.
+
+    Offers are the dictionary `lengths` and a damper of those pairs of coordinates between which a force acts
+    (`coupled_pairs`), the latter if a kernel can have so many numbers. Offers leave the model of all offers.
+    """
+
+    def without(reason: str) -> Structure:
+        return Structure(config, base, f"no dictionary of terms: {reason}")
+
+    data, own = data.to(torch.float64, "cpu"), replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
+    if (coupled := coupled_pairs(data)) is None:
+        return without("too few samples to find which coordinates are coupled")
+    terms, dampers = terms_between(coupled, data.angles), tuple(f"(v{i + 1} - v{j + 1})" for i, j in coupled)
+    offered = replace(config, dtype="float64", device="cpu", level="forced", features=terms)
+    tried = (Search(data, own, replace(offered, drag=drag), outliers=outliers) for drag in (dampers, ()))
+    wanted = next((x for x in tried if len(x.fitter(Variant(x.order)).start) <= MAX_PARAMETERS), None)
+    if wanted is None:
+        return without("too many forces act between coordinates")
+    found = wanted.part.full
+    found = found and wanted.part.settled(found)
+    if wanted.part is not wanted:
+        found = wanted.of_part(found, None)[1]
+    if found is None or not found.at_the_noise:
+        return without("the terms of one coordinate and of two miss the data by more than the noise")
+    return _of_trial(found, data, wanted.config, config, base, wanted.part)
+
+
+def _of_trial(
+    found: Trial, data: Trajectories, offered: FitConfig, config: FitConfig, base: Baseline, of: Search
+) -> Structure:
+    """The terms and starting values of a model that the search `of` found among the offers of these settings."""
+    settings, found_base = settings_of_trial(found, offered)
     return Structure(
-        settings, base, _told(found, data), found.rms, 0 if found.whole else found.length, asked.hold,
-        asked.input_terms, zeros, rates,
-        why=tuple(why.items()), compared=compared_models(asked.read.fitters.values(), found),
-    )  # fmt: skip
+        replace(settings, dtype=config.dtype, device=config.device),
+        replace(found_base, low=base.low, high=base.high),
+        _told(found, data),
+        found.rms,
+        0 if found.whole else found.length,
+        compared=compared_models(of.fitters.values(), found),
+    )
 
 
 def _told(found: Trial, data: Trajectories) -> str:

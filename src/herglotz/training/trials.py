@@ -25,7 +25,7 @@ from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
-from herglotz.training.named_terms import DRY, candidates, settings_of, started, turns_one_way
+from herglotz.training.named_terms import DRY, NamedTerms, candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import ALWAYS, offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import Grids, segment_lengths
@@ -224,7 +224,7 @@ class Fitter:
     """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
 
     `like` is another fitter of the same data, which shares its segments and noise levels. Numbers are scalar
-    parameters, by name; `keys` has the term of each number.
+    parameters, by name; `keys` has the term of each number. Features in the settings take the place of `candidates`.
     """
 
     def __init__(
@@ -232,7 +232,8 @@ class Fitter:
         like: Fitter | None = None,
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
-        bands, terms = variant.functions, candidates(data, config.translations)
+        bands = variant.functions
+        terms = NamedTerms(config.features) if config.features else candidates(data, config.translations)
         terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)

@@ -2,6 +2,7 @@
 
 import math
 import re
+from typing import Any
 
 import pytest
 
@@ -9,6 +10,8 @@ from herglotz.codegen.angles import Angles
 from herglotz.codegen.c_function import whole
 from herglotz.codegen.gated import Prepared, gated
 from herglotz.codegen.program import Program, add, multiply
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.training import kernel
 
 
 def program_of(*names):
@@ -119,3 +122,24 @@ def test_derivatives_by_absent_parameters_are_not_written():
     assert re.search(r"if \(gate\[\d\]\) \{ G\[0\] = t\d+; \}", text)
     assert not re.search(r"^  G\[", text, flags=re.MULTILINE)
     assert theta
+
+
+@pytest.mark.parametrize("parts", [
+    {"angles": (True, True), "potential_width": 3, "mass_width": 3},
+    {"level": "forced", "diagonal": True, "features": ("(q1 - q2)^2", "q1^3"), "coulomb": True, "inputs": 1},
+])  # fmt: skip
+def test_one_sample_has_the_kernel_of_many(monkeypatch, parts):
+    # fails if an axis of the batch's size 1 is taken for another, or for one to be left out. With 431 samples the trace
+    # of twenty coordinates with a network took 26 s and 10.7 GB, for 3.0 s and 0.4 GB
+    pair: dict[str, Any] = dict.fromkeys(("scale", "speed", "stiffness", "tilt"), (1.0, 1.0))
+    model = ContactLagrangian(ModelConfig(**({"angles": (False, False), "potential_width": 0} | pair | parts)))
+    one, examples = kernel.source_of(model), kernel._examples
+
+    def many(given):
+        return tuple(
+            x if name in ("theta", "constants") else x.expand(211, *x.shape[1:]).clone()
+            for name, x in zip(given, examples(given), strict=True)
+        )
+
+    monkeypatch.setattr(kernel, "_examples", many)
+    assert kernel.source_of(model) == one

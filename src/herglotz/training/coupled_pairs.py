@@ -1,0 +1,56 @@
+"""Pairs of coordinates between which a force acts, so that a search of many coordinates need not offer every pair.
+
+The acceleration of each coordinate is a linear regression on all positions and the own velocity,
+
+    q̈ᵢ = Σⱼ aᵢⱼ qⱼ + bᵢ + cᵢ q̇ᵢ,
+
+over smoothed samples. A position stays if the fit needs it by the extended Bayesian information criterion (Chen & Chen
+2008), which also asks for the price of a choice among n − 1 positions. A force beyond the linear one has a linear part,
+so that nonlinear terms are offered where the linear one stays (marginality, Nelder 1977).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from itertools import combinations
+
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.data.smoothing import local_polynomials
+from herglotz.least_squares import least_squares
+from herglotz.models.features import lengths, parse
+from herglotz.training.pruning import prune
+
+
+def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
+    """Pairs i < j of coordinates, counted from 0, of which either acceleration needs the other position.
+
+    None if there are too few independent samples for the n + 2 coefficients of a coordinate. Samples that share half a
+    smoothing window are dependent: their number is divided by the overlap.
+    """
+    data = data.to(torch.float64, "cpu")
+    local = local_polynomials(data)
+    if local is None:
+        return None
+    n, overlap = data.dof, local.width / 2
+    half = local.half[local.centred, None]
+    q, v, a = (local.coefficients[local.centred, k] * math.factorial(k) / half**k for k in range(3))
+    count = len(q) / overlap
+    if count <= n + 2:
+        return None
+    worth, kept = math.log(count) + 2 * math.log(n - 1), torch.zeros(n, n, dtype=torch.bool)
+    for i in range(n):
+        X = torch.cat([q, torch.ones_like(half), v[:, i, None]], 1)
+        x = least_squares(X, a[:, i, None])[:, 0]
+        variance = float((a[:, i] - X @ x).square().mean()) / (1 - (n + 2) / count)
+        others = torch.tensor([j for j in range(n) if j != i])
+        kept[i, prune(X.T @ X, x, others, worth * overlap * variance)[0]] = True
+    return [(i, j) for i, j in combinations(range(n), 2) if bool(kept[i, j] | kept[j, i])]
+
+
+def terms_between(coupled: Collection[tuple[int, int]], angles: Sequence[bool]) -> tuple[str, ...]:
+    """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs."""
+    on = {name: tuple(i for i, w in enumerate(parse(name, angles)[0].form) if w) for name in lengths(angles)}
+    return tuple(name for name, own in on.items() if len(own) == 1 or own in coupled)

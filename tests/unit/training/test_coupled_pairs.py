@@ -1,0 +1,127 @@
+"""Named terms of many coordinates: offers between those that a force couples, at the noise of whole trajectories."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.scenes import scene
+from herglotz.training import FitConfig, fit, structure
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.coupled_pairs import coupled_pairs, terms_between
+from herglotz.training.search import Search
+from herglotz.training.structure import many_are_free, search_of_many
+from herglotz.training.trials import Variant
+
+
+def with_dampers(noise=0.003, trajectories=10, steps=40, h=0.1):
+    """Four bodies between two walls, joined by springs and dampers: exact motion by exp(hA), with noise."""
+    make, eye = torch.Generator().manual_seed(0), torch.eye(4, dtype=torch.float64)
+    stretch = torch.cat([eye, 0 * eye[:1]]) - torch.cat([0 * eye[:1], eye])
+    K, C = stretch.mT @ stretch, 0.2 * stretch[1:-1].mT @ stretch[1:-1]
+    step = torch.linalg.matrix_exp(h * torch.cat([torch.cat([0 * eye, eye], 1), torch.cat([-K, -C], 1)]))
+    x = [torch.rand(trajectories, 8, generator=make, dtype=torch.float64) - 0.5]
+    for _ in range(steps):
+        x.append(x[-1] @ step.mT)
+    q = torch.stack(x, 1)[..., :4].flatten(0, 1)
+    q = q + noise * torch.randn(q.shape, generator=make, dtype=q.dtype)
+    t = (h * torch.arange(steps + 1, dtype=torch.float64)).repeat(trajectories)
+    return Trajectories.of(t, q, (steps + 1,) * trajectories)
+
+
+@cache
+def chain(masses, noise=0.003, seed=0, trajectories=10, steps=40):
+    of = scene("chain", masses=masses)
+    return simulate(of, trajectories=trajectories, steps=steps, h=0.1, noise=noise, seed=seed)
+
+
+@pytest.mark.parametrize(("masses", "settings"), [(20, {}), (5, {"noise": 0.01, "trajectories": 3})])
+def test_neighbours_of_a_chain_are_coupled_and_no_others(masses, settings):
+    # fails if a spring is missed, as where both accelerations have to show a pair (of five masses 11 in 15 draws), or
+    # if noise couples others: without the price of a choice 11 pairs of twenty masses
+    neighbours, false = {(i, i + 1) for i in range(masses - 1)}, 0
+    for seed in range(10):
+        found = coupled_pairs(chain(masses, seed=seed, **settings))
+        assert found is not None
+        assert neighbours <= set(found)
+        false += len(found) - len(neighbours)
+    # 0 in 15 draws of each
+    assert false <= 2
+
+
+def test_bodies_without_springs_between_them_have_no_pairs():
+    # fails if positions of other bodies are taken for forces: each of these chains of one mass moves alone
+    alone = [chain(1, seed=k) for k in range(5)]
+    data = replace(alone[0], q=torch.cat([one.q for one in alone], 1), names=tuple("abcde"), units=("m",) * 5,
+                   angles=(False,) * 5)  # fmt: skip
+    assert coupled_pairs(data) == []
+
+
+def test_few_samples_couple_nothing():
+    # fails if a regression with as many coefficients as independent samples is believed
+    assert coupled_pairs(chain(10, trajectories=2)) is None
+
+
+def test_terms_between_pairs():
+    # fails if a pair that nothing couples has a term, or one of a coupled pair or of a single coordinate is lost
+    names = terms_between([(0, 1), (2, 3)], (False,) * 4)
+    assert set(names) == {
+        *(f"(q{i} - q{j})^{k}" for i, j in ((1, 2), (3, 4)) for k in (2, 3, 4)),
+        *(f"q{i}^{k}" for i in range(1, 5) for k in (3, 4)),
+    }
+
+
+def test_more_coordinates_than_a_search_takes_are_free_where_they_have_noise():
+    # fails if exact data, which one-step errors fit better, three coordinates, angles or a user's terms come here
+    assert many_are_free(chain(4), FitConfig())
+    assert not many_are_free(chain(3), FitConfig())
+    assert not many_are_free(chain(4, noise=0.0), FitConfig())
+    assert not many_are_free(replace(chain(4), angles=(True, *(False,) * 3), units=("rad", *("m",) * 3)), FitConfig())
+    named: list[dict[str, Any]] = [{"features": ("chain",)}, {"objective": "residual"}, {"level": "linear"}]
+    for told in named:
+        assert not many_are_free(chain(4), FitConfig(**told))
+
+
+def test_a_noisy_chain_is_found():
+    # fails if terms of a pair are lost, or networks take their place: they missed unseen motion of twenty masses by a
+    # quarter of its size
+    run = fit(chain(4), FitConfig(train_fraction=1.0), progress=False)
+    plan, springs = run.metrics["plan"], {f"(q{i} - q{i + 1})^{k}" for i in range(1, 4) for k in (2, 4)}
+    assert (plan["network"], plan["objective"]) == ("none", "trajectory")
+    assert springs | {"q1^4", "q4^4"} == set(plan["features"])
+    assert run.metrics["verdict"].startswith("fits to the noise")
+
+
+def test_terms_that_miss_by_more_than_the_noise_are_no_result():
+    # fails if terms stand in for a force that they lack: a magnet on the third body, which networks may have
+    data = chain(4)
+    pushed = data.q + 0.05 * torch.sin(4 * data.t)[:, None] * torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=data.q.dtype)
+    data = replace(data, q=pushed)
+    config = FitConfig().resolved(data)
+    found = search_of_many(data, estimate_baseline(data), config, outliers=False)
+    assert found.sigma is None
+    assert found.config is config
+    assert "miss the data by more than the noise" in found.reason
+
+
+def test_dampers_between_bodies_are_found():
+    # fails if a damper between two bodies is no offer, or if the settings of the fit do not have it
+    damped = with_dampers()
+    found = search_of_many(damped, estimate_baseline(damped), FitConfig().resolved(damped), outliers=False)
+    assert found.config.drag == ("(v1 - v2)", "(v2 - v3)", "(v3 - v4)")
+
+
+@pytest.mark.parametrize(("most", "taken"), [(36, 36), (35, 33), (32, None)])
+def test_numbers_that_a_kernel_takes_are_offered(monkeypatch, most, taken):
+    # fails if a search without a kernel begins, whose fits take minutes, or if terms go with dampers that are too many
+    offered = []
+    monkeypatch.setattr(structure, "MAX_PARAMETERS", most)
+    monkeypatch.setattr(Search, "full", property(lambda self: offered.append(len(self.fitter(Variant(2)).start))))
+    data = chain(4)
+    found = search_of_many(data, estimate_baseline(data), FitConfig().resolved(data), outliers=False)
+    assert found.sigma is None
+    assert offered == ([] if taken is None else [taken])
+    assert ("too many forces" in found.reason) is (taken is None)
