@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import Partials
 from herglotz.scenes.natural import Natural
 from herglotz.scenes.rules import all_rules
 from herglotz.scenes.scene import Scene, State, Step, left_of, require_positive
@@ -19,7 +18,7 @@ from herglotz.scenes.special import as_step, expm1w
 
 @dataclass(frozen=True)
 class ExactLinearDrag:
-    """L_d = (E−1)s0 + m|Δ|²/(2hφ(γh)), E = e^{−γh}, in any dimension, with closed-form derivatives.
+    """L_d = (E−1)s0 + m|Δ|²/(2hφ(γh)), E = e^{−γh}, in any dimension.
 
     Source: section 3 of `docs/mathematics.md`, where γ/(e^{γh} − 1) is 1/(hφ(γh)).
     """
@@ -36,18 +35,6 @@ class ExactLinearDrag:
         h = as_step(h, q0)
         delta = q1 - q0
         return torch.expm1(-self.gamma * h) * s0 + 0.5 * self.stiffness(h) * (delta * delta).sum(-1)
-
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks; L_d is quadratic, so the blocks are constant."""
-        h = as_step(h, q0)
-        L = self(q0, q1, s0, h)
-        k = self.stiffness(h)[..., None]
-        D2 = (k * (q1 - q0)).expand(*L.shape, q0.shape[-1])
-        first = (L, -D2, D2, torch.expm1(-self.gamma * h).expand_as(L))
-        if order == 1:
-            return Partials(*first)
-        block, zero = torch.diag_embed(k.expand_as(D2)), torch.zeros_like(D2)
-        return Partials(*first, block, -block, block, D13=zero, D23=zero, D33=torch.zeros_like(L))
 
     def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
         """q1 = q0 + (p0/m) hφ(−γh), p1 = E p0, s1 = E s0 + E (|p0|²/2m) hφ(−γh)."""

@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import Partials
 from herglotz.scenes.natural import Natural
 from herglotz.scenes.rules import all_rules, strang
 from herglotz.scenes.scene import Scene, State, Step, left_of, require_positive
@@ -30,7 +29,7 @@ from herglotz.scenes.special import as_step, cosw, sincw, versw
 
 @dataclass(frozen=True)
 class ExactOscillator:
-    """The exact discrete Lagrangian of the damped oscillator, with closed-form derivatives.
+    """The exact discrete Lagrangian of the damped oscillator.
 
     L_d = (E−1)s0 + (m/2S)[(E q0² + q1²) C − 2√E q0·q1] − (mγ/4)(q1² − E q0²)
 
@@ -59,27 +58,6 @@ class ExactOscillator:
         r0, r1 = E * (q0 * q0).sum(-1), (q1 * q1).sum(-1)
         quadratic = 0.5 * k * ((u * u).sum(-1) - versine * (r0 + r1)) - 0.25 * self.m * self.gamma * (r1 - r0)
         return torch.expm1(-self.gamma * h) * s0 + quadratic
-
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks; L_d is quadratic, so the blocks are constant."""
-        h = as_step(h, q0)
-        q0, q1 = torch.broadcast_tensors(q0, q1)
-        L = self(q0, q1, s0, h)
-        q0, q1 = (q.expand(*L.shape, q.shape[-1]) for q in (q0, q1))
-        decay, k, versine, C = (x[..., None] for x in self.coefficients(h))
-        root = 1.0 + decay
-        E = root**2
-        u = decay * q0 - (q1 - q0)
-        drag = 0.5 * self.m * self.gamma
-        D1 = k * (root * u - versine * E * q0) + drag * E * q0
-        D2 = -k * (u + versine * q1) - drag * q1
-        D3 = torch.expm1(-self.gamma * h).expand_as(L)
-        if order == 1:
-            return Partials(L, D1, D2, D3)
-        zero = torch.zeros_like(D1)
-        blocks = (E * (k * C + drag), -root * k, k * C - drag)
-        D11, D12, D22 = (torch.diag_embed(b.expand_as(D1)) for b in blocks)
-        return Partials(L, D1, D2, D3, D11, D12, D22, D13=zero, D23=zero, D33=torch.zeros_like(L))
 
     def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
         """(q1, p1, s1), where d/dt(s − p·q/2) = −γ(s − p·q/2) gives s1 without dividing by S at conjugate points."""

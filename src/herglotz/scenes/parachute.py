@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import Partials
 from herglotz.scenes.rules import all_rules
 from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, cosw, sincw, versw
@@ -59,27 +58,6 @@ class ExactParachute:
         kinetic = m / (2 * lam**2 * S) * torch.expm1(lam * delta) ** 2
         gravity = m * g * h / (2 * lam) * ((t - 1.0) + 0.5 * t * D3 - torch.expm1(2 * lam * q1))
         return D3 * s0 + kinetic + gravity
-
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks."""
-        h = as_step(h, q0)
-        m, g, lam = self.m, self.g, self.lam
-        L = self(q0, q1, s0, h)
-        S, t = self.coefficients(h)
-        delta = (q1 - q0)[..., 0]
-        e, e1 = torch.exp(lam * delta), torch.expm1(lam * delta)
-        weight = m * g * h * torch.exp(2 * lam * q1[..., 0])
-        # ∂L_d/∂Δ
-        pull = e * e * (2 * lam * s0 + 0.5 * m * g * h * t) + m / (lam * S) * e * e1
-        D1, D2, D3 = (x.expand_as(L) for x in (-pull, pull - weight, torch.expm1(2 * lam * delta)))
-        first = (L, D1[..., None], D2[..., None], D3)
-        if order == 1:
-            return Partials(*first)
-        # ∂²L_d/∂Δ²
-        pull2 = e * e * (4 * lam**2 * s0 + lam * m * g * h * t) + m / S * e * (e + e1)
-        D11, D12, D22 = (x.expand_as(L)[..., None, None] for x in (pull2, -pull2, pull2 - 2 * lam * weight))
-        D23 = (2 * lam * e * e).expand_as(L)[..., None]
-        return Partials(*first, D11, D12, D22, D13=-D23, D23=D23, D33=torch.zeros_like(L))
 
     def potential(self, q: Tensor) -> Tensor:
         """V = (mg/2λ)(e^{2λq} − 1), (...)."""

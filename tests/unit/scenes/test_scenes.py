@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from herglotz.mechanics import (
-    autograd_partials,
     contact_defect,
     flow_derivative,
     legendre_minus,
@@ -88,24 +87,6 @@ def test_exact_lagrangian_generates_the_flow(system):
     _, p_plus, s_plus = legendre_plus(system.L_d, q, q1, s, h)
     assert relative(p_plus, p1) < 1e-11
     assert relative(s_plus, s1) < 1e-12
-
-
-@pytest.mark.parametrize("system", EXACT, ids=label)
-def test_closed_form_partials(system):
-    # fails if a closed-form derivative is wrong, at pairs (q0, q1) off the flow and with a step per sample
-    q0, q1, s0 = scene_states(system, 20, seed=4)
-    q1 = q0 + 0.1 * torch.sin(17 * q1)
-    h = torch.linspace(0.1, 0.7, 20, dtype=torch.float64)
-    P, A = partials(system.L_d, q0, q1, s0, h, order=2), autograd_partials(system.L_d, q0, q1, s0, h, order=2)
-    for name, expected in vars(A).items():
-        if expected is None:  # no forces
-            continue
-        value = getattr(P, name)
-        assert value.shape == expected.shape, name
-        assert relative(value, expected) < 1e-13, name
-    first = partials(system.L_d, q0, q1, s0, h)
-    assert first.D11 is None
-    assert torch.equal(first.D1, P.D1)
 
 
 @pytest.mark.parametrize("system", EXACT, ids=label)
