@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import join, split
+from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.mechanics.newton import attached, find_root
-from herglotz.mechanics.partials import Hamiltonian, gradient, square_jacobian
+from herglotz.mechanics.partials import Hamiltonian, gradient
 from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 from herglotz.theory.contact_manifolds import sharp_bivector
@@ -59,7 +59,7 @@ class EvolutionStepper(OneStepMethod):
         x0 = join(q, p, s)
 
         def linearised(delta: Tensor) -> tuple[Tensor, Tensor]:
-            G, J = square_jacobian(lambda d: self._equation(x0, d, h)[0], delta)
+            G, J = jacobian(lambda d: self._equation(x0, d, h)[0], delta)
             return G, J
 
         with torch.no_grad():
