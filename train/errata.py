@@ -248,7 +248,7 @@ def e5() -> Erratum:
             s0 = s1 - (x.p * P.D1).sum(-1) + P.L
             return size(-P.D1 - x.q, p - p1, s0 - x.s)
 
-        H = LeftHamiltonian(L_d, x.q).partials(x.p, q1, s1, h)
+        H = partials(LeftHamiltonian(L_d, x.q), x.p, q1, s1, h)
         corrected = size(*(a - b for a, b in zip(left_equations(H, x.p, s1), (x.q, p1, x.s), strict=True)))
         wrong = printed_left(L_d, x.p, q1, s1, h, x.q)
         rows += [
