@@ -12,7 +12,7 @@ from torch import Tensor
 
 from herglotz.scenes.natural import Natural
 from herglotz.scenes.rules import all_rules
-from herglotz.scenes.scene import Scene, State, Step, left_of, require_positive
+from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, expm1w
 
 
@@ -42,13 +42,6 @@ class ExactLinearDrag:
         h = as_step(h, q)
         span, E = h * expm1w(-gamma * h), torch.exp(-gamma * h)
         return q + p / m * span[..., None], p * E[..., None], E * (s + (p * p).sum(-1) / (2 * m) * span)
-
-    def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
-        """H⁺ = p1·q0 + |p1|² hφ(γh)/2m + (1−E)s0."""
-        m, gamma = self.m, self.gamma
-        h = as_step(h, q0)
-        kinetic = (p1 * p1).sum(-1) * h * expm1w(gamma * h) / (2 * m)
-        return (p1 * q0).sum(-1) + kinetic - torch.expm1(-gamma * h) * s0
 
 
 def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
@@ -83,7 +76,5 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
         q_range=(-1.0, 1.0),
         v_range=(-1.0, 1.0),
         h=0.1,
-        H_plus=L_d.H_plus,
-        H_minus=left_of(L_d.H_plus),
         examples=({"m": 1.7, "gamma": 0.6}, {"m": 0.6, "gamma": 0.0}),
     )
