@@ -51,7 +51,7 @@ def right(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tenso
 
     c = 1/(1 − hL_s) for linear damping.
     """
-    return _implicit(lambda x: h * L(q1, v, s0 + x), q0, q1, s0, h)
+    return implicit(lambda x: h * L(q1, v, s0 + x), q0, q1, s0, h)
 
 
 @_rule
@@ -61,7 +61,7 @@ def midpoint(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Te
     The rule is its own adjoint. L_d is NaN where Newton's method for the scalar does not converge.
     """
     q = 0.5 * (q0 + q1)
-    return _implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
+    return implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
 
 
 @_rule
@@ -84,7 +84,7 @@ def trapezoid(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: T
     c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
     """
     start = L(q0, v, s0)
-    return _implicit(lambda x: 0.5 * h * (start + L(q1, v, s0 + x)), q0, q1, s0, h)
+    return implicit(lambda x: 0.5 * h * (start + L(q1, v, s0 + x)), q0, q1, s0, h)
 
 
 @_rule
@@ -133,7 +133,7 @@ def all_rules(L: Lagrangian) -> dict[str, DiscreteLagrangian]:
     return {name: rule(L) for name, rule in RULES.items()}
 
 
-def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+def implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """The scalar x = action(x) of each sample, by Newton's method from 0; NaN without convergence.
 
     Newton's method runs outside the graph. If the action requires a gradient, `EXACT_DERIVATIVES` further steps inside

@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import scaled_margin
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
+from herglotz.scenes.rules import implicit
+from herglotz.scenes.special import as_step
 
 
 class LeftLagrangian:
@@ -20,8 +23,9 @@ class LeftLagrangian:
 
     1 − D3L⁻ = 1/c,    p0 = −D1L⁻,    p1 = D2L⁻ / (1 − D3L⁻).
 
-    Newton's method solves the scalar equation from s0 = s1. The slope of the equation is c: the solution is unique if
-    c > 0 for every s0. Value and derivatives are NaN where c = 0 or no solution is found; `regularity` names the cause.
+    L⁻ solves the scalar equation x = L_d(q0, q1, s1 − x), by Newton's method from 0. The slope of the equation is c:
+    the solution is unique if c > 0 for every s0. L⁻ is three times differentiable, and NaN where c = 0 or no solution
+    is found; `regularity` names the cause. Calls raise InputError if L_d comes with forces.
 
     Source: erratum E5, for the paper's L_d(q_k, q_{k+1}, s_{k+1}) in the left discrete Hamiltonian.
     """
@@ -29,30 +33,12 @@ class LeftLagrangian:
     def __init__(self, L_d: DiscreteLagrangian):
         self.L_d = L_d
 
-    def previous_action(
-        self,
-        q0: Tensor,  # (..., n)
-        q1: Tensor,  # (..., n)
-        s1: Tensor,  # (...)
-        h: Tensor | float,
-    ) -> Tensor:
-        """s0 with s0 + L_d(q0, q1, s0) = s1, shape (...), without a graph; NaN where no s0 exists."""
-
-        def equations(x: Tensor) -> tuple[Tensor, Tensor]:
-            P = unforced(partials(self.L_d, q0, q1, x[..., 0], h))
-            return (x[..., 0] + P.L - s1)[..., None], P.c[..., None, None]
-
-        shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s1.shape, torch.as_tensor(h).shape)
-        return find_root(equations, s1.expand(shape)[..., None]).solved[..., 0]
-
     def __call__(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
-        """L⁻, shape (...), three times differentiable: the graph holds two Newton steps of value zero."""
-        s0 = self.previous_action(q0, q1, s1, h)
-        if torch.is_grad_enabled():
-            for _ in range(2):
-                P = partials(self.L_d, q0, q1, s0, h)
-                s0 = s0 - (s0 + P.L - s1) / P.c
-        return s1 - s0
+        """L⁻, shape (...)."""
+        h = as_step(h, q0)
+        with torch.no_grad():
+            unforced(partials(self.L_d, q0, q1, s1, h))
+        return implicit(lambda x: self.L_d(q0, q1, s1 - x, h), q0, q1, s1, h)
 
 
 def unforced(P: Partials) -> Partials:
@@ -167,11 +153,11 @@ def right_step(
     NaN where Newton's method finds no solution.
     """
 
-    def equations(p1: Tensor) -> tuple[Tensor, Tensor]:
-        P = partials(H_plus, q0, p1, s0, h, order=2)
-        return P.D1 - (1 - P.D3)[..., None] * p0, P.D12 + p0[..., :, None] * P.D23[..., None, :]
+    def missed(p1: Tensor) -> Tensor:
+        P = partials(H_plus, q0, p1, s0, h)
+        return P.D1 - (1 - P.D3)[..., None] * p0
 
-    p1 = find_root(equations, p0).solved
+    p1 = find_root(lambda p1: jacobian(missed, p1), p0).solved
     q1, _, s1 = right_equations(partials(H_plus, q0, p1, s0, h), p1, s0)
     return q1, p1, s1
 
@@ -189,19 +175,15 @@ def left_step(
     """
     n = q0.shape[-1]
 
-    def equations(x: Tensor) -> tuple[Tensor, Tensor]:
-        P = partials(H_minus, p0, x[..., :n], x[..., n], h, order=2)
-        q, _, s = left_equations(P, p0, x[..., n])
-        q_row = -torch.cat([P.D12, P.D13[..., None]], -1)
-        s_q = P.D2 - (p0[..., None, :] @ P.D12)[..., 0, :]
-        s_row = torch.cat([s_q, (1 + P.D3 - (p0 * P.D13).sum(-1))[..., None]], -1)
-        return torch.cat([q - q0, (s - s0)[..., None]], -1), torch.cat([q_row, s_row[..., None, :]], -2)
+    def missed(x: Tensor) -> Tensor:
+        q, _, s = left_equations(partials(H_minus, p0, x[..., :n], x[..., n], h), p0, x[..., n])
+        return torch.cat([q - q0, (s - s0)[..., None]], -1)
 
     start = torch.cat([q0, s0[..., None]], -1)
     # Positions and actions have different units, and so different scales.
     action = s0.abs() + (p0 * q0).sum(-1).abs()
     scale = torch.cat([q0.abs().amax(-1, keepdim=True).expand(q0.shape), action[..., None]], -1)
-    x = find_root(equations, start, torch.maximum(scale, start.abs())).solved
+    x = find_root(lambda x: jacobian(missed, x), start, torch.maximum(scale, start.abs())).solved
     q1, s1 = x[..., :n], x[..., n]
     _, p1, _ = left_equations(partials(H_minus, p0, q1, s1, h), p0, s1)
     return q1, p1, s1

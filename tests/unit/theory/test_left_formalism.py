@@ -135,7 +135,7 @@ def test_no_previous_action_is_nan():
         return s0**2 + (q0 * q1).sum(-1) + 0 * h
 
     q, s1 = torch.zeros(2, 1, dtype=torch.float64), torch.tensor([-1.0, 2.0], dtype=torch.float64)
-    s0 = LeftLagrangian(fold).previous_action(q, q, s1, 1.0)
+    s0 = s1 - LeftLagrangian(fold)(q, q, s1, 1.0)
     assert s0.isnan().tolist() == [True, False]
     assert float(s0[1]) == pytest.approx(1.0)
 
