@@ -12,7 +12,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import scaled_margin
-from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.newton import find_root, solve
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.scenes.rules import implicit
 from herglotz.scenes.special import as_step
@@ -70,7 +70,22 @@ class RightHamiltonian:
         self.near = near
 
     def position(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
-        """q1 with D2L_d(q0, q1, s0) = p1, once differentiable; shape (..., n), NaN where there is none."""
+        """q1 with D2L_d(q0, q1, s0) = p1, without a graph; shape (..., n), NaN where there is none."""
+        return self._solved(q0, p1, s0, h)[0]
+
+    def __call__(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
+        """H⁺, shape (...); twice differentiable."""
+        q1, D22 = self._solved(q0, p1, s0, h)
+        H = right_hamiltonian_on_flow(q1, p1, value(self.L_d, q0, q1, s0, h))
+        if torch.is_grad_enabled():
+            # H⁺ is stationary in q1. A term of value 0 has the second derivatives due to q1.
+            F = partials(self.L_d, q0, q1, s0, h).D2 - p1
+            F = F - F.detach()
+            H = H + 0.5 * (F * solve(D22, F)).sum(-1)
+        return H
+
+    def _solved(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> tuple[Tensor, Tensor]:
+        """The position q1, NaN where there is none, and D22 there."""
 
         def equations(q1: Tensor) -> tuple[Tensor, Tensor]:
             P = unforced(partials(self.L_d, q0, q1, s0, h, order=2))
@@ -78,18 +93,12 @@ class RightHamiltonian:
 
         shape = torch.broadcast_shapes(q0.shape[:-1], p1.shape[:-1], s0.shape, torch.as_tensor(h).shape)
         start = (q0 if self.near is None else self.near).broadcast_to(*shape, q0.shape[-1])
-        root = find_root(equations, start)
+        q1 = find_root(equations, start).solved
         with torch.no_grad():
-            P = partials(self.L_d, q0, root.solved, s0, h, order=2)
+            P = partials(self.L_d, q0, q1, s0, h, order=2)
             # D22 is inverted. It is singular where its margin is rounding of the blocks of L_d.
             found = scaled_margin(P.D22, P.D12, P.D11, P.D22) > 1e3 * torch.finfo(q0.dtype).eps
-        q1 = root.with_slope(lambda q1: partials(self.L_d, q0, q1, s0, h).D2 - p1)
-        return torch.where(found[..., None], q1, torch.nan)
-
-    def __call__(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
-        """H⁺, shape (...); twice differentiable, since H⁺ is stationary in q1."""
-        q1 = self.position(q0, p1, s0, h)
-        return right_hamiltonian_on_flow(q1, p1, value(self.L_d, q0, q1, s0, h))
+            return torch.where(found[..., None], q1, torch.nan), P.D22
 
 
 class LeftHamiltonian:

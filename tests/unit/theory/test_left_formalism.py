@@ -25,6 +25,8 @@ CASES = {
     "oscillator": (OSCILLATOR.L_d, 1, 0.1),
     "parachute": (scene("parachute").L_d, 1, 0.1),
     "pendulum midpoint": (scene("damped_pendulum").L_d_rules["midpoint"], 1, 0.5),
+    # It has no third derivatives.
+    "numerically exact": (scene("damped_pendulum").numerical, 1, 0.3),
 }
 
 
