@@ -141,18 +141,14 @@ def implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Ten
     """
     start = s0.new_zeros(*torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape), 1)
 
-    def g(x: Tensor) -> Tensor:
-        return action(x[..., 0])[..., None]
-
-    def equations(x: Tensor) -> tuple[Tensor, Tensor]:
-        value, slope = jacobian(g, x)
-        return x - value, 1.0 - slope
+    def missed(x: Tensor) -> Tensor:
+        return x - action(x[..., 0])[..., None]
 
     # After a move below √eps the next move is below rounding.
     tol = torch.finfo(start.dtype).eps ** 0.5
-    root = find_root(equations, start, 1.0 + start, iterations=MAX_NEWTON, tol=tol)
+    root = find_root(lambda x: jacobian(missed, x), start, 1.0 + start, iterations=MAX_NEWTON, tol=tol)
     x = root.x + root.move
-    if torch.is_grad_enabled() and g(x).requires_grad:
+    if torch.is_grad_enabled() and missed(x).requires_grad:
         for _ in range(EXACT_DERIVATIVES):
-            x = x - solve(root.J, x - g(x))
+            x = x - solve(root.J, missed(x))
     return torch.where(root.converged, x[..., 0], torch.nan)

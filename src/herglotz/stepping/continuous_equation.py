@@ -122,11 +122,12 @@ class ContinuousEquation:
     def momentum(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         """The momentum p with q̇ = v, shape (..., n), without a graph; NaN where Newton's method finds no p."""
 
-        def equations(p: Tensor) -> tuple[Tensor, Tensor]:
-            q_dot, J = jacobian(lambda p: self.field(q, p, s)[0], p)
-            return q_dot - v, J
+        def missed(p: Tensor) -> Tensor:
+            return self.field(q, p, s)[0] - v
 
-        return find_root(equations, momentum_plus(partials(self.L_d, q - self.h * v, q, s, self.h))).solved
+        return find_root(
+            lambda p: jacobian(missed, p), momentum_plus(partials(self.L_d, q - self.h * v, q, s, self.h))
+        ).solved
 
     def lagrangian(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         """The modified contact Lagrangian L̃(q, v, s) = ṡ at the momentum of v, shape (...), without a graph."""

@@ -126,12 +126,11 @@ class ConstrainedStepper(OneStepMethod):
         """The momentum p + Dgᵀμ with Dg·v = 0. Where v is linear in p, one Newton step finds μ."""
         Dg = self._rows(q)[1]
 
-        def equations(mu: Tensor) -> tuple[Tensor, Tensor]:
-            v, v_p = jacobian(lambda p: self.velocity(q, p, s), p + (Dg.mT @ mu[..., None])[..., 0])
-            return (Dg @ v[..., None])[..., 0], Dg @ v_p @ Dg.mT
+        def missed(mu: Tensor) -> Tensor:
+            return (Dg @ self.velocity(q, p + (Dg.mT @ mu[..., None])[..., 0], s)[..., None])[..., 0]
 
         start = p.new_zeros(*p.shape[:-1], Dg.shape[-2])
         scale = (p.detach().abs().amax(-1) / Dg.detach().abs().amax((-2, -1)))[..., None].expand(start.shape)
-        root = find_root(equations, start, scale, iterations=MAX_PROJECTION_STEPS)
-        mu = root.with_slope(lambda mu: equations(mu)[0])
+        root = find_root(lambda mu: jacobian(missed, mu), start, scale, iterations=MAX_PROJECTION_STEPS)
+        mu = root.with_slope(missed)
         return p + (Dg.mT @ mu[..., None])[..., 0]
