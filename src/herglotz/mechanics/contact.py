@@ -48,7 +48,7 @@ def flow_derivatives(
         q, p, s = split(x)
         for flow in flows:
             q, p, s = flow(q, p, s)
-            found.append(((q.detach(), p.detach(), s.detach()), _rows(join(q, p, s), x, create_graph=False)))
+            found.append(((q.detach(), p.detach(), s.detach()), *rows_of(join(q, p, s), (x,), create_graph=False)))
     return found
 
 
@@ -61,20 +61,27 @@ def jacobian(
     with torch.enable_grad():
         x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
         y = f(x)
-        # Only a constant map has no graph here.
-        if not y.requires_grad:
-            return y, y.new_zeros(*y.shape, x.shape[-1])
-        J = _rows(y, x, keep_graph)
+        (J,) = rows_of(y, (x,), keep_graph)
     return (y, J) if keep_graph else (y.detach(), J)
 
 
-def _rows(y: Tensor, x: Tensor, create_graph: bool) -> Tensor:
-    """∂y/∂x row by row, (..., k, m)."""
-    rows = [
-        torch.autograd.grad(y_i.sum(), x, retain_graph=True, create_graph=create_graph, materialize_grads=True)[0]
-        for y_i in y.unbind(-1)
-    ]
-    return torch.stack(rows, -2)
+def rows_of(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor, ...]:
+    """∂y/∂x for each x: (..., m, n) for x (..., n), (..., m) for x (...); the m components of y in one backward pass.
+
+    A custom backward pass that reads numbers cannot be batched: its rows are computed one by one.
+    """
+    m, batch = y.shape[-1], y.ndim - 1
+    found: tuple[Tensor | None, ...] = (None,) * len(xs)
+    if y.requires_grad:
+        options = {"create_graph": create_graph, "retain_graph": True, "allow_unused": True}
+        unit = torch.eye(m, dtype=y.dtype, device=y.device).reshape(m, *(1,) * batch, m).expand(m, *y.shape)
+        try:
+            found = torch.autograd.grad(y, xs, unit, is_grads_batched=True, **options)
+        except RuntimeError:
+            one_by_one = zip(*(torch.autograd.grad(y, xs, row, **options) for row in unit), strict=True)
+            found = tuple(None if rows[0] is None else torch.stack(rows) for rows in one_by_one)
+    rows = (x.new_zeros(m, *x.shape) if g is None else g for g, x in zip(found, xs, strict=True))
+    return tuple(g.movedim(0, batch) for g in rows)
 
 
 def contact_defect(

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.func import vjp
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import split
+from herglotz.mechanics.contact import rows_of, split
 
 
 class DiscreteLagrangian(Protocol):
@@ -285,7 +285,7 @@ def autograd_partials(
         P = Partials(L, D1, D2, D3, force=force)
         if order == 2:
             gradient = torch.cat([D1, D2, D3[..., None]], -1)
-            P = replace(P, **second_blocks(*_rows(gradient, (a, b, s), keep_graph)))
+            P = replace(P, **second_blocks(*rows_of(gradient, (a, b, s), keep_graph)))
     return P if keep_graph else P.map(Tensor.detach)
 
 
@@ -305,7 +305,7 @@ def _autograd_forces(
     minus, plus = forces
     if order == 1:
         return Forces(minus, plus)
-    return Forces(minus, plus, *(block for F in forces for block in _rows(F, xs, keep_graph)))
+    return Forces(minus, plus, *(block for F in forces for block in rows_of(F, xs, keep_graph)))
 
 
 def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> bool:
@@ -321,25 +321,6 @@ def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor
         return tuple(torch.zeros_like(x) for x in xs)
     grads = torch.autograd.grad(y.sum(), xs, create_graph=create_graph, allow_unused=True)
     return tuple(torch.zeros_like(x) if g is None else g for g, x in zip(grads, xs, strict=True))
-
-
-def _rows(y: Tensor, xs: tuple[Tensor, Tensor, Tensor], create_graph: bool) -> tuple[Tensor, ...]:
-    """∂y/∂x for each x: (..., m, n), (..., m, n) and (..., m), the m components of y (..., m) in one backward pass.
-
-    A custom backward pass that reads numbers cannot be batched: its rows are computed one by one.
-    """
-    m, batch = y.shape[-1], y.ndim - 1
-    found: tuple[Tensor | None, ...] = (None,) * len(xs)
-    if y.requires_grad:
-        options = {"create_graph": create_graph, "retain_graph": True, "allow_unused": True}
-        unit = torch.eye(m, dtype=y.dtype, device=y.device).reshape(m, *(1,) * batch, m).expand(m, *y.shape)
-        try:
-            found = torch.autograd.grad(y, xs, unit, is_grads_batched=True, **options)
-        except RuntimeError:
-            one_by_one = zip(*(torch.autograd.grad(y, xs, row, **options) for row in unit), strict=True)
-            found = tuple(None if rows[0] is None else torch.stack(rows) for rows in one_by_one)
-    rows = (x.new_zeros(m, *x.shape) if g is None else g for g, x in zip(found, xs, strict=True))
-    return tuple(g.movedim(0, batch) for g in rows)
 
 
 def functional_partials(
@@ -422,18 +403,3 @@ def gradient(
     """F, F_x and (order 2) F_xx with shapes (...), (..., m), (..., m, m)."""
     P = autograd_partials(lambda x, _, s, h: F(x), x, x, x[..., 0], 0.0, order)  # noqa: ARG005
     return P.L, P.D1, P.D11
-
-
-def square_jacobian(
-    # (..., m) → (..., k); f must treat the samples independently and accept one more leading dimension
-    f: Callable[[Tensor], Tensor],
-    x: Tensor,  # (..., m)
-    rows: int | None = None,  # () k, m by default
-) -> tuple[Tensor, Tensor]:
-    """f(x) and its Jacobian, as `contact.jacobian`, by one backward pass instead of k.
-
-    f is evaluated on k copies of x; the gradient of component i on copy i is row i of the Jacobian.
-    """
-    copies = x.expand(x.shape[-1] if rows is None else rows, *x.shape)
-    y, J, _ = gradient(lambda x: f(x).diagonal(dim1=0, dim2=-1).movedim(-1, 0), copies)
-    return y.movedim(0, -1), J.movedim(0, -2)

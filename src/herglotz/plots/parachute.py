@@ -20,7 +20,7 @@ from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, la
 from herglotz.scenes import scene
 from herglotz.scenes.parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State, Stepper
-from herglotz.theory import generating_functions, hamilton_jacobi_residual
+from herglotz.theory import RightHamiltonian, generating_functions, hamilton_jacobi_residual
 
 # The axes are logarithmic: a difference of exactly 0 is drawn here.
 FLOOR = 1e-18
@@ -184,10 +184,9 @@ def physical_fall() -> Fall:
     stepper = Stepper(fall.L_d)
     solution = stepper.rollout(*x, h=H, steps=steps)
     S = generating_functions([lambda *state: stepper.step(State(*state), H).state] * steps, *x)
-    assert fall.H_plus is not None
     residuals = []
     for S0, S1 in pairwise(S):
-        H_plus = fall.H_plus(S0.q, S1.D2, S0.s, H)
+        H_plus = RightHamiltonian(fall.L_d, S1.q)(S0.q, S1.D2, S0.s, H).detach()
         residual = hamilton_jacobi_residual(S1.s, S0.s, S1.D2, S1.q, H_plus)
         residuals.append(float(residual.abs() / (S1.s.abs() + S0.s.abs() + H_plus.abs())))
     dS = torch.stack([x.D2[0] for x in S])

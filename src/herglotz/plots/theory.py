@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from torch import Tensor
 from herglotz.data.files import PathLike
 from herglotz.data.units import common_unit
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
 from herglotz.plots import FIGURES
 from herglotz.plots.motion import momentum_unit
@@ -34,32 +33,13 @@ from herglotz.plots.style import (
     styled,
     with_unit,
 )
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import State
 from herglotz.theory import GeneratingFunction, RightHamiltonian, generating_functions, hamilton_jacobi_residual
-from herglotz.verify.subject import named, subject
+from herglotz.verify.subject import Subject, named, subject
 
 # S^k is drawn where the spread of ∂q_k/∂p̂0 is above this part of the fan's median. At a caustic the spread is 0, and
 # S^k has no derivative.
 MIN_SPREAD = 1e-3
-
-
-@dataclass(frozen=True)
-class Fan:
-    """Initial states, a step size and the L_d that moves the states."""
-
-    L_d: DiscreteLagrangian
-    start: State  # (F, n), (F, n), (F,)
-    h: float
-    momentum_unit: str = ""
-
-    def generating_functions(self, steps: int, start: State | None = None) -> list[GeneratingFunction]:
-        """Return S^1, S^2, …, S^steps and their derivatives along every solution of the fan."""
-        stepper = Stepper(self.L_d)
-
-        def flow(*state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            return stepper.step(State(*state), self.h).state
-
-        return generating_functions([flow] * steps, *(self.start if start is None else start))
 
 
 def regular(S: GeneratingFunction) -> Tensor:
@@ -70,48 +50,37 @@ def regular(S: GeneratingFunction) -> Tensor:
     return finite & (spread > MIN_SPREAD * typical)
 
 
-def spread_fan(source: Any, size: int, h: float | None = None) -> Fan:
-    """Return `size` solutions from states spread over the data of a run; without a run, from drawn states."""
-    if not _is_run(source):
-        known = subject(source, _typical_step(source) if h is None else h, size, 0)
-        if known.L_d is None:
-            raise InputError(f"{known.name} holds no L_d; the figures of S^k need one: give the run, or the L_d")
-        return Fan(known.L_d, known.states, known.h)
-    states = source.states
-    rows = torch.linspace(0, len(states.s) - 1, min(size, len(states.s))).round().long()
-    start = _sound(State(*(x[rows] for x in states)))
-    return Fan(source.model, start, source.h if h is None else h, momentum_unit(source))
+def spread_fan(source: Any, size: int, h: float | None = None) -> Subject:
+    """Return solutions from `size` states of the data of a run; without a run, from drawn states."""
+    known = subject(source, _typical_step(source) if h is None else h, size, 0)
+    if known.L_d is None:
+        raise InputError(f"{known.name} holds no L_d; the figures of S^k need one: give the run, or the L_d")
+    return known
 
 
-def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
+def point_fan(source: Any, size: int, h: float | None = None) -> Subject:
     """Return `size` solutions through one point (q̂0, ŝ0) with different p̂0 along one direction.
 
-    The point is a state of the run's data, or of the states that `spread_fan` starts from.
+    The point is one of the states that `spread_fan` starts from.
     """
-    if _is_run(source):
-        whole = Fan(source.model, source.states, source.h if h is None else h, momentum_unit(source))
-    else:
-        whole = spread_fan(source, 64, h)
-    q, p, s = _sound(whole.start)
+    known = spread_fan(source, 64, h)
+    q, p, s = known.states
     row = int((q - q.median(0).values).abs().sum(-1).argmax()) if len(s) < 3 else len(s) // 3
     reach = (p - p.median(0).values).abs().quantile(0.9, dim=0)
     steps = torch.linspace(-1.0, 1.0, size, dtype=p.dtype, device=p.device)
     momenta = p.median(0).values + steps[:, None] * reach.clamp_min(1e-6)
-    start = State(q[row].expand(size, -1).clone(), momenta, s[row].expand(size).clone())
-    return replace(whole, start=start)
+    return replace(known, states=State(q[row].expand(size, -1).clone(), momenta, s[row].expand(size).clone()))
 
 
-def _sound(states: State) -> State:
-    """The finite states; raise if there are none."""
-    finite = states.finite
-    if not bool(finite.any()):
-        raise InputError("the run has no finite state to start from; fit it again")
-    return State(*(x[finite].detach() for x in states))
+def solutions(fan: Subject, steps: int, start: State | None = None) -> list[GeneratingFunction]:
+    """Return S^1, S^2, …, S^steps and their derivatives along every solution of the fan, or from other starts."""
+    return generating_functions([fan.flow(1, k) for k in range(steps)], *(fan.states if start is None else start))
 
 
-def _is_run(source: Any) -> bool:
-    """True if the source holds a model and states that were fitted to data."""
-    return hasattr(source, "states") and hasattr(source, "model")
+def _momentum_unit(fan: Subject) -> str:
+    """The unit of momenta; "" where there is no run."""
+    unit = "" if fan.run is None else momentum_unit(fan.run)
+    return unit and f"{unit}, mass 1"
 
 
 def _typical_step(source: Any) -> float | None:
@@ -152,19 +121,19 @@ def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None)
     """
     fan = spread_fan(source, 32, h)
     pairs, points, left_out = [], 0, 0
-    for S in fan.generating_functions(STEPS):
+    for S in solutions(fan, STEPS):
         fine = regular(S)
         points, left_out = points + int(fine.sum()), left_out + int((~fine).sum())
         pairs.append(torch.stack([S.p[fine], S.D2[fine]]).flatten(1).double().cpu().numpy())
     everything = np.concatenate(pairs, 1)
     _check_any(points)
     worst = float(np.abs(everything[0] - everything[1]).max())
-    floor = ZERO_IN_EPSILONS * torch.finfo(fan.start.q.dtype).eps
+    floor = ZERO_IN_EPSILONS * torch.finfo(fan.states.q.dtype).eps
     missing = f", {left_out} left out {NO_S}" if left_out else ""
     with styled():
         figure = new_figure(9.2, 4.4, f"The action's derivative is the momentum, to {worst:.1e}")
         left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.0])
-        unit = fan.momentum_unit and f"{fan.momentum_unit}, mass 1"
+        unit = _momentum_unit(fan)
         ends = [everything.min(), everything.max()]
         left.plot(ends, ends, color=MUTED, lw=0.9, zorder=1)
         left.plot(*everything, "o", ms=4, mfc="none", mec=MODEL, mew=0.9, zorder=2)
@@ -193,55 +162,56 @@ def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Fig
     `plot_momentum_vs_generating_function`.
     """
     fan = point_fan(source, SIZE, h)
-    S = fan.generating_functions(STEPS + 1)
-    rows = [_residual(fan, S[k], S[k + 1], S[k + 1]) for k in range(STEPS)]
+    S = solutions(fan, STEPS + 1)
+    rows = [_residual(fan.at(k + 1), S[k], S[k + 1], S[k + 1]) for k in range(STEPS)]
     table = torch.stack(rows).double().cpu().numpy()
     _check_any(np.isfinite(table).sum())
     distance, off_flow = _off_flow(fan, S)
     worst = float(np.nanmax(table))
-    floor = ZERO_IN_EPSILONS * torch.finfo(fan.start.q.dtype).eps
+    floor = ZERO_IN_EPSILONS * torch.finfo(fan.states.q.dtype).eps
     with styled():
         title = f"The action solves the discrete Hamilton–Jacobi equation: largest relative residual {worst:.1e}"
         figure = new_figure(10.2, 4.2, title)
         left, right = figure.subplots(1, 2, width_ratios=[1.15, 1.0])
         _draw_table(figure, left, fan, np.maximum(table, floor))
-        unit = common_unit(source.data.units) if hasattr(source, "data") else ""
+        unit = "" if fan.run is None else common_unit(fan.run.data.units)
         far = with_unit(r"distance of $q_{k+1}$ from the flow", unit)
         _draw_null(right, distance, off_flow, max(worst, floor), far)
     return figure
 
 
-def _residual(fan: Fan, S0: GeneratingFunction, S1: GeneratingFunction, near: GeneratingFunction) -> Tensor:
+def _residual(now: Subject, S0: GeneratingFunction, S1: GeneratingFunction, near: GeneratingFunction) -> Tensor:
     """Return |residual| between S^k at S0 and S^{k+1} at S1 over the sum of its terms' sizes, (F,); NaN without S^k.
 
     H⁺ has several branches: Newton's iteration starts at the solution `near`.
     """
-    H_plus = RightHamiltonian(fan.L_d, near.q)(S0.q, S1.D2, S0.s, fan.h)
+    assert now.L_d is not None
+    H_plus = RightHamiltonian(now.L_d, near.q)(S0.q, S1.D2, S0.s, now.h)
     residual = hamilton_jacobi_residual(S1.S, S0.S, S1.D2, S1.q, H_plus).detach().abs()
     size = S1.S.abs() + S0.S.abs() + (S1.D2 * S1.q).sum(-1).abs() + H_plus.detach().abs()
     return torch.where(regular(S0) & regular(S1), residual / size, torch.nan)
 
 
-def _off_flow(fan: Fan, S: list[GeneratingFunction]) -> tuple[np.ndarray, np.ndarray]:
+def _off_flow(fan: Subject, S: list[GeneratingFunction]) -> tuple[np.ndarray, np.ndarray]:
     """Return median distances and residuals, (K, D), with q_{k+1} of another solution of the fan."""
-    q, p, s = fan.start
+    q, p, s = fan.states
     count, width = len(DISTANCES), p[-1] - p[0]
     momenta = p + DISTANCES.to(p)[:, None, None] * width
     moved = State(q.repeat(count, 1), momenta.flatten(0, 1), s.repeat(count))
     distances, residuals = [], []
-    off = fan.generating_functions(max(NULL_STEPS) + 1, moved)
+    off = solutions(fan, max(NULL_STEPS) + 1, moved)
     for k in NULL_STEPS:
         S0, S1 = (S[j].map(lambda x: torch.cat([x] * count)) for j in (k - 1, k))
         distances.append((off[k].q - S1.q).norm(dim=-1).reshape(count, -1).nanmedian(1).values)
-        residuals.append(_residual(fan, S0, off[k], S1).reshape(count, -1).nanmedian(1).values)
+        residuals.append(_residual(fan.at(k), S0, off[k], S1).reshape(count, -1).nanmedian(1).values)
     return torch.stack(distances).double().cpu().numpy(), torch.stack(residuals).double().cpu().numpy()
 
 
-def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:
-    momenta = fan.start.p[:, 0].double().cpu().numpy()
+def _draw_table(figure: Figure, ax: Axes, fan: Subject, table: np.ndarray) -> None:
+    momenta = fan.states.p[:, 0].double().cpu().numpy()
     half = 0.5 * (momenta[1] - momenta[0])
     extent = (momenta[0] - half, momenta[-1] + half, 0.5, STEPS + 0.5)
-    low = math.floor(np.log10(ZERO_IN_EPSILONS * torch.finfo(fan.start.q.dtype).eps))
+    low = math.floor(np.log10(ZERO_IN_EPSILONS * torch.finfo(fan.states.q.dtype).eps))
     image = ax.imshow(
         np.log10(table), origin="lower", aspect="auto", extent=extent, cmap="cividis",
         vmin=low, vmax=-1, interpolation="nearest",
@@ -250,8 +220,8 @@ def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:
     bar = figure.colorbar(image, ax=ax, ticks=np.linspace(low, -1, 5).round())
     bar.set_label("log₁₀ relative residual", fontsize=9)
     missing = "" if np.isfinite(table).all() else f", grey: left out {NO_S}"
-    name = r"initial momentum $\hat p_0$" + (", first coordinate" if fan.start.p.shape[1] > 1 else "")
-    ax.set(xlabel=with_unit(name, fan.momentum_unit and f"{fan.momentum_unit}, mass 1"))
+    name = r"initial momentum $\hat p_0$" + (", first coordinate" if fan.states.p.shape[1] > 1 else "")
+    ax.set(xlabel=with_unit(name, _momentum_unit(fan)))
     ax.set(ylabel="steps k", yticks=range(1, STEPS + 1), title="on the flow" + missing)
     ax.spines[:].set_visible(False)
 

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
-from herglotz.mechanics.contact import join, split
+from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.partials import square_jacobian
 from herglotz.scenes.reference import Motion, lagrangian_motion
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step
@@ -141,7 +140,7 @@ class Collocation:
             q_dot, p, p_dot, s_dot, rate = self.motion.balance(*split(x))
             return torch.cat([p, q_dot, p_dot, s_dot[..., None], rate[..., None]], -1)
 
-        R, J = square_jacobian(rates, x, 3 * n + 2)
+        R, J = jacobian(rates, x)
         z = torch.cat([x[..., :n], R[..., :n], x[..., -1:]], -1)
         z_x = torch.eye(2 * n + 1, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1, -1).clone()
         z_x[..., n : 2 * n, :] = J[..., :n, :]

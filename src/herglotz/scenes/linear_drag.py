@@ -10,16 +10,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import Partials
 from herglotz.scenes.natural import Natural
 from herglotz.scenes.rules import all_rules
-from herglotz.scenes.scene import Scene, State, Step, left_of, require_positive
+from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, expm1w
 
 
 @dataclass(frozen=True)
 class ExactLinearDrag:
-    """L_d = (E−1)s0 + m|Δ|²/(2hφ(γh)), E = e^{−γh}, in any dimension, with closed-form derivatives.
+    """L_d = (E−1)s0 + m|Δ|²/(2hφ(γh)), E = e^{−γh}, in any dimension.
 
     Source: section 3 of `docs/mathematics.md`, where γ/(e^{γh} − 1) is 1/(hφ(γh)).
     """
@@ -37,31 +36,12 @@ class ExactLinearDrag:
         delta = q1 - q0
         return torch.expm1(-self.gamma * h) * s0 + 0.5 * self.stiffness(h) * (delta * delta).sum(-1)
 
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks; L_d is quadratic, so the blocks are constant."""
-        h = as_step(h, q0)
-        L = self(q0, q1, s0, h)
-        k = self.stiffness(h)[..., None]
-        D2 = (k * (q1 - q0)).expand(*L.shape, q0.shape[-1])
-        first = (L, -D2, D2, torch.expm1(-self.gamma * h).expand_as(L))
-        if order == 1:
-            return Partials(*first)
-        block, zero = torch.diag_embed(k.expand_as(D2)), torch.zeros_like(D2)
-        return Partials(*first, block, -block, block, D13=zero, D23=zero, D33=torch.zeros_like(L))
-
     def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
         """q1 = q0 + (p0/m) hφ(−γh), p1 = E p0, s1 = E s0 + E (|p0|²/2m) hφ(−γh)."""
         m, gamma = self.m, self.gamma
         h = as_step(h, q)
         span, E = h * expm1w(-gamma * h), torch.exp(-gamma * h)
         return q + p / m * span[..., None], p * E[..., None], E * (s + (p * p).sum(-1) / (2 * m) * span)
-
-    def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
-        """H⁺ = p1·q0 + |p1|² hφ(γh)/2m + (1−E)s0."""
-        m, gamma = self.m, self.gamma
-        h = as_step(h, q0)
-        kinetic = (p1 * p1).sum(-1) * h * expm1w(gamma * h) / (2 * m)
-        return (p1 * q0).sum(-1) + kinetic - torch.expm1(-gamma * h) * s0
 
 
 def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
@@ -96,7 +76,5 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
         q_range=(-1.0, 1.0),
         v_range=(-1.0, 1.0),
         h=0.1,
-        H_plus=L_d.H_plus,
-        H_minus=left_of(L_d.H_plus),
         examples=({"m": 1.7, "gamma": 0.6}, {"m": 0.6, "gamma": 0.0}),
     )

@@ -21,16 +21,15 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import Partials
 from herglotz.scenes.natural import Natural
 from herglotz.scenes.rules import all_rules, strang
-from herglotz.scenes.scene import Scene, State, Step, left_of, require_positive
+from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, cosw, sincw, versw
 
 
 @dataclass(frozen=True)
 class ExactOscillator:
-    """The exact discrete Lagrangian of the damped oscillator, with closed-form derivatives.
+    """The exact discrete Lagrangian of the damped oscillator.
 
     L_d = (E−1)s0 + (m/2S)[(E q0² + q1²) C − 2√E q0·q1] − (mγ/4)(q1² − E q0²)
 
@@ -60,27 +59,6 @@ class ExactOscillator:
         quadratic = 0.5 * k * ((u * u).sum(-1) - versine * (r0 + r1)) - 0.25 * self.m * self.gamma * (r1 - r0)
         return torch.expm1(-self.gamma * h) * s0 + quadratic
 
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks; L_d is quadratic, so the blocks are constant."""
-        h = as_step(h, q0)
-        q0, q1 = torch.broadcast_tensors(q0, q1)
-        L = self(q0, q1, s0, h)
-        q0, q1 = (q.expand(*L.shape, q.shape[-1]) for q in (q0, q1))
-        decay, k, versine, C = (x[..., None] for x in self.coefficients(h))
-        root = 1.0 + decay
-        E = root**2
-        u = decay * q0 - (q1 - q0)
-        drag = 0.5 * self.m * self.gamma
-        D1 = k * (root * u - versine * E * q0) + drag * E * q0
-        D2 = -k * (u + versine * q1) - drag * q1
-        D3 = torch.expm1(-self.gamma * h).expand_as(L)
-        if order == 1:
-            return Partials(L, D1, D2, D3)
-        zero = torch.zeros_like(D1)
-        blocks = (E * (k * C + drag), -root * k, k * C - drag)
-        D11, D12, D22 = (torch.diag_embed(b.expand_as(D1)) for b in blocks)
-        return Partials(L, D1, D2, D3, D11, D12, D22, D13=zero, D23=zero, D33=torch.zeros_like(L))
-
     def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
         """(q1, p1, s1), where d/dt(s − p·q/2) = −γ(s − p·q/2) gives s1 without dividing by S at conjugate points."""
         m, gamma, omega0 = self.m, self.gamma, self.omega0
@@ -91,16 +69,6 @@ class ExactOscillator:
         p1 = root * (p * C - (m * omega0**2 * q + 0.5 * gamma * p) * S)
         s1 = 0.5 * (p1 * q1).sum(-1) + torch.exp(-gamma * h) * (s - 0.5 * (p * q).sum(-1))
         return q1, p1, s1
-
-    def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
-        """H⁺ = p1²/2a + (b/a)p1·q0 + E m²Ω²q0²/2a + (1−E)s0, a = m(C/S − γ/2), b = m√E/S."""
-        m, gamma, omega0 = self.m, self.gamma, self.omega0
-        h = as_step(h, q0)
-        decay, k, _, C = self.coefficients(h)
-        a, root = k * C - 0.5 * m * gamma, 1.0 + decay
-        quadratic = 0.5 * (p1 * p1).sum(-1) + root * k * (p1 * q0).sum(-1)
-        quadratic = quadratic + 0.5 * m * (m * omega0**2) * root**2 * (q0 * q0).sum(-1)
-        return quadratic / a - torch.expm1(-gamma * h) * s0
 
 
 def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -> Scene:
@@ -140,8 +108,6 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
         q_range=(-1.5, 1.5),
         v_range=(-1.5, 1.5),
         h=0.1,
-        H_plus=L_d.H_plus,
-        H_minus=left_of(L_d.H_plus),
         examples=({"m": 1.7, "omega0": 1.3, "gamma": 0.6}, {"m": 0.6, "omega0": 0.7, "gamma": 3.1}),
     )
 

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import Partials
 from herglotz.scenes.rules import all_rules
 from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, cosw, sincw, versw
@@ -60,27 +59,6 @@ class ExactParachute:
         gravity = m * g * h / (2 * lam) * ((t - 1.0) + 0.5 * t * D3 - torch.expm1(2 * lam * q1))
         return D3 * s0 + kinetic + gravity
 
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """Value, gradient and Hessian blocks."""
-        h = as_step(h, q0)
-        m, g, lam = self.m, self.g, self.lam
-        L = self(q0, q1, s0, h)
-        S, t = self.coefficients(h)
-        delta = (q1 - q0)[..., 0]
-        e, e1 = torch.exp(lam * delta), torch.expm1(lam * delta)
-        weight = m * g * h * torch.exp(2 * lam * q1[..., 0])
-        # ∂L_d/∂Δ
-        pull = e * e * (2 * lam * s0 + 0.5 * m * g * h * t) + m / (lam * S) * e * e1
-        D1, D2, D3 = (x.expand_as(L) for x in (-pull, pull - weight, torch.expm1(2 * lam * delta)))
-        first = (L, D1[..., None], D2[..., None], D3)
-        if order == 1:
-            return Partials(*first)
-        # ∂²L_d/∂Δ²
-        pull2 = e * e * (4 * lam**2 * s0 + lam * m * g * h * t) + m / S * e * (e + e1)
-        D11, D12, D22 = (x.expand_as(L)[..., None, None] for x in (pull2, -pull2, pull2 - 2 * lam * weight))
-        D23 = (2 * lam * e * e).expand_as(L)[..., None]
-        return Partials(*first, D11, D12, D22, D13=-D23, D23=D23, D33=torch.zeros_like(L))
-
     def potential(self, q: Tensor) -> Tensor:
         """V = (mg/2λ)(e^{2λq} − 1), (...)."""
         return self.m * self.g / (2 * self.lam) * torch.expm1(2 * self.lam * q[..., 0])
@@ -113,45 +91,6 @@ class ExactParachute:
         v1 = (v * (1.0 + C_less_1) - g * S) / (1.0 + w)
         s1 = s + self(q, q1, s, h)
         return q1, self.momentum(q1, v1, s1), s1
-
-    def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
-        """H⁺ = p1·q1 − L_d, q1 = q0 + ln(x)/λ where A x² − B x = p1, on the branch that tends to q0 as h → 0.
-
-        B = m/(λS), A = B + a with a = 2λs0 + mgh t/2 − mgh e^{2λq0}; the code solves for x − 1, which is O(h). The flow
-        is on this branch while D2D2 L_d > 0, about 2λgh²e^{2λq} < 1. Beyond this fold H⁺ has several values, and is NaN
-        where A/B < 0.
-        """
-        m, g, lam = self.m, self.g, self.lam
-        h = as_step(h, q0)
-        S, t = self.coefficients(h)
-        B = m / (lam * S)
-        a = 2 * lam * s0 + m * g * h * (0.5 * t - torch.exp(2 * lam * q0[..., 0]))
-        p = p1[..., 0]
-        # As h → 0, B → ±∞ with the sign of λ. A root of the same sign does not cancel B on the near-identity branch.
-        root = torch.sign(B) * torch.sqrt(B**2 + 4 * (B + a) * p)
-        q1 = q0 + (torch.log1p(2 * (p - a) / (B + 2 * a + root)) / lam)[..., None]
-        return (p1 * q1).sum(-1) - self(q0, q1, s0, h)
-
-    def H_minus(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
-        """H⁻ = −p0·q0 − (s1 − s0), q0 = q1 + ln(y)/λ, where (a − B)y² + By = p0, on the branch that tends to q1.
-
-        B = m/(λS) and a = 2λs1 − mgh(t/2 − e^{2λq1}), from p0 = ∂s0/∂q0 at fixed (q1, s1); the code solves for y − 1,
-        which is O(h). Along the flow y = C − λv0S, on this branch while 2(1 − a/B)y > 1. Beyond this fold H⁻ has
-        several values, and is NaN where the root is not real.
-        """
-        m, g, lam = self.m, self.g, self.lam
-        h = as_step(h, q1)
-        S, t = self.coefficients(h)
-        B = m / (lam * S)
-        a = 2 * lam * s1 - m * g * h * (0.5 * t - torch.exp(2 * lam * q1[..., 0]))
-        p = p0[..., 0]
-        root = torch.sign(B) * torch.sqrt(B**2 - 4 * (B - a) * p)
-        delta = -torch.log1p(2 * (a - p) / (B - 2 * a + root)) / lam
-        q0 = q1 - delta[..., None]
-        # L_d = e^{2λΔ}s0 − s0 + A, solved for s1 − s0 at fixed s1.
-        A = self(q0, q1, torch.zeros_like(s1), h)
-        increment = A * torch.exp(-2 * lam * delta) - torch.expm1(-2 * lam * delta) * s1
-        return -(p0 * q0).sum(-1) - increment
 
     def strang_exponential(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
         """L_d = (e^{2λΔ}−1)(s0 − hV0/2) + (m/2λ²h)(e^{λΔ}−1)² − (h/2)(V0+V1): order 2, explicit, c = e^{2λΔ}."""
@@ -198,8 +137,6 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
         q_range=(50.0, 150.0),
         v_range=(-20.0, 5.0),
         h=0.1,
-        H_plus=L_d.H_plus,
-        H_minus=L_d.H_minus,
         examples=({"m": 1.4, "g": 7.0, "lam": 0.012},),
     )
 

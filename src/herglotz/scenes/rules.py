@@ -51,7 +51,7 @@ def right(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tenso
 
     c = 1/(1 − hL_s) for linear damping.
     """
-    return _implicit(lambda x: h * L(q1, v, s0 + x), q0, q1, s0, h)
+    return implicit(lambda x: h * L(q1, v, s0 + x), q0, q1, s0, h)
 
 
 @_rule
@@ -61,7 +61,7 @@ def midpoint(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Te
     The rule is its own adjoint. L_d is NaN where Newton's method for the scalar does not converge.
     """
     q = 0.5 * (q0 + q1)
-    return _implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
+    return implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
 
 
 @_rule
@@ -84,7 +84,7 @@ def trapezoid(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: T
     c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
     """
     start = L(q0, v, s0)
-    return _implicit(lambda x: 0.5 * h * (start + L(q1, v, s0 + x)), q0, q1, s0, h)
+    return implicit(lambda x: 0.5 * h * (start + L(q1, v, s0 + x)), q0, q1, s0, h)
 
 
 @_rule
@@ -133,7 +133,7 @@ def all_rules(L: Lagrangian) -> dict[str, DiscreteLagrangian]:
     return {name: rule(L) for name, rule in RULES.items()}
 
 
-def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+def implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """The scalar x = action(x) of each sample, by Newton's method from 0; NaN without convergence.
 
     Newton's method runs outside the graph. If the action requires a gradient, `EXACT_DERIVATIVES` further steps inside
@@ -141,18 +141,14 @@ def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Te
     """
     start = s0.new_zeros(*torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape), 1)
 
-    def g(x: Tensor) -> Tensor:
-        return action(x[..., 0])[..., None]
-
-    def equations(x: Tensor) -> tuple[Tensor, Tensor]:
-        value, slope = jacobian(g, x)
-        return x - value, 1.0 - slope
+    def missed(x: Tensor) -> Tensor:
+        return x - action(x[..., 0])[..., None]
 
     # After a move below √eps the next move is below rounding.
     tol = torch.finfo(start.dtype).eps ** 0.5
-    root = find_root(equations, start, 1.0 + start, iterations=MAX_NEWTON, tol=tol)
+    root = find_root(lambda x: jacobian(missed, x), start, 1.0 + start, iterations=MAX_NEWTON, tol=tol)
     x = root.x + root.move
-    if torch.is_grad_enabled() and g(x).requires_grad:
+    if torch.is_grad_enabled() and missed(x).requires_grad:
         for _ in range(EXACT_DERIVATIVES):
-            x = x - solve(root.J, x - g(x))
+            x = x - solve(root.J, missed(x))
     return torch.where(root.converged, x[..., 0], torch.nan)

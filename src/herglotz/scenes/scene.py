@@ -13,7 +13,6 @@ from herglotz.mechanics import DiscreteLagrangian
 StateFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 State = tuple[Tensor, Tensor, Tensor]
 Step = Tensor | float
-DiscreteHamiltonian = Callable[[Tensor, Tensor, Tensor, Step], Tensor]
 Range = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]  # (low, high), numbers or (n,) each
 
 
@@ -36,9 +35,6 @@ class Scene:
         The principal discrete Lagrangian L_d(q0, q1, s0, h); `exact`: L_d generates `flow` exactly.
     L_d_rules
         The discretisations of this scene by name, none of them exact.
-    H_plus, H_minus
-        Right and left discrete Hamiltonians of `L_d`, H⁺(q0, p1, s0, h) and H⁻(p0, q1, s1, h) with the conventions of
-        errata E5 and E9; None where no closed form is known.
     q_range, v_range, h
         Ranges of initial positions and velocities, and the step, of examples and generated data. A range (low, high)
         has two numbers, or two tuples of `dof` numbers.
@@ -70,8 +66,6 @@ class Scene:
     v_range: Range
     h: float
     time_unit: str = "s"
-    H_plus: DiscreteHamiltonian | None = None
-    H_minus: DiscreteHamiltonian | None = None
     numerical: DiscreteLagrangian | None = None
     examples: tuple[Mapping[str, float], ...] = ()
     at: Callable[[Tensor], Scene] | None = None
@@ -90,11 +84,6 @@ class Scene:
     def angles(self) -> tuple[bool, ...]:
         """(n,) whether each coordinate is an angle, in rad."""
         return tuple(unit == "rad" for unit in self.units)
-
-
-def left_of(H_plus: DiscreteHamiltonian) -> DiscreteHamiltonian:
-    """H⁻(p0, q1, s1, h) = −H⁺(q1, p0, s1, −h) of an exact L_d: the step of −h is the step back."""
-    return lambda p0, q1, s1, h: -H_plus(q1, p0, s1, -h)
 
 
 def require_positive(scene: str, **numbers: float) -> None:

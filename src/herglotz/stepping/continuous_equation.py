@@ -48,25 +48,19 @@ def inverse_step(L_d: DiscreteLagrangian, state: State, h: Tensor | float, guess
     q1, p1, s1 = state
     n = q1.shape[-1]
 
-    def at(y: Tensor, order: int) -> Partials:
-        return partials(L_d, y[..., :n], q1, y[..., n], h, order)
+    def at(y: Tensor) -> Partials:
+        return partials(L_d, y[..., :n], q1, y[..., n], h)
 
-    def equation(y: Tensor, P: Partials) -> Tensor:
+    def missed(y: Tensor) -> Tensor:
+        P = at(y)
         return torch.cat([momentum_plus(P) - p1, (y[..., n] + P.L - s1)[..., None]], -1)
-
-    def equations(y: Tensor) -> tuple[Tensor, Tensor]:
-        P = at(y, 2)
-        slope, by_s = P.D12.mT, P.D23
-        if P.force is not None:
-            slope, by_s = slope + P.force.plus_1, by_s + P.force.plus_3
-        rows = torch.cat([slope, by_s[..., None]], -1)
-        return equation(y, P), torch.cat([rows, torch.cat([P.D1, P.c[..., None]], -1)[..., None, :]], -2)
 
     here = torch.cat([q1, s1[..., None]], -1)
     start = here if guess is None else guess
-    root = find_root(equations, start.detach(), scale=(here.abs() + (here - start).abs()).detach())
-    y = root.with_slope(lambda y: equation(y, at(y, 1)))
-    P = at(y, 1)
+    scale = (here.abs() + (here - start).abs()).detach()
+    root = find_root(lambda y: jacobian(missed, y), start.detach(), scale)
+    y = root.with_slope(missed)
+    P = at(y)
     status = torch.where(root.converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS)).to(torch.uint8)
     return Step.of(State(y[..., :n], momentum_minus(P), y[..., n]), P.c, status, root.error, root.iterations)
 
@@ -128,11 +122,12 @@ class ContinuousEquation:
     def momentum(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         """The momentum p with q̇ = v, shape (..., n), without a graph; NaN where Newton's method finds no p."""
 
-        def equations(p: Tensor) -> tuple[Tensor, Tensor]:
-            q_dot, J = jacobian(lambda p: self.field(q, p, s)[0], p)
-            return q_dot - v, J
+        def missed(p: Tensor) -> Tensor:
+            return self.field(q, p, s)[0] - v
 
-        return find_root(equations, momentum_plus(partials(self.L_d, q - self.h * v, q, s, self.h))).solved
+        return find_root(
+            lambda p: jacobian(missed, p), momentum_plus(partials(self.L_d, q - self.h * v, q, s, self.h))
+        ).solved
 
     def lagrangian(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         """The modified contact Lagrangian L̃(q, v, s) = ṡ at the momentum of v, shape (...), without a graph."""

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian, Forces, Partials, momentum_jacobian, momentum_residual, partials
+from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus
 from herglotz.mechanics.newton import Point, attached
 from herglotz.models import ContactLagrangian
@@ -99,21 +100,15 @@ def legendre(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tensor
 
 
 def _symmetric(L_d: DiscreteLagrangian, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Legendre:
-    """The mean of FL⁻ and FL⁺ over a step with q in its middle. `by_v` lacks terms of O(h²)."""
-    half = (h / 2)[..., None] * v
-    q0, q1 = q - half, q + half
-    P = partials(L_d, q0, q1, s - partials(L_d, q0, q1, s, h).L / 2, h, 2)
-    before, after, c = momentum_minus(P), momentum_plus(P), P.c[..., None]
-    # The derivative of s0 by v.
-    by_s = -(h / 4)[..., None] * (P.D2 - P.D1)
-    minus, plus = P.D12 - P.D11, P.D22 - P.D12.mT
-    if P.force is not None:
-        minus, plus = minus + P.force.minus_2 - P.force.minus_1, plus + P.force.plus_2 - P.force.plus_1
-    half_h, c_ = (h / 2)[..., None, None], c[..., None]
-    minus = -(minus + before[..., :, None] * (P.D23 - P.D13)[..., None, :]) / c_ * half_h
-    minus = minus - ((P.D13 + before * P.D33[..., None]) / c)[..., :, None] * by_s[..., None, :]
-    plus = plus * half_h + P.D23[..., :, None] * by_s[..., None, :]
-    return Legendre((before + after) / 2, (minus + plus) / 2)
+    """The mean of FL⁻ and FL⁺ over a step with q in its middle."""
+
+    def mean(v: Tensor) -> Tensor:
+        half = (h / 2)[..., None] * v
+        q0, q1 = q - half, q + half
+        P = partials(L_d, q0, q1, s - partials(L_d, q0, q1, s, h).L / 2, h)
+        return (momentum_minus(P) + momentum_plus(P)) / 2
+
+    return Legendre(*jacobian(mean, v))
 
 
 class _AtVelocity:

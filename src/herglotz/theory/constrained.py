@@ -17,8 +17,6 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import (
     DiscreteLagrangian,
-    Partials,
-    momentum_jacobian,
     momentum_plus,
     momentum_residual,
     partials,
@@ -103,17 +101,10 @@ class ConstrainedStepper(OneStepMethod):
         Dg0 = self._rows(q0)[1]
         m = Dg0.shape[-2]
 
-        def balance(x: Tensor, order: int) -> tuple[Tensor, Tensor, Partials]:
-            P = partials(self.L_d, q0, x[..., :n], s0, h, order)
-            g1, Dg1 = self._rows(x[..., :n])
-            F = torch.cat([momentum_residual(P, p0) - (Dg0.mT @ x[..., n:, None])[..., 0], g1], -1)
-            return F, Dg1, P
-
-        def equations(x: Tensor) -> tuple[Tensor, Tensor]:
-            F, Dg1, P = balance(x, 2)
-            upper = torch.cat([momentum_jacobian(P, p0), -Dg0.mT], -1)
-            lower = torch.cat([Dg1, Dg1.new_zeros(*Dg1.shape[:-1], m)], -1)
-            return F, torch.cat([upper, lower], -2)
+        def balance(x: Tensor) -> Tensor:
+            P = partials(self.L_d, q0, x[..., :n], s0, h)
+            left = momentum_residual(P, p0) - (Dg0.mT @ x[..., n:, None])[..., 0]
+            return torch.cat([left, self.constraint(x[..., :n])], -1)
 
         with torch.no_grad():
             if guess is None:
@@ -127,20 +118,19 @@ class ConstrainedStepper(OneStepMethod):
             impulse = (P.c[..., None] * p0).abs() + P.D1.abs()
             impulse = (impulse.amax(-1, keepdim=True) / slope).expand_as(start[..., n:])
             scale = torch.cat([size.expand(q0.shape), impulse], -1)
-            root = find_root(equations, start, scale)
-        x = root.with_slope(lambda x: balance(x, 1)[0])
+            root = find_root(lambda x: jacobian(balance, x), start, scale)
+        x = root.with_slope(balance)
         return x[..., :n], x[..., n:], root
 
     def _projected(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         """The momentum p + Dgᵀμ with Dg·v = 0. Where v is linear in p, one Newton step finds μ."""
         Dg = self._rows(q)[1]
 
-        def equations(mu: Tensor) -> tuple[Tensor, Tensor]:
-            v, v_p = jacobian(lambda p: self.velocity(q, p, s), p + (Dg.mT @ mu[..., None])[..., 0])
-            return (Dg @ v[..., None])[..., 0], Dg @ v_p @ Dg.mT
+        def missed(mu: Tensor) -> Tensor:
+            return (Dg @ self.velocity(q, p + (Dg.mT @ mu[..., None])[..., 0], s)[..., None])[..., 0]
 
         start = p.new_zeros(*p.shape[:-1], Dg.shape[-2])
         scale = (p.detach().abs().amax(-1) / Dg.detach().abs().amax((-2, -1)))[..., None].expand(start.shape)
-        root = find_root(equations, start, scale, iterations=MAX_PROJECTION_STEPS)
-        mu = root.with_slope(lambda mu: equations(mu)[0])
+        root = find_root(lambda mu: jacobian(missed, mu), start, scale, iterations=MAX_PROJECTION_STEPS)
+        mu = root.with_slope(missed)
         return p + (Dg.mT @ mu[..., None])[..., 0]

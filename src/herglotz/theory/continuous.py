@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import join
+from herglotz.mechanics.contact import jacobian, join
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import Hamiltonian, Lagrangian, ScalarField, derivatives, gradient
 from herglotz.theory.contact_manifolds import Field, Function, prolongation
@@ -104,18 +104,17 @@ def fiber_inverse(
     """
     q, y = torch.broadcast_tensors(q, y)
 
-    def equation(x: Tensor) -> tuple[Tensor, Tensor]:
-        P = derivatives(f, q, x, s, order=2)
-        return P.D2 - y, P.D22
+    def missed(x: Tensor) -> Tensor:
+        return fiber_derivative(f, q, x, s) - y
 
-    root = find_root(equation, y)
+    root = find_root(lambda x: jacobian(missed, x), y)
     if not bool(root.converged.all()):
         sample = tuple(int(i) for i in (~root.converged).nonzero()[0])
         raise InputError(
             f"Legendre transform: no x with f_x = {y[sample].tolist()} found at sample {sample} (after "
             f"{root.iterations} Newton steps); check that a solution exists and that f_xx is not singular"
         )
-    return root.with_slope(lambda x: fiber_derivative(f, q, x, s) - y)
+    return root.with_slope(missed)
 
 
 def legendre_dual(f: ScalarField) -> ScalarField:

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import join, split
-from herglotz.mechanics.newton import attached, find_root
-from herglotz.mechanics.partials import Hamiltonian, gradient, square_jacobian
+from herglotz.mechanics.contact import jacobian, join, split
+from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.partials import Hamiltonian, gradient
 from herglotz.stepping.rollout import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 from herglotz.theory.contact_manifolds import sharp_bivector
@@ -58,20 +58,16 @@ class EvolutionStepper(OneStepMethod):
         h = check_h(h, q)
         x0 = join(q, p, s)
 
-        def linearised(delta: Tensor) -> tuple[Tensor, Tensor]:
-            G, J = square_jacobian(lambda d: self._equation(x0, d, h)[0], delta)
-            return G, J
+        def missed(delta: Tensor) -> Tensor:
+            return self._equation(x0, delta, h)[0]
 
         with torch.no_grad():
             euler = h[..., None] * join(*FIELDS[self.field](self.H, q, p, s))
             scale = (x0.abs() + euler.abs()).amax(-1, keepdim=True)
-            root = find_root(linearised, euler, scale)
-        delta = root.x
+            root = find_root(lambda delta: jacobian(missed, delta), euler, scale)
+        delta = root.with_slope(missed)
         G, rate = self._equation(x0, delta, h)
         status = status_of_root(root, torch.isfinite(G.detach()).all(-1))
-        if G.requires_grad:
-            delta = attached(delta, root.J, G)
-            rate = self._equation(x0, delta, h)[1]
         new, c = State(*split(x0 + delta)), (1 - h * rate / 2) / (1 + h * rate / 2)
         return Step.of(new, c, status, root.error, root.iterations)
 

@@ -37,7 +37,7 @@ from herglotz.mechanics.legendre import least_singular_value
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.stepping import State, Stepper
-from herglotz.theory.contact_manifolds import Function, FunctionGerm, germ, prolongation
+from herglotz.theory.contact_manifolds import Function, germ, prolongation
 from herglotz.theory.hamiltonian_dynamics import LeftHamiltonian, RightHamiltonian
 
 
@@ -158,13 +158,7 @@ class Quadratic:
 
     def __call__(self, q: Tensor) -> Tensor:
         """S(q), shape (...)."""
-        return self.germ(q).S
-
-    def germ(self, q: Tensor) -> FunctionGerm:
-        """Value and derivatives."""
-        force = (self.alpha @ q[..., None])[..., 0]
-        S = (0.5 * force * q + self.beta * q).sum(-1) + self.delta
-        return FunctionGerm(S, force + self.beta, self.alpha.expand(*q.shape, q.shape[-1]))
+        return ((0.5 * (self.alpha @ q[..., None])[..., 0] + self.beta) * q).sum(-1) + self.delta
 
 
 @dataclass(frozen=True)
@@ -179,12 +173,6 @@ class PointSource:
     def __call__(self, y: Tensor) -> Tensor:
         """S¹(y), shape (...)."""
         return self.s + value(self.L_d, self.q, y, self.s, self.h)
-
-    def germ(self, y: Tensor) -> FunctionGerm:
-        """Value and derivatives."""
-        q = self.q.expand(y.shape)
-        P = partials(self.L_d, q, y, self.s.expand(y.shape[:-1]), self.h, order=2)
-        return FunctionGerm(self.s + P.L, P.D2, P.D22)
 
 
 def projected_flow(flow: Flow, S: Function, q: Tensor) -> Tensor:
@@ -311,7 +299,7 @@ def check(
     ----------
     S0, S1
         Functions on Q, (..., n) → (...), whose values are values of s. Their derivatives come from a method `germ`
-        (`Quadratic`, `PointSource`, `Propagated`), or else from autograd.
+        (`Propagated`), or else from autograd.
     q
         (B, n) positions q_k that represent an open set: they spread in all n directions. On a single trajectory the
         equations determine nothing (erratum E7).

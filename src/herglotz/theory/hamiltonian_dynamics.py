@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import scaled_margin
-from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.newton import find_root, solve
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
+from herglotz.scenes.rules import implicit
+from herglotz.scenes.special import as_step
 
 
 class LeftLagrangian:
@@ -20,8 +23,9 @@ class LeftLagrangian:
 
     1 − D3L⁻ = 1/c,    p0 = −D1L⁻,    p1 = D2L⁻ / (1 − D3L⁻).
 
-    Newton's method solves the scalar equation from s0 = s1. The slope of the equation is c: the solution is unique if
-    c > 0 for every s0. Value and derivatives are NaN where c = 0 or no solution is found; `regularity` names the cause.
+    L⁻ solves the scalar equation x = L_d(q0, q1, s1 − x), by Newton's method from 0. The slope of the equation is c:
+    the solution is unique if c > 0 for every s0. L⁻ is three times differentiable, and NaN where c = 0 or no solution
+    is found; `regularity` names the cause. Calls raise InputError if L_d comes with forces.
 
     Source: erratum E5, for the paper's L_d(q_k, q_{k+1}, s_{k+1}) in the left discrete Hamiltonian.
     """
@@ -29,61 +33,12 @@ class LeftLagrangian:
     def __init__(self, L_d: DiscreteLagrangian):
         self.L_d = L_d
 
-    def previous_action(
-        self,
-        q0: Tensor,  # (..., n)
-        q1: Tensor,  # (..., n)
-        s1: Tensor,  # (...)
-        h: Tensor | float,
-    ) -> Tensor:
-        """s0 with s0 + L_d(q0, q1, s0) = s1, shape (...), without a graph; NaN where no s0 exists."""
-
-        def equations(x: Tensor) -> tuple[Tensor, Tensor]:
-            P = partials(self.L_d, q0, q1, x[..., 0], h)
-            return (x[..., 0] + P.L - s1)[..., None], P.c[..., None, None]
-
-        with torch.no_grad():
-            q0, q1, s1 = q0.detach(), q1.detach(), s1.detach()
-            shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s1.shape, torch.as_tensor(h).shape)
-            return find_root(equations, s1.expand(shape)[..., None]).solved[..., 0]
-
     def __call__(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
-        """L⁻, shape (...), three times differentiable: the graph holds two Newton steps of value zero."""
-        s0 = self.previous_action(q0, q1, s1, h)
-        if torch.is_grad_enabled():
-            for _ in range(2):
-                P = partials(self.L_d, q0, q1, s0, h)
-                s0 = s0 - (s0 + P.L - s1) / P.c
-        return s1 - s0
-
-    def partials(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float, order: int = 1) -> Partials:
-        """Value and derivatives of L⁻ with respect to (q0, q1, s1), by the implicit-function theorem.
-
-        With g = ∂s0 = (−D1, −D2, 1)/c, D_aD_b L⁻ = (D_ab + D_a3 g_b + g_a D_b3 + D33 g_a g_b)/c. The attribute `c` of
-        the result is 1 + D3L⁻; the conformal factor is 1/(1 − D3L⁻). Raise InputError if L_d comes with forces, which
-        have no left Lagrangian.
-        """
-        s0 = self.previous_action(q0, q1, s1, h)
-        P = unforced(partials(self.L_d, q0, q1, s0, h, order))
-        c = P.c
-        g1, g2, g3 = -P.D1 / c[..., None], -P.D2 / c[..., None], 1 / c
-        first = (s1 - s0, -g1, -g2, 1 - g3)
-        if order == 1:
-            return Partials(*first)
-
-        def block(D: Tensor, a3: Tensor, a: Tensor, b3: Tensor, b: Tensor) -> Tensor:
-            outer = a3[..., :, None] * b[..., None, :] + a[..., :, None] * (b3 + P.D33[..., None] * b)[..., None, :]
-            return (D + outer) / c[..., None, None]
-
-        return Partials(
-            *first,
-            D11=block(P.D11, P.D13, g1, P.D13, g1),
-            D12=block(P.D12, P.D13, g1, P.D23, g2),
-            D22=block(P.D22, P.D23, g2, P.D23, g2),
-            D13=(P.D13 + P.D33[..., None] * g1) * (g3 / c)[..., None],
-            D23=(P.D23 + P.D33[..., None] * g2) * (g3 / c)[..., None],
-            D33=P.D33 * g3**2 / c,
-        )
+        """L⁻, shape (...)."""
+        h = as_step(h, q0)
+        with torch.no_grad():
+            unforced(partials(self.L_d, q0, q1, s1, h))
+        return implicit(lambda x: self.L_d(q0, q1, s1 - x, h), q0, q1, s1, h)
 
 
 def unforced(P: Partials) -> Partials:
@@ -99,7 +54,7 @@ def right_hamiltonian_on_flow(q1: Tensor, p1: Tensor, L: Tensor) -> Tensor:
 
 
 class RightHamiltonian:
-    """H⁺(q0, p1, s0) = p1·q1 − L_d(q0, q1, s0) where D2L_d(q0, q1, s0) = p1, with its derivatives.
+    """H⁺(q0, p1, s0) = p1·q1 − L_d(q0, q1, s0) where D2L_d(q0, q1, s0) = p1.
 
     D1H⁺ = −D1L_d,    D2H⁺ = q1,    D3H⁺ = −D3L_d  (envelope theorem).
 
@@ -116,50 +71,38 @@ class RightHamiltonian:
 
     def position(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
         """q1 with D2L_d(q0, q1, s0) = p1, without a graph; shape (..., n), NaN where there is none."""
-
-        def equations(q1: Tensor) -> tuple[Tensor, Tensor]:
-            P = partials(self.L_d, q0, q1, s0, h, order=2)
-            return P.D2 - p1, P.D22
-
-        with torch.no_grad():
-            shape = torch.broadcast_shapes(q0.shape[:-1], p1.shape[:-1], s0.shape, torch.as_tensor(h).shape)
-            q0, p1 = (x.detach().broadcast_to(*shape, x.shape[-1]) for x in (q0, p1))
-            s0 = s0.detach().broadcast_to(shape)
-            start = q0 if self.near is None else self.near.broadcast_to(q0.shape)
-            q1 = find_root(equations, start).solved
-            P = unforced(partials(self.L_d, q0, q1, s0, h, order=2))
-            # D22 is inverted. It is singular where its margin is rounding of the blocks of L_d.
-            fold = ~(scaled_margin(P.D22, P.D12, P.D11, P.D22) > 1e3 * torch.finfo(q1.dtype).eps)
-            return torch.where(fold[..., None], torch.nan, q1)
+        return self._solved(q0, p1, s0, h)[0]
 
     def __call__(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
-        """H⁺, shape (...); once differentiable, since H⁺ is stationary in q1."""
-        q1 = self.position(q0, p1, s0, h)
-        return right_hamiltonian_on_flow(q1, p1, value(self.L_d, q0, q1, s0, h))
+        """H⁺, shape (...); twice differentiable."""
+        q1, D22 = self._solved(q0, p1, s0, h)
+        H = right_hamiltonian_on_flow(q1, p1, value(self.L_d, q0, q1, s0, h))
+        if torch.is_grad_enabled():
+            # H⁺ is stationary in q1. A term of value 0 has the second derivatives due to q1.
+            F = partials(self.L_d, q0, q1, s0, h).D2 - p1
+            F = F - F.detach()
+            H = H + 0.5 * (F * solve(D22, F)).sum(-1)
+        return H
 
-    def partials(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1) -> Partials:
-        """H⁺ and its derivatives with respect to (q0, p1, s0), by the Legendre transform in the second argument."""
-        q1 = self.position(q0, p1, s0, h)
-        P = partials(self.L_d, q0, q1, s0, h, order)
-        first = (right_hamiltonian_on_flow(q1, p1, P.L), -P.D1, q1, -P.D3)
-        if order == 1:
-            return Partials(*first)
-        G = torch.linalg.inv_ex(P.D22)[0]
-        B = P.D12 @ G
-        v = (G @ P.D23[..., None])[..., 0]
-        return Partials(
-            *first,
-            D11=B @ P.D12.mT - P.D11,
-            D12=-B,
-            D22=G,
-            D13=(P.D12 @ v[..., None])[..., 0] - P.D13,
-            D23=-v,
-            D33=(P.D23 * v).sum(-1) - P.D33,
-        )
+    def _solved(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> tuple[Tensor, Tensor]:
+        """The position q1, NaN where there is none, and D22 there."""
+
+        def equations(q1: Tensor) -> tuple[Tensor, Tensor]:
+            P = unforced(partials(self.L_d, q0, q1, s0, h, order=2))
+            return P.D2 - p1, P.D22
+
+        shape = torch.broadcast_shapes(q0.shape[:-1], p1.shape[:-1], s0.shape, torch.as_tensor(h).shape)
+        start = (q0 if self.near is None else self.near).broadcast_to(*shape, q0.shape[-1])
+        q1 = find_root(equations, start).solved
+        with torch.no_grad():
+            P = partials(self.L_d, q0, q1, s0, h, order=2)
+            # D22 is inverted. It is singular where its margin is rounding of the blocks of L_d.
+            found = scaled_margin(P.D22, P.D12, P.D11, P.D22) > 1e3 * torch.finfo(q0.dtype).eps
+            return torch.where(found[..., None], q1, torch.nan), P.D22
 
 
 class LeftHamiltonian:
-    """H⁻(p0, q1, s1) = −p0·q0 − L⁻(q0, q1, s1) where p0 = −D1L⁻(q0, q1, s1), with its derivatives.
+    """H⁻(p0, q1, s1) = −p0·q0 − L⁻(q0, q1, s1) where p0 = −D1L⁻(q0, q1, s1).
 
     D1H⁻ = −q0,    D2H⁻ = −D2L⁻,    D3H⁻ = −D3L⁻  (envelope theorem).
 
@@ -171,41 +114,12 @@ class LeftHamiltonian:
     """
 
     def __init__(self, L_d: DiscreteLagrangian, near: Tensor | None = None):
-        self.mirror = RightHamiltonian(_Exchanged(LeftLagrangian(L_d)), near)
-
-    def position(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
-        """q0 with D1L⁻(q0, q1, s1) = −p0, without a graph; shape (..., n), NaN where there is none."""
-        return self.mirror.position(q1, -p0, s1, h)
+        left = LeftLagrangian(L_d)
+        self.mirror = RightHamiltonian(lambda q1, q0, s1, h: left(q0, q1, s1, h), near)
 
     def __call__(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
-        """H⁻, shape (...); once differentiable."""
+        """H⁻, shape (...); twice differentiable."""
         return self.mirror(q1, -p0, s1, h)
-
-    def partials(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float, order: int = 1) -> Partials:
-        """H⁻ and its derivatives with respect to (p0, q1, s1)."""
-        P = _exchanged(self.mirror.partials(q1, -p0, s1, h, order))
-        first = (P.L, -P.D1, P.D2, P.D3)
-        if order == 1:
-            return Partials(*first)
-        return Partials(*first, D11=P.D11, D12=-P.D12, D22=P.D22, D13=-P.D13, D23=P.D23, D33=P.D33)
-
-
-class _Exchanged:
-    """L⁻ as a function of (q1, q0, s)."""
-
-    def __init__(self, of: LeftLagrangian):
-        self.of = of
-
-    def __call__(self, q1: Tensor, q0: Tensor, s: Tensor, h: Tensor) -> Tensor:
-        return self.of(q0, q1, s, h)
-
-    def partials(self, q1: Tensor, q0: Tensor, s: Tensor, h: Tensor, order: int = 1) -> Partials:
-        return _exchanged(self.of.partials(q0, q1, s, h, order))
-
-
-def _exchanged(P: Partials) -> Partials:
-    D12 = P.D12 if P.D12 is None else P.D12.mT
-    return Partials(P.L, P.D2, P.D1, P.D3, P.D22, D12, P.D11, P.D23, P.D13, P.D33)
 
 
 # Both are functions of two vectors, a scalar and h.
@@ -248,11 +162,11 @@ def right_step(
     NaN where Newton's method finds no solution.
     """
 
-    def equations(p1: Tensor) -> tuple[Tensor, Tensor]:
-        P = partials(H_plus, q0, p1, s0, h, order=2)
-        return P.D1 - (1 - P.D3)[..., None] * p0, P.D12 + p0[..., :, None] * P.D23[..., None, :]
+    def missed(p1: Tensor) -> Tensor:
+        P = partials(H_plus, q0, p1, s0, h)
+        return P.D1 - (1 - P.D3)[..., None] * p0
 
-    p1 = find_root(equations, p0).solved
+    p1 = find_root(lambda p1: jacobian(missed, p1), p0).solved
     q1, _, s1 = right_equations(partials(H_plus, q0, p1, s0, h), p1, s0)
     return q1, p1, s1
 
@@ -270,19 +184,15 @@ def left_step(
     """
     n = q0.shape[-1]
 
-    def equations(x: Tensor) -> tuple[Tensor, Tensor]:
-        P = partials(H_minus, p0, x[..., :n], x[..., n], h, order=2)
-        q, _, s = left_equations(P, p0, x[..., n])
-        q_row = -torch.cat([P.D12, P.D13[..., None]], -1)
-        s_q = P.D2 - (p0[..., None, :] @ P.D12)[..., 0, :]
-        s_row = torch.cat([s_q, (1 + P.D3 - (p0 * P.D13).sum(-1))[..., None]], -1)
-        return torch.cat([q - q0, (s - s0)[..., None]], -1), torch.cat([q_row, s_row[..., None, :]], -2)
+    def missed(x: Tensor) -> Tensor:
+        q, _, s = left_equations(partials(H_minus, p0, x[..., :n], x[..., n], h), p0, x[..., n])
+        return torch.cat([q - q0, (s - s0)[..., None]], -1)
 
     start = torch.cat([q0, s0[..., None]], -1)
     # Positions and actions have different units, and so different scales.
     action = s0.abs() + (p0 * q0).sum(-1).abs()
     scale = torch.cat([q0.abs().amax(-1, keepdim=True).expand(q0.shape), action[..., None]], -1)
-    x = find_root(equations, start, torch.maximum(scale, start.abs())).solved
+    x = find_root(lambda x: jacobian(missed, x), start, torch.maximum(scale, start.abs())).solved
     q1, s1 = x[..., :n], x[..., n]
     _, p1, _ = left_equations(partials(H_minus, p0, q1, s1, h), p0, s1)
     return q1, p1, s1

@@ -88,18 +88,13 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
     is too large.
     """
 
-    def equation(x: Tensor, q1: Tensor, s1: Tensor) -> tuple[Tensor, Tensor]:
-        q0, s0 = x[..., :-1], x[..., -1]
-        p0, g_q, g_s = section_derivatives(gamma0, q0, s0)
-        P = partials(L_d, q0, q1, s0, h, order=2)
-        c = P.c[..., None]
-        E_q = P.D11 + p0[..., :, None] * P.D13[..., None, :] + c[..., None] * g_q
-        E_s = P.D13 + p0 * P.D33[..., None] + c * g_s
-        J = torch.cat([torch.cat([E_q, E_s[..., None]], -1), torch.cat([P.D1, c], -1)[..., None, :]], -2)
-        return torch.cat([momentum_residual(P, p0), (s0 + P.L - s1)[..., None]], -1), J
-
     def gamma1(q1: Tensor, s1: Tensor) -> Tensor:
-        root = find_root(lambda x: equation(x, q1, s1), torch.cat([q1, s1[..., None]], -1))
+        def missed(x: Tensor) -> Tensor:
+            q0, s0 = x[..., :-1], x[..., -1]
+            P = partials(L_d, q0, q1, s0, h)
+            return torch.cat([momentum_residual(P, gamma0(q0, s0)), (s0 + P.L - s1)[..., None]], -1)
+
+        root = find_root(lambda x: jacobian(missed, x), torch.cat([q1, s1[..., None]], -1))
         if not bool(root.converged.all()):
             sample = tuple(int(i) for i in (~root.converged).nonzero()[0])
             raise InputError(
@@ -107,7 +102,7 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
                 f"sample {sample}; use a smaller h, or points nearer to the image of the section"
             )
 
-        x = root.with_slope(lambda x: equation(x, q1, s1)[0])
+        x = root.with_slope(missed)
         return momentum_plus(partials(L_d, x[..., :-1], q1, x[..., -1], h))
 
     return gamma1

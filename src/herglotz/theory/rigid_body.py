@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.newton import attached, find_root
+from herglotz.mechanics.newton import find_root
 from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Status, Step, check_h, status_of_root, step_sizes
 
@@ -146,9 +146,7 @@ class RigidBodyStepper:
             # at a fold, where the determinant changes sign.
             wanted = ((f * f).sum(-1) < 1.0) & (torch.linalg.det(root.J) < 0)
             status = status_of_root(root, torch.isfinite(f).all(-1), root.converged & ~wanted)
-        if torch.is_grad_enabled() and g.requires_grad:
-            f = attached(f, root.J, _equation(g, J2, f)[0])
-        return f, status, root.error, root.iterations
+        return root.with_slope(lambda f: _equation(g, J2, f)[0]), status, root.error, root.iterations
 
 
 def _equation(g: Tensor, J2: Tensor, f: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import Forces, herglotz_residual, mixed_hessian, momentum_jacobian, momentum_plus, partials
+from herglotz.mechanics import (
+    Forces,
+    legendre_plus,
+    mixed_hessian,
+    momentum_jacobian,
+    momentum_residual,
+    partials,
+)
 from herglotz.mechanics.legendre import left_hessian, scaled_margin, soft_threshold, unheld_residual
 from herglotz.stepping import Status, solve
 from herglotz.theory import LeftHamiltonian, left_equations
@@ -120,11 +127,14 @@ def momentum_matching(subject: Subject, w: SampledRollout, bound: float) -> Chec
         error = error[both]
     else:
         q0, q1, q2 = (w.q[:, k : w.steps - 1 + k][both] for k in range(3))
-        s0, s1 = w.s[:, :-2][both], w.s[:, 1:-1][both]
+        k = torch.arange(w.steps - 1).expand_as(both)[both]
+        before, after = (subject.at(x).L_d for x in (k, k + 1))
+        assert before is not None
+        assert after is not None
         with torch.no_grad():
-            R = herglotz_residual(subject.L_d, q0, q1, q2, s0, subject.h, subject.h)
-            p1 = momentum_plus(partials(subject.L_d, q0, q1, s0, subject.h))
-            error = solve(momentum_jacobian(partials(subject.L_d, q1, q2, s1, subject.h, 2), p1), R)
+            _, p1, s1 = legendre_plus(before, q0, q1, w.s[:, :-2][both], subject.h)
+            P = partials(after, q1, q2, s1, subject.h, 2)
+            error = solve(momentum_jacobian(P, p1), momentum_residual(P, p1))
     return Check.at_most("momentum", statement, worst(error.abs().amax(-1) / size), bound, note)
 
 

@@ -7,7 +7,6 @@ every identity; only differences of the map show the dependence.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +49,11 @@ class SampledRollout:
         return moves if self.sticks else torch.ones_like(moves)
 
     @property
+    def numbers(self) -> Tensor:
+        """The numbers k of the steps that are ok."""
+        return torch.arange(self.steps).expand_as(self.c)[self.ok]
+
+    @property
     def starts(self) -> State:
         """The states before the steps that are ok."""
         return State(*(x[:, :-1][self.ok] for x in (self.q, self.p, self.s)))
@@ -67,10 +71,11 @@ class SampledRollout:
 
 def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
     """Roll out from the subject's states and differentiate every step by autograd."""
-    frozen = _FrozenOnFailure(subject.step, subject.h)
+    frozen = _FrozenOnFailure(subject)
     with torch.no_grad():
         out = frozen.rollout(*subject.states, h=subject.h, steps=steps)
-    _, D = flow_derivative(subject.flow(), *(x[:, :-1].flatten(0, 1) for x in (out.q, out.p, out.s)))
+    each = subject.at(torch.arange(steps).repeat(len(out.s)))
+    _, D = flow_derivative(each.flow(), *(x[:, :-1].flatten(0, 1) for x in (out.q, out.p, out.s)))
     c = torch.stack(frozen.factors, 1)
     return SampledRollout(out.q, out.p, out.s, c, out.status, D.unflatten(0, (-1, steps)), subject.sticks)
 
@@ -78,13 +83,13 @@ def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
 class _FrozenOnFailure(Map):
     """The map with the identity for samples whose step failed, because a batch needs finite inputs."""
 
-    def __init__(self, one: Callable[[State, float], Step], h: float):
-        super().__init__(one, h)
+    def __init__(self, subject: Subject):
+        super().__init__(subject)
         self.factors: list[Tensor] = []
 
-    def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
-        """One step; a sample that is not finite is DIVERGED. The factors c of all steps are kept."""
-        step = self.one(state, self.h)
+    def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:
+        """The next step; a sample that is not finite is DIVERGED. The factors c of all steps are kept."""
+        step = super().step(state, h, guess)
         self.factors.append(step.c)
         good = torch.isfinite(torch.cat([*step.state[:2], step.state.s[:, None]], -1)).all(-1)
         status = torch.where(~good & (step.status == Status.CONVERGED), int(Status.DIVERGED), step.status)

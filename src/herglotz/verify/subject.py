@@ -25,6 +25,7 @@ from herglotz.models import ContactLagrangian, capabilities
 from herglotz.scenes import Scene, scene, scene_names
 from herglotz.stepping import OneStepMethod, Rollout, State, Step, Stepper
 from herglotz.stepping.state import check_batch
+from herglotz.theory import TimeDependent
 from herglotz.training import Run, load_run
 
 # Largest number of coordinates that is tried on a function.
@@ -120,24 +121,34 @@ class Subject:
         """The source of the derivative that is judged, for the table."""
         return "the file's" if self.metadata and self.kind != "pt2" else "autograd"
 
-    def flow(self, k: int = 1) -> Flow:
-        """Return the k-step map (q, p, s) → (q_k, p_k, s_k); a sample whose step failed is NaN."""
-        return lambda q, p, s: self.rollout(State(q, p, s), k).final
+    def at(self, k: int | Tensor) -> Subject:
+        """Return the subject of step k, () or (...); each step has its own L_d if L_d depends on time."""
+        if not isinstance(self.L_d, TimeDependent):
+            return self
+        t = self.L_d.t0 + self.h * torch.as_tensor(k).to(self.states.s)
+        L_d = self.L_d.at(t[..., None])
+        return replace(self, L_d=L_d, step=Stepper(L_d).step)
+
+    def flow(self, k: int = 1, first: int = 0) -> Flow:
+        """Return the map (q, p, s) → (q_k, p_k, s_k) of k steps from step `first` on; NaN where a step failed."""
+        return lambda q, p, s: Map(self, first).rollout(q, p, s, h=self.h, steps=k).final
 
     def rollout(self, start: State, steps: int) -> Rollout:
         """Roll the map out from `start`."""
-        return Map(self.step, self.h).rollout(*start, h=self.h, steps=steps)
+        return Map(self).rollout(*start, h=self.h, steps=steps)
 
 
 class Map(OneStepMethod):
-    """A step map at one number h as a stepper, for `OneStepMethod.rollout`."""
+    """The steps of a subject from step `first` on as a stepper, for `OneStepMethod.rollout`."""
 
-    def __init__(self, one: Callable[[State, float], Step], h: float):
-        self.one, self.h = one, h
+    def __init__(self, subject: Subject, first: int = 0):
+        self.subject, self.next = subject, first
 
     def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
-        """One step."""
-        return self.one(state, self.h)
+        """The next step."""
+        step = self.subject.at(self.next).step(state, self.subject.h)
+        self.next += 1
+        return step
 
 
 def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:

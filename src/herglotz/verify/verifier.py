@@ -14,7 +14,7 @@ from herglotz.theory import Symmetries, TimeDependent, symmetries as of_lagrangi
 from herglotz.theory.symmetries import PRECISION
 from herglotz.threads import one_thread
 from herglotz.training import Run
-from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, in_time, left_hamilton_jacobi
+from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi, time_form
 from herglotz.verify.data_checks import data_checks
 from herglotz.verify.legendre import (
     NO_H_MINUS,
@@ -106,9 +106,10 @@ def verify(
     known = subject(target, h, samples, seed)
     strict, identity = _bounds(known, tolerance)
     details = _details(known, steps, seed)
-    if isinstance(known.L_d, TimeDependent):
-        return Report(known.name, tuple(in_time(known, known.L_d, steps, strict, identity)), details)
     w = sampled_rollout(known, steps)
+    if isinstance(known.L_d, TimeDependent):
+        of_time = _of_a_map_in_time(known, w, strict, identity, fan(known, steps, seed + 1))
+        return Report(known.name, tuple(of_time), details)
     behind = replace(known, L_d=model) if known.forced else known
     force = forces(behind, w)
     checks = [convergence(w), positive_factor(w), regularity(known, w)]
@@ -167,6 +168,13 @@ def _of_a_contact_map(
     if not left:
         return [*checks, *NO_H_MINUS]
     return [*checks, left_formalism(known, w, loose[1]), left_hamilton_jacobi(known, f, bound)]
+
+
+def _of_a_map_in_time(known: Subject, w: SampledRollout, strict: float, bound: float, f: Fan) -> list[Check]:
+    """The identities of steps of a time-dependent L_d, of which step k begins at t_k = t0 + kh."""
+    checks = [convergence(w), positive_factor(w), contact(w, strict), volume(w, bound), time_form(known, w, bound)]
+    checks += [momentum_matching(known, w, bound), *derivatives(f, bound, bound)]
+    return [*checks, hamilton_jacobi(known, f, bound), left_hamilton_jacobi(known, f, bound)]
 
 
 def _details(known: Subject, steps: int, seed: int) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def test_the_residual_is_rounding_on_the_flow():
     figure: Any = plot_hamilton_jacobi_residual(pendulum, h=0.1)
     table, _, bar = figure.axes
     image = table.images[0]
-    momenta = point_fan(pendulum, 31, 0.1).start.p[:, 0]
+    momenta = point_fan(pendulum, 31, 0.1).states.p[:, 0]
     left, right, bottom, top = image.get_extent()
     assert ((right - left) / 31, left + (right - left) / 62) == pytest.approx(
         (float(momenta[1] - momenta[0]), float(momenta[0]))
@@ -145,7 +145,7 @@ def orbit(q, p, s, steps: int, h: float):
 def test_off_the_flow_the_equation_is_between_two_solutions_of_the_fan():
     # fails if a term of the residual or of its size is another one, or the curve belongs to another k or distance
     h, axes = 0.1, plot_hamilton_jacobi_residual(pendulum, h=0.1).axes
-    start = point_fan(pendulum, 31, h).start
+    start = point_fan(pendulum, 31, h).states
     q, p, s = start.q[:, 0].numpy(), start.p[:, 0].numpy(), start.s.numpy()
     here = orbit(q, p, s, 9, h)
     for line, k in zip(axes[1].lines, (1, 4, 8), strict=False):

@@ -1,4 +1,4 @@
-"""Closed forms against 50-digit motions at random parameters, with H⁺ = p1 q1 − L_d and H⁻ = −p0 q0 − L_d."""
+"""Closed forms against 50-digit motions at random parameters."""
 
 import mpmath as mp
 import pytest
@@ -66,22 +66,21 @@ def quadratic_drag(h, q0, v0, s0, m, lam):
 def oscillator_bounds(h, q0, v0, s0, m, omega0, gamma):  # noqa: ARG001
     size, action, t = abs(q0) + abs(v0), m * (q0**2 + v0**2) + abs(s0), min(h, 1.0)
     flow = 1e-14 * size, 1e-14 * m * size * (1 + omega0**2), 1e-14 * action
-    return *flow, 1e-14 * action / t, 1e-14 * action / t, 1e-14 * action / t**2, 2e-14 * action / h**2
+    return *flow, 1e-14 * action / t, 1e-14 * action / t, 1e-14 * action / t**2
 
 
 def parachute_bounds(h, q0, v0, s0, m, g, lam):
     # λ = 1e-6: t − 1 and e^{2λΔ} − 1 are small numbers divided by λ; their rounding grows like ε g h/λ.
     action = 2e-14 * (m * (v0**2 + g * abs(q0) + g * h) + abs(s0)) / h + 2e-16 * m * g * h / abs(lam)
     flow = 1e-14 * (abs(q0) + abs(v0) + 1), 1e-13 * m * (abs(v0) + g * h), action
-    return *flow, action, action / h, action / h, 10 * action / h
+    return *flow, action, action / h, action / h
 
 
 def drag_bounds(h, q0, v0, s0, m, rate):  # noqa: ARG001
-    bound = 2e-14 * (1 + m) / h
-    return *(bound,) * 6, 2 * bound
+    return (2e-14 * (1 + m) / h,) * 6
 
 
-# Largest errors of q1, p1 and s1 of the flow, then of L_d, p1, p0 and H±.
+# Largest errors of q1, p1 and s1 of the flow, then of L_d, p1 and p0.
 BOUNDS = {
     oscillator: oscillator_bounds, parachute: parachute_bounds, linear_drag: drag_bounds, quadratic_drag: drag_bounds,
 }  # fmt: skip
@@ -96,7 +95,6 @@ CASES = [
     (oscillator, 1.3, 1e-9, 0.4, 0.21),
     (oscillator, 1.3, 0.0, 0.4, 0.21),
     (oscillator, 1.3, 1.1, 1e-12, 0.21),
-    # seeds whose steps stay before the fold of H⁺
     *((parachute, *draws(i, (0.3, 3), (1, 20), (0.003, 0.2), (0.01, 0.8))) for i in range(1, 5)),
     (parachute, 1.7, 0.0, 0.05, 0.3),
     (parachute, 1.7, 9.81, 1e-6, 0.3),
@@ -114,25 +112,20 @@ CASES = [
 @pytest.mark.parametrize("case", range(len(CASES)))
 def test_against_50_digits(case):
     # fails if one damping regime uses another's formula, critical damping divides by ω = 0, a power of m, Ω, g, γ or λ
-    # is off (defaults of 1 hide them), a small γ or λ cancels, or H± has another branch or sign
+    # is off (defaults of 1 hide them), or a small γ or λ cancels
     answer, *numbers, h = CASES[case]
     name, *names = NAMES[answer]
     q0, v0, s0 = draws(100 + case, (-2, 2), (-2, 1), (-1, 1))
     with mp.workdps(50):
         q1, p1, s1 = answer(*(mp.mpf(x) for x in (h, q0, v0, s0, *numbers)))
         p0 = numbers[0] * mp.mpf(v0) + (2 * mp.mpf(numbers[-1]) * s0 if names[-1] == "lam" else 0)
-        L = s1 - s0
-        wanted = [float(x) for x in (q1, p1, s1, L, p1, p0, p1 * q1 - L, -p0 * q0 - L)]
+        wanted = [float(x) for x in (q1, p1, s1, s1 - s0, p1, p0)]
     system = scene(name, **dict(zip(names, numbers, strict=True)))
-    assert system.H_plus is not None
-    assert system.H_minus is not None
-    q, p, end_q, end_p = (torch.tensor([float(x)], dtype=torch.float64) for x in (q0, p0, q1, p1))
-    s, end_s = (torch.tensor(float(x), dtype=torch.float64) for x in (s0, s1))
+    q, p, end_q = (torch.tensor([float(x)], dtype=torch.float64) for x in (q0, p0, q1))
+    s = torch.tensor(s0, dtype=torch.float64)
     P = partials(system.L_d, q, end_q, s, h)
-    found = [*system.flow(q, p, s, h), P.L, P.D2, -P.D1 / P.c, system.H_plus(q, end_p, s, h),
-             system.H_minus(p, end_q, end_s, h)]  # fmt: skip
-    *bounds, of_H = BOUNDS[answer](h, q0, v0, s0, *numbers)
-    for value, number, bound in zip(found, wanted, (*bounds, of_H, of_H), strict=True):
+    found = *system.flow(q, p, s, h), P.L, P.D2, -P.D1 / P.c
+    for value, number, bound in zip(found, wanted, BOUNDS[answer](h, q0, v0, s0, *numbers), strict=True):
         assert abs(value.item() - number) < bound
 
 
@@ -144,13 +137,3 @@ def test_no_drag_at_all():
     L = system.L_d(q0, q1, s0, h)
     assert abs(L.item() - 0.36 / 0.3) < 1e-15
     assert abs(torch.autograd.grad(L, h)[0].item() + 0.36 / 0.09) < 1e-14
-
-
-def test_left_hamiltonian_of_the_parachute_beyond_its_fold_is_nan():
-    # fails if beyond the fold, where no q0 has this p0, a number comes back
-    system = scene("parachute")
-    assert system.H_minus is not None
-    S = 0.1 * (1 + 0.1 * 0.1**2 / 6)
-    p0 = torch.tensor([[0.2], [0.3]], dtype=torch.float64) / (0.01 * S)  # the fold is at m/4λS, a little shifted by a
-    H = system.H_minus(p0, torch.zeros(2, 1).double(), torch.zeros(2).double(), 0.1)
-    assert H.isnan().tolist() == [False, True]

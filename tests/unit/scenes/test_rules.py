@@ -8,7 +8,7 @@ import torch
 
 from herglotz.mechanics import autograd_partials, partials
 from herglotz.scenes import ORDERS, damped_pendulum, midpoint, midpoint_heun, parachute, scene
-from herglotz.scenes.rules import RULES, _implicit
+from herglotz.scenes.rules import RULES, implicit
 from herglotz.stepping import Stepper
 
 HORIZON = 2.0
@@ -68,7 +68,7 @@ def pairs():
 
 def adjoint(L_d):
     """L_d* of the adjoint method (Φ̃_{−h})⁻¹: L_d* = −L_d(q1, q0, s0 + L_d*, −h), implicit in one scalar."""
-    return lambda q0, q1, s0, h: _implicit(lambda x: -L_d(q1, q0, s0 + x, -h), q0, q1, s0, h)
+    return lambda q0, q1, s0, h: implicit(lambda x: -L_d(q1, q0, s0 + x, -h), q0, q1, s0, h)
 
 
 @pytest.mark.parametrize(("name", "other"), [("left", "right"), *((x, x) for x in ("midpoint", "trapezoid", "strang"))])
