@@ -158,20 +158,22 @@ class Search:
     def flexible(self) -> Trial | None:
         """The model of all functions, over the longest segments that the model follows.
 
-        Functions of the mass join later, as other offers do: the first fit could find a mass that is negative somewhere
-        and follows no longer segment. None if all named terms miss the shortest segments, over which the motion is
-        almost linear in the forces, by more than the noise, and functions foretell no better.
+        The first fit is to the shortest segments, over which the motion is almost linear in the forces. Functions of
+        the mass are left out at first, because this fit may find a mass that is negative somewhere, with which no
+        longer segment is followed. None if all named terms miss these segments by more than the noise, and functions
+        foretell no better, with masses or without.
         """
         if (fitter := self.fitter_of_functions(Variant(self.order))) is None:
             return None
-        taken = [*fitter.simple, *(name for name in fitter.functions if not name.startswith("mass"))]
-        trial = fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        trial, named = trial and self.joined(trial), self._every_term
-        if trial is None or (named is not None and not named.segments_at_the_noise and not trial.foretells(named)):
-            return None
-        while (longer := trial.fitter.longer(trial)) is not None:
-            trial = self.joined(longer)
-        return trial
+        named, every = self._every_term, tuple(fitter.functions)
+        forces = tuple(name for name in every if not name.startswith("mass"))
+        for functions in dict.fromkeys((forces, every)):
+            trial = fitter.fit([*fitter.simple, *functions], {}, fitter.lengths[0], None, 2 * ITERATIONS)
+            if trial is not None and (named is None or named.segments_at_the_noise or trial.foretells(named)):
+                while (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
+                    trial = longer
+                return trial
+        return None
 
     @inside()
     def run(self) -> Trial | None:

@@ -18,7 +18,7 @@ POTENTIAL_WAVES_OF_MANY = 15
 # Pairs of cos and sin of the potential of two lengths together.
 PLANE_PAIRS = 80
 # Waves of the mass of the only coordinate.
-MASS_WAVES = 7
+MASS_WAVES = 15
 # Pairs of cos and sin of the damping as a function of position: of the only coordinate, and of each of several.
 DAMPING_PAIRS, DAMPING_PAIRS_OF_MANY = 7, 3
 # Pairs of cos and sin of the friction as a function of speed.

@@ -99,13 +99,21 @@ def test_a_wide_swing_is_no_bad_recording():
     assert run.metrics["left_out"] == []
 
 
-def _swings(amplitudes: tuple[float, ...], bad: int = -1, weight: float = 8.5) -> Trajectories:
+def test_a_recording_that_rests_near_the_top_stays():
+    # fails if a recording is followed as a whole from the state that its first samples tell, which falls from the top
+    # to the other side or later: 4 rad of misfit were taken for another machine
+    run = fit(_swings((0.6, 1.2, 1.8, 3.14), samples=60), progress=False)
+    assert run.metrics["left_out"] == []
+    assert run.metrics["train_rms"] < 1.5 * 0.002
+
+
+def _swings(amplitudes: tuple[float, ...], bad: int = -1, weight: float = 8.5, samples: int = 30) -> Trajectories:
     """Pendulums with 2 mrad of noise; the recording `bad` is of one with another weight over its length."""
-    of, parts, t = torch.Generator().manual_seed(3), [], 0.1 * torch.arange(30).double()
+    of, parts, t = torch.Generator().manual_seed(3), [], 0.1 * torch.arange(samples).double()
     for b, amplitude in enumerate(amplitudes):
-        q = _swing(amplitude, weight if b == bad else 9.81)
-        parts.append(q + 0.002 * torch.randn(30, generator=of, dtype=torch.float64))
-    return Trajectories.of(t.repeat(len(parts)), torch.cat(parts), (30,) * len(parts), angles=(True,))
+        q = _swing(amplitude, weight if b == bad else 9.81, samples)
+        parts.append(q + 0.002 * torch.randn(samples, generator=of, dtype=torch.float64))
+    return Trajectories.of(t.repeat(len(parts)), torch.cat(parts), (samples,) * len(parts), angles=(True,))
 
 
 def test_a_recording_that_differs_little_is_left_out():
@@ -150,10 +158,10 @@ def test_a_recording_that_bends_a_plan_is_named():
     assert run.metrics["verdict"].endswith("may be of something else. Try the fit without it")
 
 
-def _swing(amplitude: float, weight: float = 9.81) -> torch.Tensor:
-    """30 samples, 0.1 apart, of q″ = −weight sin q from rest, by 20 leapfrog steps each."""
+def _swing(amplitude: float, weight: float = 9.81, samples: int = 30) -> torch.Tensor:
+    """Samples, 0.1 apart, of q″ = −weight sin q from rest, by 20 leapfrog steps each."""
     q, v, found = amplitude, 0.0, []
-    for k in range(30 * 20):
+    for k in range(samples * 20):
         if k % 20 == 0:
             found.append(q)
         v -= 0.0025 * weight * math.sin(q)
