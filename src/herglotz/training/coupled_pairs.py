@@ -54,3 +54,15 @@ def terms_between(coupled: Collection[tuple[int, int]], angles: Sequence[bool]) 
     """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs."""
     on = {name: tuple(i for i, w in enumerate(parse(name, angles)[0].form) if w) for name in lengths(angles)}
     return tuple(name for name, own in on.items() if len(own) == 1 or own in coupled)
+
+
+def groups(features: Collection[str], angles: Sequence[bool]) -> list[list[int]]:
+    """Coordinates, counted from 0, that features of several coordinates join to one another, each group in order."""
+    group = {i: [i] for i in range(len(angles))}
+    for name in features:
+        first, *others = (i for i, w in enumerate(parse(name, angles)[0].form) if w)
+        for other in others:
+            if group[other] is not group[first]:
+                joined = sorted(group[first] + group[other])
+                group |= dict.fromkeys(joined, joined)
+    return [own for i, own in group.items() if own[0] == i]
