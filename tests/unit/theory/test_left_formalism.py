@@ -54,6 +54,20 @@ def test_left_lagrangian(name):
     close(P.D2 / (1 - P.D3)[..., None], p1, 1e-12)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e-12])
+def test_small_actions_are_solved_as_exactly_as_large_ones(unit):
+    # fails if Newton's method ends at an action below 1e-8, whatever its unit: L⁻ was off by 2e-4 of itself
+    def L_d(q0, q1, s0, h):
+        kinetic = ((q1 - q0) ** 2).sum(-1) / (2 * h)
+        return kinetic * scale - h * (0.5 * s0 + 0.8 * s0**2 / scale)
+
+    q = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)[:, None]
+    s, found = 1 - q[:, 0], []
+    for scale in (1.0, unit):
+        found.append(LeftLagrangian(L_d)(q, q + 0.1, scale * s, 0.1) / scale)
+    close(found[1], found[0], 1e-14)
+
+
 @pytest.mark.parametrize("side", ["right", "left"])
 @pytest.mark.parametrize("name", ["nonlinear", "parachute"])
 def test_hamiltonian_derivatives(name, side):
