@@ -5,8 +5,9 @@ The acceleration of each coordinate is a linear regression on all positions and 
     q̈ᵢ = Σⱼ aᵢⱼ qⱼ + bᵢ + cᵢ q̇ᵢ,
 
 over smoothed samples. A position stays if the fit needs it by the extended Bayesian information criterion (Chen & Chen
-2008), which also asks for the price of a choice among n − 1 positions. A force beyond the linear one has a linear part,
-so that nonlinear terms are offered where the linear one stays (marginality, Nelder 1977).
+2008), which also asks for the price of a choice among n − 1 positions. Nonlinear terms are offered where the linear one
+stays (marginality, Nelder 1977). A force that is even in q_i − q_j, in motion that goes as far to either side of rest,
+has no linear part, and a damper without a spring has none of the position: such pairs are not found.
 """
 
 from __future__ import annotations

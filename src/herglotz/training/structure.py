@@ -123,7 +123,10 @@ def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 
 def many_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
-    """Whether `search_of_many` may choose: more coordinates than `search` takes, no angle, noise, and nothing named."""
+    """Whether `search_of_many` may choose: more coordinates than `search` takes, no angle, and nothing named.
+
+    Data without noise, or with few samples a period, are not searched: their steps need a rule of order 4.
+    """
     c = user_settings
     return structure_is_free(data, c) and data.dof > MOST and c.objective == "auto" and not is_precise(data)
 
