@@ -134,6 +134,16 @@ def test_steps_by_right_and_by_left_equations(name):
         close(value, expected, 1e-12)
 
 
+def test_samples_may_share_a_momentum():
+    # fails if derivatives by the momentum that samples share are sums over samples: q1 and p1 were NaN
+    q0, p0, s0 = (x[:4] for x in states(n=1))
+    H = RightHamiltonian(OSCILLATOR.L_d)
+    for shared, each in zip(
+        right_step(H, q0, p0[0], s0, 0.1), right_step(H, q0, p0[:1].expand(4, 1), s0, 0.1), strict=True
+    ):
+        close(shared, each, 1e-15)
+
+
 def test_where_c_vanishes_the_left_side_is_nan_and_the_right_is_not():
     # fails if 1/c is hidden, or one bad sample spoils its neighbours: left rule at h = 1/γ
     L_d = scene("damped_oscillator").L_d_rules["left"]
