@@ -56,11 +56,19 @@ def jacobian(
     f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), sample by sample
     x: Tensor,  # (..., m)
 ) -> tuple[Tensor, Tensor]:
-    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph if x or a parameter of f requires a gradient."""
+    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph if x or a parameter of f requires a gradient.
+
+    One x may serve all samples of f.
+    """
     keep_graph = torch.is_grad_enabled() and (x.requires_grad or f(x).requires_grad)
     with torch.enable_grad():
         x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
         y = f(x)
+        batch = torch.broadcast_shapes(y.shape[:-1], x.shape[:-1])
+        if batch != x.shape[:-1]:
+            # Rows by an x that several samples share would be sums over these.
+            x = x.expand(*batch, x.shape[-1])
+            y = f(x)
         (J,) = rows_of(y, (x,), keep_graph)
     return (y, J) if keep_graph else (y.detach(), J)
 

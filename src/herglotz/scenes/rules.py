@@ -146,9 +146,14 @@ def implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Ten
 
     # After a move below √eps the next move is below rounding.
     tol = torch.finfo(start.dtype).eps ** 0.5
-    root = find_root(lambda x: jacobian(missed, x), start, 1.0 + start, iterations=MAX_NEWTON, tol=tol)
+    with torch.no_grad():
+        # Units decide nothing: small actions are solved to their own size.
+        size = (s0.abs()[..., None] + missed(start).abs()).clamp(max=1.0)
+    root = find_root(lambda x: jacobian(missed, x), start, size, iterations=MAX_NEWTON, tol=tol)
     x = root.x + root.move
+    # The size is rounding where the terms of an action cancel.
+    converged = root.converged | (root.move.abs() <= tol)[..., 0]
     if torch.is_grad_enabled() and missed(x).requires_grad:
         for _ in range(EXACT_DERIVATIVES):
             x = x - solve(root.J, missed(x))
-    return torch.where(root.converged, x[..., 0], torch.nan)
+    return torch.where(converged, x[..., 0], torch.nan)

@@ -5,8 +5,9 @@ The acceleration of each coordinate is a linear regression on all positions and 
     q̈ᵢ = Σⱼ aᵢⱼ qⱼ + bᵢ + cᵢ q̇ᵢ,
 
 over smoothed samples. A position stays if the fit needs it by the extended Bayesian information criterion (Chen & Chen
-2008), which also asks for the price of a choice among n − 1 positions. A force beyond the linear one has a linear part,
-so that nonlinear terms are offered where the linear one stays (marginality, Nelder 1977).
+2008), which also asks for the price of a choice among n − 1 positions. Nonlinear terms are offered where the linear one
+stays (marginality, Nelder 1977). A force that is even in q_i − q_j, in motion that goes as far to either side of rest,
+has no linear part, and a damper without a spring has none of the position: such pairs are not found.
 """
 
 from __future__ import annotations
@@ -54,3 +55,15 @@ def terms_between(coupled: Collection[tuple[int, int]], angles: Sequence[bool]) 
     """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs."""
     on = {name: tuple(i for i, w in enumerate(parse(name, angles)[0].form) if w) for name in lengths(angles)}
     return tuple(name for name, own in on.items() if len(own) == 1 or own in coupled)
+
+
+def groups(features: Collection[str], angles: Sequence[bool]) -> list[list[int]]:
+    """Coordinates, counted from 0, that features of several coordinates join to one another, each group in order."""
+    group = {i: [i] for i in range(len(angles))}
+    for name in features:
+        first, *others = (i for i, w in enumerate(parse(name, angles)[0].form) if w)
+        for other in others:
+            if group[other] is not group[first]:
+                joined = sorted(group[first] + group[other])
+                group |= dict.fromkeys(joined, joined)
+    return [own for i, own in group.items() if own[0] == i]

@@ -28,13 +28,12 @@ from herglotz.data.splits import cuts_of, held_out_whole, leading
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import differences, estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.coupled_pairs import coupled_pairs, terms_between
 from herglotz.training.errors_of_runs import EXACT_ENOUGH
 from herglotz.training.look import LeftOut, Look, look, read_like
 from herglotz.training.problems.robust import FREEDOM, TAIL, robust_fit, scale_of
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
-from herglotz.training.structure import MOST
+from herglotz.training.structure import MOST, search_between_coupled
 from herglotz.training.trajectory_fit import SegmentStages
 from herglotz.training.verdict import STATE_ITERATIONS
 
@@ -130,13 +129,12 @@ def _bends(seen: Look, recording: int) -> bool:
     others = seen.kept.select(_but(seen, recording)).to(torch.float64, "cpu")
     if _agree(seen, precision(others)):
         return False
-    features = ()
+    base = estimate_baseline(others)
     if others.dof > MOST:
-        if (coupled := coupled_pairs(others)) is None:
-            return False
-        features = terms_between(coupled, others.angles)
-    settings = replace(seen.settings, features=features, dtype="float64", device="cpu")
-    full = Search(others, estimate_baseline(others), settings).part.full
+        search = search_between_coupled(others, base, seen.settings, outliers=False)
+    else:
+        search = Search(others, base, replace(seen.settings, features=(), dtype="float64", device="cpu"))
+    full = None if isinstance(search, str) else search.part.full
     return full is not None and full.at_the_noise
 
 

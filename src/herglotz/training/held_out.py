@@ -137,7 +137,7 @@ class HeldOut:
         # Places of the numbers that are left out, (C, r), padded with k, which is no place.
         k, width = len(own), max(map(len, left_out))
         out = [[*(places[number] for number in numbers), *[k] * (width - len(numbers))] for numbers in left_out]
-        at = torch.tensor(out, device=own.device).reshape(len(left_out), width)
+        at = torch.tensor(out, dtype=torch.long, device=own.device).reshape(len(left_out), width)
         response = pad(inverse, (0, 1, 0, 1))[:, at]  # (B, C, r, k + 1)
         own_response = response.gather(3, at[:, None].expand(*response.shape[:3], width))
         own_response = own_response + torch.diag_embed((at == k).to(x))

@@ -123,7 +123,10 @@ def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 
 def many_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
-    """Whether `search_of_many` may choose: more coordinates than `search` takes, no angle, noise, and nothing named."""
+    """Whether `search_of_many` may choose: more coordinates than `search` takes, no angle, and nothing named.
+
+    Data without noise, or with few samples a period, are not searched: their steps need a rule of order 4.
+    """
     c = user_settings
     return structure_is_free(data, c) and data.dof > MOST and c.objective == "auto" and not is_precise(data)
 
@@ -211,22 +214,16 @@ def search(
 def search_of_many(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
     """The named terms of many coordinates at the noise of whole trajectories; unchanged if no terms are.
 
-    Offers are the dictionary `lengths` and a damper of those pairs of coordinates between which a force acts
-    (`coupled_pairs`), the latter if a kernel can have so many numbers. Offers leave the model of all offers.
+    Offers leave the model of all offers of `search_between_coupled`.
     """
 
     def without(reason: str) -> Structure:
         return Structure(config, base, f"no dictionary of terms: {reason}")
 
     data, own = data.to(torch.float64, "cpu"), replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
-    if (coupled := coupled_pairs(data)) is None:
-        return without("too few samples to find which coordinates are coupled")
-    terms, dampers = terms_between(coupled, data.angles), tuple(f"(v{i + 1} - v{j + 1})" for i, j in coupled)
-    offered = replace(config, dtype="float64", device="cpu", level="forced", features=terms)
-    tried = (Search(data, own, replace(offered, drag=drag), outliers=outliers) for drag in (dampers, ()))
-    wanted = next((x for x in tried if len(x.fitter(Variant(x.order)).start) <= MAX_PARAMETERS), None)
-    if wanted is None:
-        return without("too many forces act between coordinates")
+    wanted = search_between_coupled(data, own, config, outliers=outliers)
+    if isinstance(wanted, str):
+        return without(wanted)
     found = wanted.part.full
     found = found and wanted.part.settled(found)
     if wanted.part is not wanted:
@@ -234,6 +231,21 @@ def search_of_many(data: Trajectories, base: Baseline, config: FitConfig, *, out
     if found is None or not found.at_the_noise:
         return without("the terms of one coordinate and of two miss the data by more than the noise")
     return _of_trial(found, data, wanted.config, config, base, wanted.part)
+
+
+def search_between_coupled(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Search | str:
+    """The search of many coordinates, or the reason that there is none.
+
+    Offers are the dictionary `lengths` and a damper of those pairs of coordinates between which a force acts
+    (`coupled_pairs`), the latter if a kernel can have so many numbers. `data` have float64 on the CPU.
+    """
+    if (coupled := coupled_pairs(data)) is None:
+        return "too few samples to find which coordinates are coupled"
+    terms, dampers = terms_between(coupled, data.angles), tuple(f"(v{i + 1} - v{j + 1})" for i, j in coupled)
+    offered = replace(config, dtype="float64", device="cpu", level="forced", features=terms)
+    tried = (Search(data, base, replace(offered, drag=drag), outliers=outliers) for drag in (dampers, ()))
+    found = next((x for x in tried if len(x.fitter(Variant(x.order)).start) <= MAX_PARAMETERS), None)
+    return "too many forces act between coordinates" if found is None else found
 
 
 def _of_trial(

@@ -21,6 +21,7 @@ from herglotz.data.noise import AT_THE_NOISE, coarse, precision, relative_spread
 from herglotz.data.smoothing import slopes, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.coupled_pairs import groups
 from herglotz.training.dictionary import keys_of
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.functions import Band, prior_spreads, terms_with
@@ -249,6 +250,11 @@ class Fitter:
         self.always, every_offer, self.simple = offers_of(
             self.model, list(self.keys.values()), bands, len(input_terms_of(data.columns))
         )
+        # Positions do not determine the scale of the mass of coordinates that no term joins to the first one. Were it
+        # free, a larger mass would stand, to first order, for all forces that leave.
+        apart = groups(config.features, data.angles)[1:] if config.features else []
+        fixed = {f"kinetic.log_diagonal[{own[0] - 1}]" for own in apart}
+        self.always = tuple(name for name in self.always if name not in fixed)
         without_offers(self.model, every_offer)
         # On a joint that turns one way, a load is the same force as dry friction, which is offered already.
         one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]

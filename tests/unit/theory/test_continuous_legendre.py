@@ -95,6 +95,13 @@ def test_scenes_agree_with_the_general_transform():
         close(legendre_dual(system.hamiltonian)(q, v, s), system.lagrangian(q, v, s))
 
 
+def test_one_velocity_is_found_for_many_actions():
+    # fails if derivatives by the velocity that samples share are sums over samples: no velocity was found
+    q, p, s = torch.tensor([0.3, -0.2]).double(), torch.tensor([0.5, 0.4]).double(), torch.linspace(-1, 1, 5).double()
+    many = fiber_inverse(L, q, p, s)
+    torch.testing.assert_close(many, fiber_inverse(L, q.expand(5, 2), p.expand(5, 2), s))
+
+
 def test_what_cannot_be_inverted_is_named():
     # fails if a momentum that no velocity has gives NaN or a number
     def bounded(q, v, s):  # noqa: ARG001

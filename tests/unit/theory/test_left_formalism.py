@@ -54,6 +54,20 @@ def test_left_lagrangian(name):
     close(P.D2 / (1 - P.D3)[..., None], p1, 1e-12)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e-12])
+def test_small_actions_are_solved_as_exactly_as_large_ones(unit):
+    # fails if Newton's method ends at an action below 1e-8, whatever its unit: L⁻ was off by 2e-4 of itself
+    def L_d(q0, q1, s0, h):
+        kinetic = ((q1 - q0) ** 2).sum(-1) / (2 * h)
+        return kinetic * scale - h * (0.5 * s0 + 0.8 * s0**2 / scale)
+
+    q = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)[:, None]
+    s, found = 1 - q[:, 0], []
+    for scale in (1.0, unit):
+        found.append(LeftLagrangian(L_d)(q, q + 0.1, scale * s, 0.1) / scale)
+    close(found[1], found[0], 1e-14)
+
+
 @pytest.mark.parametrize("side", ["right", "left"])
 @pytest.mark.parametrize("name", ["nonlinear", "parachute"])
 def test_hamiltonian_derivatives(name, side):
@@ -118,6 +132,16 @@ def test_steps_by_right_and_by_left_equations(name):
     by_left = left_step(LeftHamiltonian(L_d, start.q), *start, h)
     for value, expected in zip((*by_right, *by_left), (*end, *end), strict=True):
         close(value, expected, 1e-12)
+
+
+def test_samples_may_share_a_momentum():
+    # fails if derivatives by the momentum that samples share are sums over samples: q1 and p1 were NaN
+    q0, p0, s0 = (x[:4] for x in states(n=1))
+    H = RightHamiltonian(OSCILLATOR.L_d)
+    for shared, each in zip(
+        right_step(H, q0, p0[0], s0, 0.1), right_step(H, q0, p0[:1].expand(4, 1), s0, 0.1), strict=True
+    ):
+        close(shared, each, 1e-15)
 
 
 def test_where_c_vanishes_the_left_side_is_nan_and_the_right_is_not():

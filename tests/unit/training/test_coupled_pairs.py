@@ -11,7 +11,7 @@ from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, structure
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.coupled_pairs import coupled_pairs, terms_between
+from herglotz.training.coupled_pairs import coupled_pairs, groups, terms_between
 from herglotz.training.search import Search
 from herglotz.training.structure import many_are_free, search_of_many
 from herglotz.training.trials import Variant
@@ -52,12 +52,35 @@ def test_neighbours_of_a_chain_are_coupled_and_no_others(masses, settings):
     assert false <= 2
 
 
+def apart(masses, count):
+    """Recordings of chains that nothing couples to one another, as coordinates of one recording."""
+    each, n = [chain(masses, seed=k) for k in range(count)], masses * count
+    q = torch.cat([one.q for one in each], 1)
+    return replace(each[0], q=q, names=tuple("abcdef"[:n]), units=("m",) * n, angles=(False,) * n)
+
+
 def test_bodies_without_springs_between_them_have_no_pairs():
     # fails if positions of other bodies are taken for forces: each of these chains of one mass moves alone
-    alone = [chain(1, seed=k) for k in range(5)]
-    data = replace(alone[0], q=torch.cat([one.q for one in alone], 1), names=tuple("abcde"), units=("m",) * 5,
-                   angles=(False,) * 5)  # fmt: skip
-    assert coupled_pairs(data) == []
+    assert coupled_pairs(apart(1, 5)) == []
+
+
+def test_groups_are_coordinates_that_terms_join():
+    # fails if a group that a later term joins to another one stays apart, or if coordinates are lost
+    names = ("q1^4", "(q1 - q3)^2", "(q4 - q5)^2", "(q3 - q5)^4")
+    assert groups(names[:3], (False,) * 6) == [[0, 2], [1], [3, 4], [5]]
+    assert groups(names, (False,) * 6) == [[0, 2, 3, 4], [1], [5]]
+
+
+@pytest.mark.parametrize(("masses", "count"), [(1, 4), (2, 2)])
+def test_terms_leave_bodies_that_nothing_couples(masses, count):
+    # fails if the mass of coordinates that nothing couples to the first one is free: all terms stayed, as a larger mass
+    # stands for all forces to first order, and no fit of the sets without them was near the data
+    data = apart(masses, count)
+    found = search_of_many(data, estimate_baseline(data), FitConfig().resolved(data), outliers=False)
+    springs = {f"(q{i} - q{i + 1})^{k}" for i in range(1, 4) if i % masses for k in (2, 4)}
+    # Noise may hide the weakest term of a single body.
+    assert springs <= set(found.config.features) <= springs | {f"q{i}^4" for i in range(1, 5)}
+    assert found.config.drag == ()
 
 
 def test_few_samples_couple_nothing():

@@ -12,9 +12,10 @@ from herglotz import fit
 from herglotz.data import Trajectories, simulate
 from herglotz.data.noise import precision
 from herglotz.scenes import scene
-from herglotz.training import disagreeing
+from herglotz.training import disagreeing, structure
 from herglotz.training.config import FitConfig
 from herglotz.training.disagreeing import _bends, _followed
+from herglotz.training.search import Search
 from runge_kutta import step
 
 
@@ -179,22 +180,24 @@ def test_recordings_are_judged_by_what_a_fit_uses():
     assert _followed(_drops(0, 3, 60, bad=3), FitConfig(train_fraction=1.0)).lengths == (60, 60, 60)
 
 
-@pytest.mark.parametrize(("masses", "offers"), [(3, None), (4, 9 + 8)])
-def test_the_whole_dictionary_is_asked_whether_a_recording_bends_the_model(monkeypatch, masses, offers):
-    # fails if the terms that were found are the only offers (an open system was searched three times, 42 s for 14), or
-    # if many coordinates are offered terms of pairs that nothing couples
+@pytest.mark.parametrize(
+    ("masses", "most", "offers"), [(3, 300, None), (4, 300, (9 + 8, 3)), (4, 35, (9 + 8, 0)), (4, 32, ())]
+)
+def test_the_whole_dictionary_is_asked_whether_a_recording_bends_the_model(monkeypatch, masses, most, offers):
+    # fails if the terms that were found are the only offers (an open system was searched three times, 42 s for 14), if
+    # many coordinates are offered terms of pairs that nothing couples or no dampers, or if so many numbers are fitted
+    # that there is no kernel
     asked = []
 
-    class Asked:
-        def __init__(self, _data, _base, settings):
-            asked.append(settings.features)
-            self.part = SimpleNamespace(full=None)
+    def full(search):
+        asked.append((len(search.config.features), len(search.config.drag)))
 
-    monkeypatch.setattr(disagreeing, "Search", Asked)
+    monkeypatch.setattr(Search, "full", property(full))
+    monkeypatch.setattr(structure, "MAX_PARAMETERS", most)
     monkeypatch.setattr(disagreeing, "_agree", lambda *_: False)
     of = scene("chain", masses=masses)
     data = simulate(of, trajectories=10, steps=40, h=0.1, noise=0.003, seed=0)
     settings = FitConfig(level="forced", diagonal=True, features=("q1^4",)).resolved(data)
     seen: Any = SimpleNamespace(kept=data, data=data, settings=settings)
     assert not disagreeing._bends(seen, 0)
-    assert [len(names) for names in asked] == [offers or 0]
+    assert asked == ([(0, 0)] if offers is None else [offers] if offers else [])

@@ -406,6 +406,8 @@ def test_sets_that_lack_few_numbers_are_solved_as_each_alone():
     # The two ways differ by 4e-5 σ, and both from 60 digits by 1e-3 σ: curvatures have a condition of 2e11.
     for x, own in zip(found, alone, strict=True):
         assert float((x - own).abs().max()) < 1e-3 * model.sigma
+    # fails if sets that lack nothing have no solution
+    assert torch.equal(model.residuals(4 * sets[:1]).isnan(), found[0][:1].isnan().expand(4, -1, -1))
     model.equations[:, 5, 5] = -1.0
     missed = model.residuals(sets).isnan().any(-1).any(-1)
     assert missed.tolist() == [5 in own for own in sets]
