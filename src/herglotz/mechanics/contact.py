@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
+from herglotz.errors import InputError
+
 Triple = tuple[Tensor, Tensor, Tensor]
 Flow = Callable[[Tensor, Tensor, Tensor], Triple]
 
@@ -76,7 +78,8 @@ def jacobian(
 def rows_of(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor, ...]:
     """∂y/∂x for each x: (..., m, n) for x (..., n), (..., m) for x (...); the m components of y in one backward pass.
 
-    A custom backward pass that reads numbers cannot be batched: its rows are computed one by one.
+    Rows are computed one by one where a batch of them cannot be: by a custom backward pass that reads numbers, and in a
+    trace, which refuses the writes through views by which a batched slice is differentiated.
     """
     m, batch = y.shape[-1], y.ndim - 1
     found: tuple[Tensor | None, ...] = (None,) * len(xs)
@@ -85,7 +88,7 @@ def rows_of(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tens
         unit = torch.eye(m, dtype=y.dtype, device=y.device).reshape(m, *(1,) * batch, m).expand(m, *y.shape)
         try:
             found = torch.autograd.grad(y, xs, unit, is_grads_batched=True, **options)
-        except RuntimeError:
+        except (RuntimeError, InputError):
             one_by_one = zip(*(torch.autograd.grad(y, xs, row, **options) for row in unit), strict=True)
             found = tuple(None if rows[0] is None else torch.stack(rows) for rows in one_by_one)
     rows = (x.new_zeros(m, *x.shape) if g is None else g for g, x in zip(found, xs, strict=True))
