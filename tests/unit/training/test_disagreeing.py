@@ -102,19 +102,26 @@ def test_a_wide_swing_is_no_bad_recording():
 
 def test_a_recording_that_rests_near_the_top_stays():
     # fails if a recording is followed as a whole from the state that its first samples tell, which falls from the top
-    # to the other side or later: 4 rad of misfit were taken for another machine
-    run = fit(_swings((0.6, 1.2, 1.8, 3.14), samples=60), progress=False)
+    # to the other side or later: 3 rad of misfit were taken for another machine
+    of, t, q = torch.Generator().manual_seed(0), 0.1 * torch.arange(250).double(), []
+    x = torch.tensor([(2.0, 0.0), (1.0, 1.0), (0.5, -1.0), (3.14, 0.0)], dtype=torch.float64).T
+    for _ in t:
+        q.append(x[0])
+        for _ in range(4):
+            x = step(lambda x: torch.stack([x[1], -x[0].sin() - 0.02 * x[1]]), x, 0.025)
+    read = torch.stack(q, 1).reshape(-1)
+    read += 0.002 * torch.randn(len(read), generator=of, dtype=torch.float64)
+    run = fit(Trajectories.of(t.repeat(4), read, (len(t),) * 4, angles=(True,)), progress=False)
     assert run.metrics["left_out"] == []
-    assert run.metrics["train_rms"] < 1.5 * 0.002
 
 
-def _swings(amplitudes: tuple[float, ...], bad: int = -1, weight: float = 8.5, samples: int = 30) -> Trajectories:
+def _swings(amplitudes: tuple[float, ...], bad: int = -1, weight: float = 8.5) -> Trajectories:
     """Pendulums with 2 mrad of noise; the recording `bad` is of one with another weight over its length."""
-    of, parts, t = torch.Generator().manual_seed(3), [], 0.1 * torch.arange(samples).double()
+    of, parts, t = torch.Generator().manual_seed(3), [], 0.1 * torch.arange(30).double()
     for b, amplitude in enumerate(amplitudes):
-        q = _swing(amplitude, weight if b == bad else 9.81, samples)
-        parts.append(q + 0.002 * torch.randn(samples, generator=of, dtype=torch.float64))
-    return Trajectories.of(t.repeat(len(parts)), torch.cat(parts), (samples,) * len(parts), angles=(True,))
+        q = _swing(amplitude, weight if b == bad else 9.81)
+        parts.append(q + 0.002 * torch.randn(30, generator=of, dtype=torch.float64))
+    return Trajectories.of(t.repeat(len(parts)), torch.cat(parts), (30,) * len(parts), angles=(True,))
 
 
 def test_a_recording_that_differs_little_is_left_out():
@@ -159,10 +166,10 @@ def test_a_recording_that_bends_a_plan_is_named():
     assert run.metrics["verdict"].endswith("may be of something else. Try the fit without it")
 
 
-def _swing(amplitude: float, weight: float = 9.81, samples: int = 30) -> torch.Tensor:
-    """Samples, 0.1 apart, of q″ = −weight sin q from rest, by 20 leapfrog steps each."""
+def _swing(amplitude: float, weight: float = 9.81) -> torch.Tensor:
+    """30 samples, 0.1 apart, of q″ = −weight sin q from rest, by 20 leapfrog steps each."""
     q, v, found = amplitude, 0.0, []
-    for k in range(samples * 20):
+    for k in range(30 * 20):
         if k % 20 == 0:
             found.append(q)
         v -= 0.0025 * weight * math.sin(q)
