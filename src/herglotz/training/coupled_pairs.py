@@ -53,7 +53,7 @@ def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
 
 def terms_between(coupled: Collection[tuple[int, int]], angles: Sequence[bool]) -> tuple[str, ...]:
     """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs."""
-    on = {name: tuple(i for i, w in enumerate(parse(name, angles)[0].form) if w) for name in lengths(angles)}
+    on = {name: _coordinates(name, angles) for name in lengths(angles)}
     return tuple(name for name, own in on.items() if len(own) == 1 or own in coupled)
 
 
@@ -61,9 +61,14 @@ def groups(features: Collection[str], angles: Sequence[bool]) -> list[list[int]]
     """Coordinates, counted from 0, that features of several coordinates join to one another, each group in order."""
     group = {i: [i] for i in range(len(angles))}
     for name in features:
-        first, *others = (i for i, w in enumerate(parse(name, angles)[0].form) if w)
+        first, *others = _coordinates(name, angles)
         for other in others:
             if group[other] is not group[first]:
                 joined = sorted(group[first] + group[other])
                 group |= dict.fromkeys(joined, joined)
     return [own for i, own in group.items() if own[0] == i]
+
+
+def _coordinates(feature: str, angles: Sequence[bool]) -> tuple[int, ...]:
+    """The coordinates, counted from 0, that a feature depends on."""
+    return tuple(i for i, w in enumerate(parse(feature, angles)[0].form) if w)
