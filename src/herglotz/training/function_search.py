@@ -17,7 +17,7 @@ def with_functions(search: Search, best: Trial) -> Trial:
     join the simplest model, from the shortest segments on. If the result is not at the noise, the model of all
     functions competes (`Search.flexible`), settled.
     """
-    if best.at_the_noise or search.config.translations:
+    if best.lacks_nothing or search.config.translations:
         return best
     part(MORE_TERMS)
     found = search.better(best, _joined(search, best) if best.near else _anew(search)) or best
@@ -28,10 +28,10 @@ def with_functions(search: Search, best: Trial) -> Trial:
 
 
 def _joined(search: Search, best: Trial) -> Trial | None:
-    """The model `best` with functions that join one by one or, if the result is not at the noise, all at once.
+    """The model `best` with functions that join one by one or, if the result still lacks something, all at once.
 
-    The model with all functions is fitted further only if its held-out log-loss is below that of `best`. None if
-    `best` cannot be fitted with the dictionary that has all functions.
+    The model with all functions, at their likeliest prior variances, is kept only if its held-out log-loss is below
+    that of `best`. None if `best` cannot be fitted with the dictionary that has all functions.
     """
     if (fitter := search.fitter_of_functions(replace(best.fitter.variant, kept=best.taken))) is None:
         return None
@@ -40,13 +40,14 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
     same = fitter.fit(taken, fitter.values_of(best), best.length, best)
     found = same and search.settled(search.finer(same))
-    if found is None or found.at_the_noise:
+    if found is None or found.lacks_nothing:
         return found
     # A pendulum whose length turns with it needs mass, potential and damping together.
     every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
+    every = every and likeliest(every, 2 * ITERATIONS)
     if every is None or not float((best.score.losses - every.score.losses).sum()) > 0:
         return found
-    return search.better(found, search.settled(likeliest(every, 2 * ITERATIONS)))
+    return search.better(found, search.settled(every))
 
 
 def _anew(search: Search) -> Trial | None:

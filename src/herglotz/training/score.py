@@ -172,12 +172,28 @@ def _sum_and_error(by_block: Tensor) -> tuple[float, float]:
     return float(by_block.sum()), float(by_block.std()) * len(by_block) ** 0.5
 
 
+def are_white(problem: ShootingProblem, path: Path) -> bool:
+    """True if the residuals of a fit are white: their correlation time τ exceeds 1 by chance alone.
+
+    The sum Σ ρ_k = (τ − 1)/2 of m autocorrelations of white residuals has the variance m/N. Chance is what ½ log N,
+    the price of a parameter, covers: N (Σ ρ_k)² / m ≤ log N.
+    """
+    r = problem.misfit(path)[problem.data.complete][None]
+    total, lags = _correlated(r / _scale(r))
+    return float(total.clamp_min(0.0).square() * r.numel()) <= float(lags) * math.log(r.numel())
+
+
 def correlation_time(x: Tensor) -> Tensor:
     """Correlation time τ = 1 + 2 Σ ρ_k in samples, (C,), of residuals x (C, N, n) over their scale; 1 if white.
 
     ρ_k is the autocorrelation at lag k of the influence of a residual, the slope of its loss under Student's t. Lags
     are added in pairs until the first pair that is not positive (Geyer 1992).
     """
+    return (1 + 2 * _correlated(x)[0]).clamp_min(1.0)
+
+
+def _correlated(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Σ ρ_k over the lags k ≥ 1 that `correlation_time` adds, and the number of these lags, both (C,)."""
     influence = (x / (FREEDOM + x.square())).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     N = x.shape[1]
     power = torch.fft.rfft(influence, 2 * N, dim=1).abs().square().sum(2)
@@ -185,7 +201,7 @@ def correlation_time(x: Tensor) -> Tensor:
     rho = covariance / covariance[:, :1].clamp_min(torch.finfo(x.dtype).tiny)
     pairs = rho.unflatten(1, (-1, 2)).sum(2)
     positive = (pairs > 0).cumprod(1)
-    return (2 * (pairs * positive).sum(1) - 1).clamp_min(1.0)
+    return (pairs * positive).sum(1) - 1, 2 * positive.sum(1) - 1
 
 
 def _scale(r: Tensor) -> Tensor:

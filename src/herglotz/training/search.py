@@ -159,21 +159,24 @@ class Search:
         """The model of all functions, over the longest segments that the model follows.
 
         The first fit is to the shortest segments, over which the motion is almost linear in the forces. Functions of
-        the mass are left out at first, because this fit may find a mass that is negative somewhere, with which no
-        longer segment is followed. None if all named terms miss these segments by more than the noise, and functions
-        foretell no better, with masses or without.
+        the mass join only if those of the forces miss these segments, because a fit with masses may find one that is
+        negative somewhere, with which no longer segment is followed. None if all named terms miss these segments by
+        more than the noise, and functions at their likeliest prior variances foretell no better.
         """
         if (fitter := self.fitter_of_functions(Variant(self.order))) is None:
             return None
-        named, every = self._every_term, tuple(fitter.functions)
+        trial, named, every = None, self._every_term, tuple(fitter.functions)
         forces = tuple(name for name in every if not name.startswith("mass"))
         for functions in dict.fromkeys((forces, every)):
-            trial = fitter.fit([*fitter.simple, *functions], {}, fitter.lengths[0], None, 2 * ITERATIONS)
-            if trial is not None and (named is None or named.segments_at_the_noise or trial.foretells(named)):
-                while (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
-                    trial = longer
-                return trial
-        return None
+            if trial is None or not trial.segments_at_the_noise:
+                other = fitter.fit([*fitter.simple, *functions], {}, fitter.lengths[0], None, 2 * ITERATIONS)
+                other = other and likeliest(other, 2 * ITERATIONS)
+                trial = other if trial is None or (other is not None and other.foretells(trial)) else trial
+        if trial is None or not (named is None or named.segments_at_the_noise or trial.foretells(named)):
+            return None
+        while (longer := (trial := self.finer(trial)).fitter.longer(trial)) is not None:
+            trial = longer
+        return trial
 
     @inside()
     def run(self) -> Trial | None:

@@ -23,6 +23,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.coupled_pairs import groups
 from herglotz.training.dictionary import keys_of
+from herglotz.training.errors_of_runs import EXACT_ENOUGH
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
@@ -33,7 +34,7 @@ from herglotz.training.problems.grid import Grids, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
 from herglotz.training.problems.robust import scale_of
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.score import Score, fitted_score, free_run_score, scores
+from herglotz.training.score import Score, are_white, fitted_score, free_run_score, scores
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import EXACT, build_model, with_sticking
@@ -148,6 +149,12 @@ class Trial:
     def segments_at_the_noise(self) -> bool:
         """True if the misfit of the segments is about the noise of the data."""
         return self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
+
+    @cached_property
+    def lacks_nothing(self) -> bool:
+        """True if the misfit of whole trajectories is about the noise and white, or too small to matter."""
+        small = self.rms <= EXACT_ENOUGH * self.fitter.spread
+        return self.at_the_noise and (small or are_white(self.problem, self.path))
 
     @cached_property
     def _held_out(self) -> HeldOut:
