@@ -72,7 +72,11 @@ def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
     if found is None or not found.replaces(trial):
         return ()
     if any(map(saturation, taken_terms(found, every))):
-        every = _sharpened(search, found, every)
+        # Both kinds look alike, and the level of either was a guess: each is tried alone, at its best level.
+        each = [_of_kind(search, kind, every, trial) for kind in SATURATIONS]
+        for of, other in each:
+            if other is not None and search.better(found, other) is other:
+                every, found = of, other
     taken = taken_terms(found, every)
     return taken if found.gain(trial, sum(map(bool, map(saturation, taken)))) > 0 else ()
 
@@ -87,6 +91,28 @@ def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:
         return other.settled(other.finer(same))
     fitter = other.fitter(Variant(search.order))
     return other.climbed(fitter, fitter.simple, {})
+
+
+def _of_kind(search: Search, kind: str, terms: Sequence[str], trial: Trial) -> tuple[tuple[str, ...], Trial | None]:
+    """The terms with one kind of saturation, at the levels at which their model misses the data least, and the model.
+
+    None if no path is found.
+    """
+    every = tuple(term for term in terms if (of := saturation(term)) is None or of[0] == kind)
+    best: tuple[tuple[str, ...], Trial | None] = every, _with(search, every, trial)
+    if (found := best[1]) is None:
+        return best
+    # An input that saturates need not act beside its saturation, though it makes up for a wrong level.
+    names, taken = [name for name, _ in search.data.input_labels], taken_terms(found, every)
+    alone = {names.index(of[2]) for term in taken if (of := saturation(term))}
+    beside_it = {name for name in found.taken if name.startswith(INPUTS) and _column(name, found) in alone}
+    for own in dict.fromkeys((found.taken, found.taken - beside_it)):
+        sharp = _sharpened(search, replace(found, taken=own), every)
+        other = search.driven_by(sharp)
+        again = other.again(replace(found, taken=own))
+        if again is not None and search.better(best[1], settled := other.settled(again)) is settled:
+            best = sharp, settled
+    return best
 
 
 def beside(trial: Trial, more: int) -> Trial:
@@ -107,11 +133,15 @@ def beside(trial: Trial, more: int) -> Trial:
 def taken_terms(found: Trial, every: Sequence[str]) -> tuple[str, ...]:
     """Those terms of `every` that a model has taken; the last inputs of its data are those that are columns."""
     columns, own = len(found.fitter.data.input_labels), input_columns(every)
-    # The only gain of a model has no number.
-    gains = (int(name.partition("[")[2].rstrip("]") or 0) % columns for name in found.taken if name.startswith(INPUTS))
+    gains = (_column(name, found) for name in found.taken if name.startswith(INPUTS))
     recorded, forces = columns - len(own), set(input_forces(every)) & found.taken
     taken = {own[k - recorded] for k in gains if k >= recorded} | forces
     return tuple(term for term in every if term in taken)
+
+
+def _column(gain: str, found: Trial) -> int:
+    """The column of u that a gain belongs to; the only gain of a model has no number."""
+    return int(gain.partition("[")[2].rstrip("]") or 0) % len(found.fitter.data.input_labels)
 
 
 def _sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
@@ -128,12 +158,16 @@ def _sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str,
             fit = search.driven_by(terms).again(found)
             return math.inf if fit is None else fit.rms
 
-        missed(_least(missed, math.log(level / AROUND), math.log(level * AROUND)))
+        missed(_least(missed, math.log(level), math.log(AROUND)))
     return tuple(terms)
 
 
-def _least(f: Callable[[float], float], low: float, high: float) -> float:
-    """The minimum of f between two numbers, by golden sections."""
+def _least(f: Callable[[float], float], x: float, step: float) -> float:
+    """The minimum of f near x: golden sections around the lowest of points a step apart, downhill from x."""
+    for way in (step, -step):
+        while f(x + way) < f(x):
+            x += way
+    low, high = x - step, x + step
     x, y = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
     of_x, of_y = f(x), f(y)
     for _ in range(SECTIONS):

@@ -4,7 +4,7 @@ Each arrival (`herglotz.data.driving`) makes other inputs of the steps. One line
 by differences against `acceleration_terms`, dry friction and the forces of other joints. Differences amplify noise, so
 that the problem is turned back into one of positions over short windows, whose noise is white. An arrival is taken if
 it lowers the error by more than a tenth and beyond the spread of that gain over blocks of time: first a hold, then a
-delay or a lag, then both.
+delay or a lag, then both. Where the rates of the inputs lower it as much beyond a delay, there is none.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.driving import InputPieces, acting
 from herglotz.data.holds import HOLDS, SAMPLES, Arrival
-from herglotz.data.smoothing import smoothed
+from herglotz.data.smoothing import slopes, smoothed
 from herglotz.data.splits import liveliest_rows
 from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
@@ -99,7 +99,9 @@ def _searched(train: Trajectories, said: Arrival) -> tuple[Arrival, str]:
     singles = {name: ways.along(axis, found.arrival) for name, axis in axes.items()}
     compared |= singles
     single = min(singles.values(), key=lambda way: way.rms, default=found)
-    if ways.is_late(single.arrival, found.arrival) and single.beats(found):
+    late = ways.is_late(single.arrival, found.arrival) and single.beats(found)
+    # A force by the rate of the input looks like a delay, which is no explanation where the rate explains far more.
+    if late and not ways.of(found.arrival, rates=True).beats(single):
         found = single
         if len(axes) == 2:
             compared["both"] = both = ways.nearby(single, MOVES, 0.5)
@@ -120,9 +122,10 @@ class Ways:
         assert recorded is not None
         self.pieces = cache(lambda hold: InputPieces.of(hold, self.all.t, recorded, self.all.lengths))
 
-    def of(self, arrival: Arrival) -> Way:
-        """An arrival with its errors."""
+    def of(self, arrival: Arrival, *, rates: bool = False) -> Way:
+        """An arrival with its errors; `rates`: inputs may also act by their rates."""
         u = self.pieces(arrival.hold).acting(*arrival.late)
+        u = torch.cat([u, slopes(self.all, u)], 1) if rates else u
         u = replace(self.all, u=u, hold=arrival.hold).inputs_of_steps(self.rows)
         assert u is not None
         return Way(arrival, self.problem.errors(u))

@@ -2,7 +2,7 @@
 
 1. Zeros of the sensors and the hold of the inputs, because terms could make up for either.
 2. The terms of the model, damping by s among them (`Search.run`).
-3. The terms by which inputs act (`how_inputs_act`).
+3. The terms by which inputs act (`how_inputs_act`), and whether an angle is rather a position on a line.
 4. Learned functions in the place of missing named terms (`functions`).
 
 Of a long recording a part answers these questions, and `all_data` fits the answer to all samples.
@@ -19,7 +19,7 @@ from herglotz.models.drag import input_columns
 from herglotz.training.acting_inputs import asked_terms, taken_terms
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
-from herglotz.training.trials import Trial
+from herglotz.training.trials import Trial, Variant
 
 
 class Questions:
@@ -27,12 +27,13 @@ class Questions:
 
     `wanted` is the search of all data. `read` is the search of the part, of readings less the zeros of their sensors
     once those are found. `best` is the model in `read`, and `differ` the zeros (B, n) with their standard deviations.
-    `hold` and `input_terms` are empty until another hold, or terms of the inputs, are found.
+    `hold` and `input_terms` are empty until another hold, or terms of the inputs, are found. `unread` is the search of
+    all data as they were recorded.
     """
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
         # The hold of the data is among the candidates, because it is tried again after another hold was found.
-        self.wanted, self.holds = wanted, (*holds, *([wanted.data.hold] if holds else []))
+        self.unread, self.wanted, self.holds = wanted, wanted, (*holds, *([wanted.data.hold] if holds else []))
         self.hold, self.input_terms = "", ()
         self.read: Search = wanted.part
         self.best: Trial | None = None
@@ -86,14 +87,17 @@ class Questions:
         that only made up for the hold leave. Terms make up so well for a wrong hold, u(t + τ) being u + τ u′, that no
         other may be found beside them: where there are rates, or the noise is not met, every hold is tried without.
         """
-        if self.best is None or not (terms := asked_terms(self.read, self.best)):
+        if self.best is None or (asked := _asked(self.read, self.best)) is None:
             return
         recorded = self.wanted, self.read
-        read = self.read.driven_by(terms)
-        found = read.run()
-        if found is None or not found.replaces(self.best):
-            return
-        self._drive(terms, self.wanted, read, found)
+        # Zeros, and a hold that was found beside them, may have made up for the terms.
+        if self.differ is not None and (plain := self.unread.part.run()) is not None:
+            other, more = _asked(self.unread.part, plain), (len(self.read.data) - 1) * self.read.data.dof
+            if other is not None and asked[2].gain(other[2], more) <= 0:
+                asked, recorded = other, (self.unread, self.unread.part)
+                self.differ, self.hold = None, ""
+        terms, driven, found = asked
+        self._drive(terms, recorded[0], driven, found)
         tried = []
         if self.how_inputs_hold():
             left = taken_terms(self.read.settled(self.best), terms)
@@ -114,6 +118,40 @@ class Questions:
         self.input_terms, self.wanted = input_columns(terms), wanted.driven_by(terms)
         self.read, self.best = read, found
 
+    def better_on_a_line(self) -> bool:
+        """True if a model is better with every angle taken for a position on a line, as of a coil spring."""
+        trial, read = self.best, self.read
+        if not any(read.data.angles) or read.config.translations:
+            return False
+        line = read.on_a_line()
+        if trial is not None:
+            turning = trial.taken.difference(offer.name for offer in line.fitter(Variant(line.order)).offers)
+            # No model on a line is simpler than one with a single term for each coordinate.
+            if trial.lacks_nothing and len(turning) <= read.data.dof:
+                return False
+            # A search on the line is worth its time only if its first model is no worse.
+            if trial.whole and (line.first is None or trial.replaces(line.first)):
+                return False
+        other = line.run()
+        if read.data.u is not None and not (other and other.at_the_noise):
+            # Terms of the inputs that are found beside wrong forces of the angle may be wrong, too.
+            asked = Questions(self.unread.part.on_a_line(), self.holds)
+            asked.how_inputs_act()
+            other = read.better(other, asked.best)
+        if other is None or trial is None:
+            return other is not None
+        # Both readings are compared over segments that both models follow.
+        length = min(trial.length, other.length)
+        trial, other = (x if x.length == length else x.fitter.over(x, length) for x in (trial, other))
+        if trial is None or other is None or read.better(trial, other) is trial:
+            return trial is None and other is not None
+        ahead, its = other.fitter.free_run_score(other), trial.fitter.free_run_score(trial)
+        if ahead is None or its is None:
+            return ahead is not None
+        if its.numbers > ahead.numbers:
+            return not its.replaces(ahead, trial.fitter.offered)
+        return ahead.replaces(its, trial.fitter.offered)
+
     def functions(self) -> None:
         """Find a better model with learned functions."""
         self.best = self.best and with_functions(self.read, self.best)
@@ -130,3 +168,12 @@ class Questions:
         if longer and self.best is not None and (hold := self.read.better_hold(self.best, self.holds)):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
+
+
+def _asked(read: Search, best: Trial) -> tuple[tuple[str, ...], Search, Trial] | None:
+    """Terms by which the inputs act, the search with them, and its model if that replaces `best`; else None."""
+    if not (terms := asked_terms(read, best)):
+        return None
+    driven = read.driven_by(terms)
+    found = driven.run()
+    return None if found is None or not found.replaces(best) else (terms, driven, found)

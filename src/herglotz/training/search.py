@@ -339,21 +339,11 @@ class Search:
             trial = other.grow(fit)
         return trial
 
-    def better_on_a_line(self, trial: Trial | None) -> bool:
-        """True if a model is better with every angle taken for a position on a line, as of a coil spring."""
-        if not any(self.data.angles) or self.config.translations or (trial is not None and trial.at_the_noise):
-            return False
+    def on_a_line(self) -> Search:
+        """The search with every angle taken for a position on a line, as of a coil spring."""
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        line = Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
-        # A search on the line is worth its time only if the angles fail or its first model is no worse.
-        if trial is not None and trial.whole and (line.first is None or trial.replaces(line.first)):
-            return False
-        other = line.run()
-        if other is None or trial is None or not other.replaces(trial):
-            return other is not None and trial is None
-        ahead, its = other.fitter.free_run_score(other), trial.fitter.free_run_score(trial)
-        return ahead is not None and (its is None or ahead.replaces(its, trial.fitter.offered))
+        return Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
 
     def zeros(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
         """Zeros of the sensors (B, n), fitted with the numbers and states of a model, and standard deviations.

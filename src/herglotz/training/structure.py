@@ -189,7 +189,7 @@ def search(
             asked, rates, why["drifts"] = again, found, f"rates {sure(*drift)}"
     asked.how_inputs_act()
     # With positions on a line, whose inputs and sizes differ, `look` searches again.
-    if asked.read.better_on_a_line(asked.best):
+    if asked.better_on_a_line():
         return Structure(config, base, "terms of positions on a line miss the data by less", turning=False)
     if asked.best is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow the shortest segments")

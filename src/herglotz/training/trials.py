@@ -379,6 +379,10 @@ class Fitter:
         followed = min(max(LOST * trial.rms, FOLLOWED * self.spread), MAX_MISFIT * self.spread)
         return None if found is None or found.rms > followed else found
 
+    def over(self, trial: Trial, length: int) -> Trial | None:
+        """The model over shorter segments, of this length; None if no path is found."""
+        return self.fit(trial.taken, trial.values, length, None, 2 * ITERATIONS)
+
     def grow(self, trial: Trial) -> Trial:
         """The model over the longest segments that it follows, lengthened step by step."""
         while (found := self.longer(trial)) is not None:

@@ -95,6 +95,24 @@ def test_the_level_at_which_an_input_saturates_is_found():
     assert found[1] == pytest.approx(0.6, rel=0.01)
 
 
+def test_an_input_that_saturates_softly_acts_by_nothing_else():
+    # fails if one kind of saturation stands beside the input itself for the other kind, at a level far from the first
+    # guess: each of 3 sat(u/0.2) + u and tanh alone meets the data to a few times the noise
+    data = driven(lambda u, _: 3 * np.tanh(u / 0.3), sway, samples=150, noise=1e-3)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search.order = 2  # as of noisier data, in half the time
+    first = search.first
+    assert first is not None
+    (term,) = asked_terms(search, first)
+    found = saturation(term)
+    assert found is not None
+    assert (found[0], found[2]) == ("tanh", "u")
+    assert found[1] == pytest.approx(0.3, rel=0.01)
+    model = search.driven_by([term]).run()
+    assert model is not None
+    assert model.taken == {"q1^2", f"{INPUTS}[1]"}
+
+
 def test_an_accelerated_pivot_is_found():
     # fails if forces of the position are not offered, are taken for columns, or are printed, predicted or planned as
     # another motion than that of the model
@@ -112,6 +130,15 @@ def test_an_accelerated_pivot_is_found():
     assert moved < missed / 5  # the rule's error at this step is 0.12
     later = lambda s: sway(s + 20)  # noqa: E731
     assert (run.predict(recorded(on_a_crane(later), later, -0.3, True, noise=0)).rms or 1) < 1e-3
+
+
+def test_a_spring_on_an_angle_is_no_sum_of_harmonics():
+    # fails if three harmonics that meet the noise of a servo's angle, and turn back beyond it, stay for one spring
+    servo = lambda s, q, v: 30 * (0.5 * sway(s) - q) - 3 * v  # noqa: E731
+    run = hz.fit(recorded(servo, sway, 0.02, True, samples=150, noise=1e-3), train_fraction=1, progress=False)
+    assert not run.metrics["plan"]["turning"]
+    assert run.metrics["plan"]["features"] == ("q1^2",)
+    assert run.metrics["verdict"].startswith("fits to the noise")
 
 
 def test_a_force_factor_that_falls_with_the_stroke_is_found():
@@ -182,10 +209,19 @@ def test_foresight_knows_a_model_with_a_force_of_the_position():
 
 
 class Asked:
-    """A search whose terms of the inputs are u² and u cos q; under another hold only `left` of them stay."""
+    """A search whose terms of the inputs are u² and u cos q; under another hold only `left` of them stay.
+
+    `needed`: a model with zeros of sensors is better than one without.
+    """
+
+    needed = False
 
     def __init__(self, data, terms=(), left=()):
-        self.data, self.terms, self.left, self.part = data, terms, left, SimpleNamespace(step_ratio=1)
+        self.data, self.terms, self.left, self.step_ratio = data, terms, left, 1
+
+    @property
+    def part(self):
+        return self
 
     def of(self, data):
         return Asked(data, self.terms, self.left)
@@ -215,7 +251,11 @@ class Asked:
         taken = {f"{INPUTS}[1]" if term == "u^2" else term for term in terms}
         labels = (("u", ""), *((term, "") for term in self.terms if term == "u^2"))
         fitter = SimpleNamespace(data=SimpleNamespace(input_labels=labels))
-        return SimpleNamespace(taken=taken, fitter=fitter, terms=terms, replaces=lambda other: not other.terms)
+        gain = lambda *_: 1.0 if self.needed else -1.0  # noqa: E731
+        replaces = lambda other: not other.terms  # noqa: E731
+        return SimpleNamespace(
+            taken=taken, fitter=fitter, terms=terms, gain=gain, replaces=replaces, at_the_noise=True
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize("left", [("u1 cos(q1)",), ("u^2",), ("u^2", "u1 cos(q1)")])
@@ -226,10 +266,28 @@ def test_terms_that_stood_for_a_hold_leave(monkeypatch, left):
     asked: Any = object.__new__(questions.Questions)
     asked.wanted = asked.read = Asked(Trajectories.of(*np.ones((2, 9)).cumsum(1), u=np.ones(9), hold="zero"), left=left)
     asked.holds, asked.hold, asked.input_terms, asked.best = ("smooth",), "", (), asked.wanted.run()
+    asked.differ = None
     asked.how_inputs_act()
     assert (asked.hold, asked.wanted.data.hold, asked.read.data.hold) == ("smooth",) * 3
     assert asked.wanted.terms == asked.read.terms == asked.best.terms == left
     assert asked.input_terms == tuple(term for term in left if term == "u^2")
+
+
+@pytest.mark.parametrize("needed", [True, False])
+def test_zeros_that_stood_for_terms_leave(monkeypatch, needed):
+    # fails if zeros of the sensors, found before the terms that were missing, stay beside them where the recordings as
+    # they are tell the same terms, or leave where they are needed
+    monkeypatch.setattr(questions, "asked_terms", lambda search, best: search.input_terms(best))
+    monkeypatch.setattr(Asked, "needed", needed)
+    plain, zeroed = (
+        Asked(Trajectories.of(*np.ones((2, 9)).cumsum(1), u=np.ones(9), hold="smooth"), left=("u^2",)) for _ in range(2)
+    )
+    asked: Any = object.__new__(questions.Questions)
+    asked.unread, asked.wanted, asked.read, asked.best = plain, zeroed, zeroed, zeroed.run()
+    asked.holds, asked.hold, asked.input_terms, asked.differ = (), "", (), ("zeros", "deviations")
+    asked.how_inputs_act()
+    assert (asked.differ is None) == (not needed)
+    assert (asked.read.data is plain.data) == (not needed)
 
 
 def test_a_run_predicts_recordings_without_the_term():

@@ -54,6 +54,17 @@ def test_the_best_delay_is_looked_for_between_those_that_were_tried(monkeypatch)
     assert found.arrival.delay == pytest.approx(0.19, abs=0.1 * FINEST)
 
 
+def test_a_force_by_the_rate_of_an_input_is_no_delay():
+    # fails if q″ + 0.2 q′ + q = u′, driven by cosines, is read as u that is late: no term of the input mends a delay
+    t = torch.arange(400, dtype=torch.float64) / 10
+    waves = torch.tensor([0.7, 2.0, 4.1], dtype=torch.float64)
+    phase, gain, loss = waves * t[:, None], 1 - waves**2, 0.2 * waves
+    q = ((loss * phase.cos() - gain * phase.sin()) * waves / (gain**2 + loss**2)).sum(1)
+    noise = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = Trajectories.of(t, q + 0.005 * noise, u=phase.cos().sum(1))
+    assert with_arrival(data, data)[1].late == (0.0, 0.0)
+
+
 def test_another_hold_is_tried_with_the_terms_that_were_found(monkeypatch):
     # fails if a hold that the linear model of inputs mistook stays: a driven cart with its pole missed by 34 times the
     # noise. A spring with drag, 25 samples a period, whose input jumps at samples and is held over its steps

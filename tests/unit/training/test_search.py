@@ -164,8 +164,8 @@ def test_a_fit_is_told_how_long_segments_the_search_followed(duffing, monkeypatc
     search, _ = duffing
     fitter = search.fitter(Variant(4))
     found = there(fitter.fit(fitter.simple, {}, fitter.lengths[0], None))
-    read = SimpleNamespace(better_on_a_line=lambda _: False, fitters={})
-    asked = SimpleNamespace(best=found, read=read, differ=None, hold="", input_terms=(), wanted=SimpleNamespace())
+    asked = SimpleNamespace(best=found, differ=None, hold="", input_terms=(), wanted=SimpleNamespace())
+    asked.read, asked.better_on_a_line = SimpleNamespace(fitters={}), lambda: False
     asked.wanted.config = asked.wanted.part = search.config
     asked.how_inputs_act = asked.functions = asked.all_data = lambda: None
     monkeypatch.setattr(structure, "Questions", lambda *_: asked)

@@ -17,7 +17,6 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.linear_terms import MIN_EIGENVALUE, LinearStart, LinearTerms, start_of
 from herglotz.training.named_terms import MOVING, NamedTerms, candidates
-from herglotz.training.search import Search
 from herglotz.training.structure import search
 from herglotz.training.trajectory_fit import TrajectoryFit
 
@@ -169,9 +168,6 @@ class Asked:
         self.seen.append((self.name, f"of_part, {differ is not None}"))
         return self.with_zeros(found, accepted=differ is not None)
 
-    def better_on_a_line(self, _):
-        return self.answer("line", False)
-
     def with_functions(self, best):
         return SimpleNamespace(names=["f1"], rms=0.1, whole=True, at=self.name) if self.answer("functions") else best
 
@@ -199,6 +195,7 @@ def asked(monkeypatch):
         seen = []
         monkeypatch.setattr(module, "Search", partial(Asked, told=told, seen=seen))
         monkeypatch.setattr(questions, "with_functions", lambda search, best: search.with_functions(best))
+        monkeypatch.setattr(questions.Questions, "better_on_a_line", lambda own: own.read.answer("line", False))
         monkeypatch.setattr(questions, "asked_terms", lambda search, best: search.input_terms(best))
         monkeypatch.setattr(module, "drifts", lambda search: search.answer("drifts"))
         return search(data, base, config, outliers=False, holds=["first", "smooth"]), seen
@@ -311,22 +308,41 @@ def test_terms_of_inputs_are_those_of_all_data(asked):
     ]  # fmt: skip
 
 
+class OnALine:
+    """A search with angles whose search on a line has a `first` model; `first` replaces nothing."""
+
+    data = SimpleNamespace(angles=(True,), dof=1, u=None)
+    config = SimpleNamespace(translations=())
+    order, first = 2, SimpleNamespace(length=20)
+
+    def __init__(self):
+        self.searched = False
+
+    def on_a_line(self):
+        return self
+
+    def fitter(self, _):
+        return SimpleNamespace(offers=[SimpleNamespace(name=name) for name in ("q1^2", "|v1| v1")])
+
+    def run(self):
+        self.searched = True
+
+
 @pytest.mark.parametrize(
-    ("whole", "worse", "searched"), [(True, True, False), (True, False, True), (False, True, True)]
-)
-def test_a_line_is_searched_where_its_first_model_may_be_better(whole, worse, searched, monkeypatch):
-    # fails if a model that follows no whole trajectory ends the question (two magnets under a pendulum are powers),
-    # or if a search is made where its first model is worse than one that follows them
-    seen = []
-
-    def made(*_, **__):
-        first = SimpleNamespace(length=20)
-        other = SimpleNamespace(replaces=lambda _: False)
-        return SimpleNamespace(first=first, run=lambda: seen.append(True) or other)
-
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=2)
-    own = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    monkeypatch.setattr(sys.modules[Search.__module__], "Search", made)
-    trial: Any = SimpleNamespace(whole=whole, at_the_noise=False, replaces=lambda _: worse)
-    assert not own.better_on_a_line(trial)
-    assert seen == ([True] if searched else [])
+    ("whole", "worse", "lacks", "terms", "searched"),
+    [
+        (True, True, True, ("cos(q1)",), False), (True, False, True, ("cos(q1)",), True),
+        (False, True, True, ("cos(q1)",), True), (True, False, False, ("cos(q1)", "|v1| v1"), False),
+        (True, False, False, ("cos(q1)", "cos(3q1)"), True),
+    ],
+)  # fmt: skip
+def test_a_line_is_searched_where_its_model_may_be_better(whole, worse, lacks, terms, searched):
+    # fails if a model that follows no whole trajectory ends the question (two magnets under a pendulum are powers), if
+    # a search is made where its first model is worse than one that follows them, or where no model on a line can be
+    # simpler than one that lacks nothing; a coil spring is found as harmonics of the angle that lack nothing
+    asked: Any = object.__new__(questions.Questions)
+    asked.read = OnALine()
+    trial: Any = SimpleNamespace(whole=whole, lacks_nothing=not lacks, taken=frozenset(terms), replaces=lambda _: worse)
+    asked.best = trial
+    assert not asked.better_on_a_line()
+    assert asked.read.searched == searched
