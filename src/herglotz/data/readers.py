@@ -28,7 +28,7 @@ from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import usable
-from herglotz.data.trajectories import GAP, Trajectories
+from herglotz.data.trajectories import GAP, Trajectories, made_alike
 from herglotz.data.units import in_degrees, in_radians_and_seconds, with_angles_in_degrees
 from herglotz.errors import InputError, refuse, tell
 
@@ -285,6 +285,7 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
     """The joined set; notes that only some files have, and errors about differences, begin with the file's name."""
+    sets = made_alike(sets)
     for file, one in zip(files[1:], sets[1:], strict=True):
         try:
             check_alike([sets[0], one])

@@ -283,10 +283,8 @@ class Trajectories:
 
     @classmethod
     def cat(cls, sets: Iterable[Trajectories]) -> Trajectories:
-        """Join sets of the same coordinates, units and optional arrays."""
-        sets = list(sets)
-        if any(one.observed is not None for one in sets):
-            sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
+        """Join sets of the same coordinates, units and optional arrays, after `made_alike`."""
+        sets = made_alike(list(sets))
         check_alike(sets)
         present = [name for name in ARRAYS if getattr(sets[0], name) is not None]
         columns = {name: torch.cat([getattr(one, name) for one in sets]) for name in present}
@@ -345,3 +343,16 @@ class Trajectories:
     def rows(self, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
         """Return these rows of the concatenation, as trajectories of these lengths."""
         return replace(self, **self._map(lambda x: x[rows]), lengths=lengths)
+
+
+def made_alike(sets: Sequence[Trajectories]) -> list[Trajectories]:
+    """The sets, ready to be joined although samples are missing in only some of them.
+
+    A set without `observed` has all its positions. Inputs that go in lines or cubics between samples become the means
+    of their steps beside a set that has such means, with the hold "zero" (`Trajectories.keep`).
+    """
+    if any(one.observed is not None for one in sets):
+        sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
+    if any(one.hold == "zero" for one in sets):
+        sets = [replace(one, u=one.inputs_of_steps(), hold="zero") if one.hold else one for one in sets]
+    return list(sets)
