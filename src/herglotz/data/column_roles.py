@@ -26,7 +26,10 @@ ROLES = {
         r"t|times?|timestamps?|date|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
         r"|czas|čas|aika"
     ),
-    "trajectory": re.compile(r"trajectory|trial|run"),
+    "trajectory": re.compile(
+        r"(trajectory|trial|run|recording|experiment|episode|versuch|lauf|messreihe|essai|ensayo|prueba|prova)"
+        r"([ _-]?(id|nr|no|num|number|index|n°|#)\.?)?"
+    ),
     "action": re.compile(r"s"),
     "momentum": re.compile(r"p|p_.*"),
     # Left aside, as are rates: logged velocities are usually filtered, and counters of rows are no motion.
@@ -182,6 +185,8 @@ def _whole(key: str, kind: str) -> str:
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "")
     if role in ("action", "momentum"):
         return "" if kind in ("position", "pressure", "other") else role
+    if role == "trajectory":
+        return "" if kind else role
     meant = kind in ("", "effort", "electric") or (kind == "position" and key[0] == "u")
     return "" if role == "input" and not meant else role
 

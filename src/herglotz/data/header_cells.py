@@ -105,8 +105,7 @@ def _may_have(name: str, unit: str) -> bool:
     # x_in is the input beside x_out.
     if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or base == "in":
         return False
-    # A run in mA would number the trajectories.
-    return role_of(name, unit).role not in ("trajectory", "action", "momentum", "counter")
+    return role_of(name, unit).role not in ("action", "momentum", "counter")
 
 
 def _is_unit(name: str, unit: str, names: Sequence[str]) -> bool:
