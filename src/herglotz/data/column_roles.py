@@ -16,7 +16,7 @@ KINDS = {
     "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|volts?|amps?|%|percent"),
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi|s?lpm|gpm|(m?[lL]|m3|m³)/ ?(s|min|h)"),
     "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
-    "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|.+[ ·*]s(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
+    "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|(.+[ ·*])?(s|min)(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
 }
 NUMBERED = r"(_?\d+|_.*)?"

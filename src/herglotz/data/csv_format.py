@@ -179,9 +179,9 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     `herglotz.data.csv_columns.Wanted`.
 
     **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
-    The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name_unit` as in
-    `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.header_cells` says where the end of a name is an
-    index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
+    The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
+    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.header_cells` says where the end of
+    a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
     of their own below the header. Other lines that start with # and blank lines are skipped, except for these comments:
     `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples, `# delay: 0.004` and `# lag: 0.02`
     are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5` make
