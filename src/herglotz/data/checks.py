@@ -102,6 +102,9 @@ def _check_labels(where: str, labels: Any, n: int) -> None:
         entries = getattr(labels, field)
         if len(entries) != n:
             raise InputError(f"{where}: {field} has {len(entries)} entries for {n} coordinates; give one a coordinate")
+    names, count = labels.recordings, len(labels.lengths)
+    wrong = f"recordings has {len(names)} names for {count} trajectories; give one a trajectory, or none"
+    refuse({f"{where}: {wrong}": len(names) not in (0, count)})
     unclear = len(set(labels.names)) != n or not all(labels.names)
     empty = not all(labels.units) or not labels.time_unit
     refuse({

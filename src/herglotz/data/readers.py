@@ -293,7 +293,11 @@ def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories
             raise InputError(f"{file} beside {files[0].name}: {error}") from None
     shared = set(sets[0].notes).intersection(*(one.notes for one in sets))
     named = (
-        replace(one, notes=tuple(note if note in shared else of_file(file.name, note) for note in one.notes))
+        replace(
+            one,
+            notes=tuple(note if note in shared else of_file(file.name, note) for note in one.notes),
+            recordings=tuple(f"{file.name}, {name}" for name in one.recordings) or (file.name,) * len(one),
+        )
         for file, one in zip(files, sets, strict=True)
     )
     return Trajectories.cat(named)

@@ -212,6 +212,7 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording])
     )
     refuse({since_1970: last > MAX_SECONDS and not columns.units[columns.time]})
     units = tuple(columns.units[i] or "1" for i in columns.q)
+    group = "" if columns.trajectory is None else columns.names[columns.trajectory]
     found = Trajectories.of(
         t[:, 0],
         q,
@@ -226,6 +227,7 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording])
         hold=columns.hold if columns.u else "",
         source=path.name,
         columns=columns.roles(),
+        recordings=[f"{group} {one.label}" for one in recordings] if group else (),
     )
     return replace(found, notes=columns.notes)
 
