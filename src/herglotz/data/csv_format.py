@@ -194,10 +194,11 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     momenta. Of other columns the unit decides before the name
     (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions; N, Nm, A, V, % inputs; m/s, rad/s, rpm rates;
     rates are left aside, and so are °C, Pa, W. A set value of a motion is an input in any unit: goal, target, set
-    point, desired, reference, command, soll. Without a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage, motor
-    are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors, temperatures, batteries and counters (`index`,
-    `frame`, a first column without a name) are left aside; every other column is a coordinate. A coordinate in rad is
-    taken for an angle. A warning names every role that is a guess.
+    point, desired, reference, command, soll; so is what shakes a mechanism: road, ground, excitation, Erregung. Without
+    a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`,
+    `qd1` rates; errors, temperatures, batteries, counters (`index`, `frame`, a first column without a name) and
+    filtered copies of another column (`theta_filt`) are left aside; every other column is a coordinate. A coordinate in
+    rad is taken for an angle. A warning names every role that is a guess.
 
     **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row
     without any coordinate, or without s or a momentum, is left out; the step over that row has the mean of the inputs.

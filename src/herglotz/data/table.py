@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from herglotz.data.checks import EXACT, MIN_SAMPLES, MISSING, Unusable, numbers_runs, out_of_order, quote
+from herglotz.data.checks import EXACT, MIN_SAMPLES, Unusable, numbers_runs, out_of_order, quote
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import with_missing
 from herglotz.data.header_cells import name_and_unit
@@ -71,18 +71,18 @@ def group_by_values(
     inputs: a constant input is one. Rows of stacked tables, which are sorted by time, are one recording.
     """
     values = np.asarray(values, dtype=np.float64).reshape(-1, len(columns.numeric))
-    whole = in_order(Recording("", np.arange(len(values)), values))
-    if columns.trajectory is not None or not (np.diff(whole.values[:, 0]) < 0).any():
+    anew = np.diff(values[:, 0]) < 0
+    if columns.trajectory is not None or not anew.any():
         return ""
-    anew, given = np.diff(values[:, 0]) < 0, {columns.time, columns.s, *columns.p, *columns.u}
+    if not (np.diff(in_order(Recording("", np.arange(len(values)), values)).values[:, 0]) < 0).any():
+        return ""
+    given = {columns.time, columns.s, *columns.p, *columns.u}
     free = [
         i for i, name in enumerate(columns.names)
         if i not in given and wanted.role(name) is None and wanted.before(name) in (None, "dropped")
     ]  # fmt: skip
     for i in sorted(free, key=lambda i: i not in columns.q):
-        labels = labels_of(i)
-        complete = not any(label.casefold() in MISSING for label in labels)
-        if columns.q != (i,) and complete and numbers_runs(np.array(labels), anew):
+        if numbers_runs(np.array(labels_of(i)), anew):
             return columns.names[i]
     return ""
 

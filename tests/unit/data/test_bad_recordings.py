@@ -171,6 +171,13 @@ def test_a_column_left_aside_may_number_the_recordings(tmp_path):
         load(written(tmp_path, "load,t,x", recordings([4, 5], 1)), like=known)
 
 
+def test_stacked_tables_are_one_recording(tmp_path):
+    # fails if the rows of a second sensor, behind those of the first, are a second recording without the first's values
+    nan = float("nan")
+    rows = [[0, 0.1 * k, k**2, nan] for k in range(6)] + [[1, 0.1 * k, nan, k**3] for k in range(6)]
+    assert load(written(tmp_path, "index,t,x,y", rows)).lengths == (6,)
+
+
 @pytest.mark.parametrize(
     ("rows", "row"),
     [
