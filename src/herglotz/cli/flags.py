@@ -212,7 +212,8 @@ READING = (
     flag("--coordinates", "exactly these, with commas", type=names, metavar="NAMES"),
     flag("--inputs", "forces, torques, ...: exactly these, or none", type=names, metavar="NAMES"),
     flag("--drop", "columns to leave aside", type=names, metavar="NAMES"),
-    flag("--group", "column that numbers the trajectories", metavar="NAME"),
+    flag("--group", "column that numbers the trajectories (default: by its name, or by its values where time starts "
+         "anew)", metavar="NAME"),
     flag("--angles", "coordinates that are angles in radians, with commas, or none (default: those with the unit rad "
          "or deg)", type=names, metavar="NAMES"),
     flag("--degrees", "coordinates in degrees whose header does not say so, or none (default: with a warning, those "

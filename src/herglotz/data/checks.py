@@ -102,6 +102,9 @@ def _check_labels(where: str, labels: Any, n: int) -> None:
         entries = getattr(labels, field)
         if len(entries) != n:
             raise InputError(f"{where}: {field} has {len(entries)} entries for {n} coordinates; give one a coordinate")
+    names, count = labels.recordings, len(labels.lengths)
+    wrong = f"recordings has {len(names)} names for {count} trajectories; give one a trajectory, or none"
+    refuse({f"{where}: {wrong}": len(names) not in (0, count)})
     unclear = len(set(labels.names)) != n or not all(labels.names)
     empty = not all(labels.units) or not labels.time_unit
     refuse({
@@ -233,15 +236,23 @@ def number(text: str, where: str) -> float:
     return value
 
 
-def out_of_order(values: np.ndarray, starts: np.ndarray, names: Sequence[str]) -> str:
-    """The remedy for times that do not increase at the rows `starts` of a table, whose columns have these names.
+def numbers_runs(column: np.ndarray, anew: np.ndarray) -> bool:
+    """Whether a column (N,) has a value of its own in each run of rows, most of which have three rows or more.
+
+    `anew` (N - 1,) bool: a run begins at the next row, because time falls there.
+    """
+    runs = np.diff(np.flatnonzero(anew), prepend=-1, append=len(anew))
+    constant = bool(((column[1:] != column[:-1]) == anew).all())
+    return constant and len(np.unique(column)) == len(runs) and float(np.median(runs)) >= MIN_SAMPLES
+
+
+def out_of_order(values: np.ndarray, anew: np.ndarray, names: Sequence[str]) -> str:
+    """The remedy for times that do not increase where `anew` (N - 1,) is true, in a table with columns of these names.
 
     A column that changes there and nowhere else numbers the recordings.
     """
-    changes = np.diff(values, axis=0) != 0
-    expected = np.isin(np.arange(1, len(values)), starts)
-    numbered = [name for name, own in zip(names, changes.T, strict=True) if bool((own == expected).all())]
-    if len(starts) > 1 and numbered:
+    numbered = [name for name, own in zip(names, values.T, strict=True) if numbers_runs(own, anew)]
+    if numbered:
         return f"column '{numbered[0]}' changes wherever time starts anew: --group {numbered[0]} (group= in Python)"
     return (
         "sort the rows, delete one, or number the trajectories in a column 'trajectory' (another name: --group NAME, "

@@ -16,7 +16,7 @@ KINDS = {
     "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|volts?|amps?|%|percent"),
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi|s?lpm|gpm|(m?[lL]|m3|m³)/ ?(s|min|h)"),
     "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
-    "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|.+[ ·*]s(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
+    "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|(.+[ ·*])?(s|min)(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
 }
 NUMBERED = r"(_?\d+|_.*)?"
@@ -26,7 +26,10 @@ ROLES = {
         r"t|times?|timestamps?|date|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
         r"|czas|čas|aika"
     ),
-    "trajectory": re.compile(r"trajectory|trial|run"),
+    "trajectory": re.compile(
+        r"(trajectory|trial|run|recording|experiment|episode|versuch|lauf|messreihe|essai|ensayo|prueba|prova)"
+        r"([ _-]?(id|nr|no|num|number|index|n°|#)\.?)?"
+    ),
     "action": re.compile(r"s"),
     "momentum": re.compile(r"p|p_.*"),
     # Left aside, as are rates: logged velocities are usually filtered, and counters of rows are no motion.
@@ -44,9 +47,16 @@ LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")
 DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")
 # Usual names of coordinates.
 KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")
-# The last part of a German compound decides: Motorstrom, Winkelgeschwindigkeit.
+# The last part of a German compound decides, Motorstrom, Winkelgeschwindigkeit, or a first part for an excitation:
+# Erregerwinkel.
 COMPOUND = re.compile(
-    ".+(winkel|kraft|moment|strom|spannung|drehzahl|geschwindigkeit|beschleunigung|fehler|temperatur|zeit)"
+    "^(?:erreger|anregung(?=s))(?=.)|(?<=.)(?:winkel|kraft|moment|strom|spannung|drehzahl|geschwindigkeit|beschleunigung"
+    "|fehler|temperatur|zeit|erregung|anregung)$"
+)
+# A column that was filtered from another: theta_filt beside theta, x_smoothed beside x_raw.
+COPY = re.compile(
+    r"(?:filt(?:ered)?|smooth(?:ed)?)[ _-]?(?P<before>.+)|(?P<behind>.+?)[ _-]?"
+    r"(?:filt(?:ered)?|smooth(?:ed)?|lowpass|lp|gefiltert|geglättet|filtrée?|filtrad[oa]|filtrat[oa])"
 )
 # Words without accents: ángulo is here as angulo. Kinds of words that need a reason:
 # side: quantities that are measured beside a motion. attribute: of a position (motor_angle), or else of an input.
@@ -69,9 +79,9 @@ _WORDS = {
               "strom spannung couple courant tension fuerza corriente voltaje coppia corrente forza tensione grf",
     "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse",
     "reading": "pot potentiometer lvdt encoder laser",
-    "excitation": "road ground floor shaker exciter excitation erreger anregung excitateur excitador disturbance "
-                  "seismic",
-    "support": "base pivot support platform",
+    "excitation": "road ground floor shaker exciter excitation erreger erregung anregung excitateur excitador "
+                  "excitacion eccitazione disturbance seismic",
+    "support": "base pivot support platform fusspunkt fundament",
 }  # fmt: skip
 WORDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 GIVEN = frozenset(("input", "inputs", "control", "controls"))
@@ -88,6 +98,13 @@ class Guess(NamedTuple):
 
 def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     """The role of a column by its own name and unit; `others` are the names of all columns: dx is the rate of x."""
+    guess = _own_role(name, unit, others)
+    is_copy = guess.role == "q" and _is_copy(name.casefold(), [other.casefold() for other in others])
+    return Guess("dropped", "it may be more than a filtered copy of another column") if is_copy else guess
+
+
+def _own_role(name: str, unit: str, others: Collection[str]) -> Guess:
+    """The role of a column that is no filtered copy of another."""
     kind = kind_of(unit)
     # "Time" means time, but a single "V" may be a volume.
     key = name.casefold() if len(name) > 1 else name
@@ -168,13 +185,13 @@ def is_usual(name: str, unit: str) -> bool:
 def words_of(name: str) -> frozenset[str]:
     """The words of a name, in lower case and without accents: `ActCurrent`, `goal_position` and `x vel` have two each.
 
-    The last part of a German compound is a further word.
+    The part of a German compound that decides is a further word.
     """
     parts = re.findall(r"[^\W\d_]+", name)
     found = [word for part in parts for word in re.findall(r"[A-ZÄÖÜ]?[^A-ZÄÖÜ]+|[A-ZÄÖÜ]+(?![^A-ZÄÖÜ])", part)]
     folded = ("".join(x for x in normalize("NFD", word.casefold()) if not combining(x)) for word in found)
     words = frozenset(folded)
-    return words | {head[1] for head in map(COMPOUND.fullmatch, words) if head}
+    return words | {part for word in words for part in COMPOUND.findall(word)}
 
 
 def _whole(key: str, kind: str) -> str:
@@ -182,6 +199,8 @@ def _whole(key: str, kind: str) -> str:
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "")
     if role in ("action", "momentum"):
         return "" if kind in ("position", "pressure", "other") else role
+    if role == "trajectory":
+        return "" if kind else role
     meant = kind in ("", "effort", "electric") or (kind == "position" and key[0] == "u")
     return "" if role == "input" and not meant else role
 
@@ -221,7 +240,7 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
     """The role of a column whose unit does not decide."""
     shaken = words & {"acceleration", "acc", "accel"} and words & WORDS["support"]
     if shaken or words & WORDS["excitation"]:
-        return Guess("input", BY_NAME)
+        return Guess("input", "" if words & WORDS["effort"] else BY_NAME)
     if is_timed(words):
         return Guess("dropped")
     if _is_rate(key, words, others, ""):
@@ -233,6 +252,13 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
     if attribute and re.fullmatch(SYMBOL, last):
         return Guess("q", "its name may be that of an input")
     return Guess("input" if attribute or words & WORDS["effort"] else "q")
+
+
+def _is_copy(key: str, others: Collection[str]) -> bool:
+    """Whether a name is that of another column, or of its raw values, and a word for a filter."""
+    match = COPY.fullmatch(key)
+    base = match and (match["before"] or match["behind"])
+    return bool(base) and bool({base, f"{base}_raw", f"raw_{base}"}.intersection(others))
 
 
 def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:

@@ -165,7 +165,7 @@ def assign(cells: Sequence[str], where: str, wanted: Wanted = HEADER_DECIDES) ->
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
         f"{where}: no coordinate column, only {every}; {_remedy(names, roles)}": not q,
-        f"{where}: both a column {both}; keep one": len(roles["trajectory"]) > 1,
+        f"{where}: both a column {both}; keep one: --group NAME (group= in Python)": len(roles["trajectory"]) > 1,
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))

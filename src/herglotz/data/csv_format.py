@@ -25,7 +25,7 @@ from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, i
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.header_cells import name_and_unit
 from herglotz.data.sensors import calibrated
-from herglotz.data.table import from_table, in_dates, moment, with_units
+from herglotz.data.table import from_table, group_by_values, grouped_by_guess, in_dates, moment, with_units
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 
@@ -179,23 +179,26 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     `herglotz.data.csv_columns.Wanted`.
 
     **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
-    The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name_unit` as in
-    `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.header_cells` says where the end of a name is an
-    index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
+    The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
+    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.header_cells` says where the end of
+    a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
     of their own below the header. Other lines that start with # and blank lines are skipped, except for these comments:
     `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples, `# delay: 0.004` and `# lag: 0.02`
     are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5` make
     q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
 
     **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time.
-    Times may be dates in ISO 8601, which become seconds since the first row. `trajectory`, `trial` or `run` groups the
-    rows; `s` is the action, `p`/`p_*` are momenta. Of other columns the unit decides before the name
+    Times may be dates in ISO 8601, which become seconds since the first row. `trajectory`, `trial`, `run`,
+    `experiment`, `Versuch`, `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a
+    warning, a column that changes wherever time starts anew, and nowhere else, does. `s` is the action, `p`/`p_*` are
+    momenta. Of other columns the unit decides before the name
     (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions; N, Nm, A, V, % inputs; m/s, rad/s, rpm rates;
     rates are left aside, and so are °C, Pa, W. A set value of a motion is an input in any unit: goal, target, set
-    point, desired, reference, command, soll. Without a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage, motor
-    are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors, temperatures, batteries and counters (`index`,
-    `frame`, a first column without a name) are left aside; every other column is a coordinate. A coordinate in rad is
-    taken for an angle. A warning names every role that is a guess.
+    point, desired, reference, command, soll; so is what shakes a mechanism: road, ground, excitation, Erregung. Without
+    a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`,
+    `qd1` rates; errors, temperatures, batteries, counters (`index`, `frame`, a first column without a name) and
+    filtered copies of another column (`theta_filt`) are left aside; every other column is a coordinate. A coordinate in
+    rad is taken for an angle. A warning names every role that is a guess.
 
     **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row
     without any coordinate, or without s or a momentum, is left out; the step over that row has the mean of the inputs.
@@ -217,6 +220,8 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     comments = [line for line in lines if line.lstrip().startswith("#")]
     values = _plain_numbers(columns, rows)
     values = _parse_rows(path, columns, rows) if values is None else values
+    if group := group_by_values(columns, wanted, values, lambda i: [cells_of(line)[i] for _, line in rows]):
+        return grouped_by_guess(read_csv(path, replace(wanted, group=group)), group)
     labels, at = _labels(path, columns, rows), [i for i, _ in rows]
     found = from_table(path, columns, at, labels, values, lambda found: _with_settings(found, comments))
     if rows and not is_number(cells_of(rows[0][1])[columns.time]):
@@ -300,7 +305,10 @@ def _check_kinds(path: Path, columns: Columns, rows: Rows) -> None:
     two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
     for i in columns.numeric if len(two) == 2 else ():
         name, pair = columns.names[i], [cells[i] for cells in two]
-        remedy = f"leave the column out with --drop {name} (drop= in Python), or write numbers"
+        remedy = (
+            f"write numbers, leave the column out with --drop {name} (drop= in Python), or group the rows by it with "
+            f"--group {name} (group= in Python)"
+        )
         is_date = i == columns.time and any(map(moment, pair))
         if i == columns.time:
             remedy = "write numbers, or dates such as 2026-03-01 12:00:00.25"

@@ -1,4 +1,7 @@
-"""Names and units of a header's cells: `x[m]`, `x (m)`, `x(m)`, `x_mm` and `angleDeg`.
+"""Names and units of a header's cells: `x[m]`, `x (m)`, `x(m)`, `x/m`, `v/(m/s)`, `x_mm` and `angleDeg`.
+
+A slash stands before a known unit (ISO 80000-1: a quantity over its unit), unless another column has the same name
+before a slash: `arm/A` beside `arm/B` is a path. A unit of time stands behind the name of a time alone, unlike `x/s`.
 
 A unit that ends a name without brackets is one of `KINDS`. It is none where it is an index or a word:
 
@@ -29,6 +32,8 @@ from herglotz.data.column_roles import (
 CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
 # A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
 TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
+# A quantity over its unit: t/s, phi / °, v/(m/s).
+SLASH = re.compile(r"([^/\[\]()]+?)\s*/\s*(?:[\[(](.+)[\])]|([^\[\]()]+?))\s*")
 # Units that are read in any case, and as the last word of a name in camel case.
 CASELESS = re.compile(r"(?:deg|rad)(?:/s2?)?|mm|rpm|s|ms|us|ns|min", re.I)
 # A name, and a unit of two parts or one at its end. The momentum of x_deg is p_x_deg.
@@ -49,6 +54,8 @@ def name_and_unit(cell: str) -> tuple[str, str] | None:
     match = CELL.fullmatch(cell)
     if not match or not cell.isprintable():
         return None
+    if (slash := SLASH.fullmatch(cell)) and _is_over(slash[1], slash[2] or slash[3]):
+        return slash[1], slash[2] or slash[3]
     if match[2] is not None or match[3] is not None:
         return match[1], (match[2] or match[3]).strip()
     if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
@@ -72,7 +79,8 @@ def heads_of(cells: Sequence[str], known: Collection[str] = ()) -> list[tuple[st
 
 def _in_table(cell: str, head: tuple[str, str], names: Sequence[str], known: Collection[str]) -> tuple[str, str]:
     """Name and unit of a cell beside columns of these names."""
-    if cell in known or f"p_{cell}" in names:
+    path = SLASH.fullmatch(cell) and any(name.startswith(f"{head[0]}/") for name in names)
+    if cell in known or path or f"p_{cell}" in names:
         return cell, ""
     name, unit = _split(head[0])
     return (name, unit) if unit and not head[1] and (name in known or _is_unit(name, unit, names)) else head
@@ -94,19 +102,28 @@ def _split(text: str) -> tuple[str, str]:
     return text, ""
 
 
+def _is_over(name: str, unit: str) -> bool:
+    """Whether a name over this text is a quantity over its unit."""
+    return bool(kind_of(unit)) and _is_timed(name) == (kind_of(unit) == "time")
+
+
+def _is_timed(name: str) -> bool:
+    """Whether a name is that of a time."""
+    return is_time(name, "") or is_timed(words_of(name))
+
+
 def _may_have(name: str, unit: str) -> bool:
     """Whether a column of this name may be in this unit: see the head of this module."""
     kind, part = kind_of(unit), kind_of(base := re.split("[/ ]", unit)[0])
     if not kind or (base != unit and part != "position" and not PARTS.fullmatch(base)):
         return False
-    timed = is_time(name, "") or is_timed(words_of(name))
+    timed = _is_timed(name)
     length = part == "position" and not ANGLES.fullmatch(base)
     letter = len(unit) == 1 and unit.isalpha() and not AMBIGUOUS.fullmatch(unit)
     # x_in is the input beside x_out.
     if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or base == "in":
         return False
-    # A run in mA would number the trajectories.
-    return role_of(name, unit).role not in ("trajectory", "action", "momentum", "counter")
+    return role_of(name, unit).role not in ("action", "momentum", "counter")
 
 
 def _is_unit(name: str, unit: str, names: Sequence[str]) -> bool:

@@ -36,6 +36,7 @@ class Metadata(TypedDict, total=False):
     delay: float | None
     lag: float | None
     columns: list[tuple[str, str, str]]
+    recordings: list[str]
 
 
 LABELS = tuple(Metadata.__annotations__)
@@ -45,8 +46,8 @@ def read_npz(path: PathLike) -> Trajectories:
     """Read trajectories from a .npz archive.
 
     Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and `metadata`
-    (a JSON object with names, units, angles, time_unit, source, hold, delay, lag, columns) may follow. Integer arrays
-    become float64. InputError names the file, the array, what is wrong with it and the remedy.
+    (a JSON object with names, units, angles, time_unit, source, hold, delay, lag, columns, recordings) may follow.
+    Integer arrays become float64. InputError names the file, the array, what is wrong with it and the remedy.
     """
     return trajectories_of(read_bytes(path), Path(path))
 

@@ -28,7 +28,7 @@ from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import usable
-from herglotz.data.trajectories import GAP, Trajectories
+from herglotz.data.trajectories import GAP, Trajectories, made_alike
 from herglotz.data.units import in_degrees, in_radians_and_seconds, with_angles_in_degrees
 from herglotz.errors import InputError, refuse, tell
 
@@ -285,6 +285,7 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
     """The joined set; notes that only some files have, and errors about differences, begin with the file's name."""
+    sets = made_alike(sets)
     for file, one in zip(files[1:], sets[1:], strict=True):
         try:
             check_alike([sets[0], one])
@@ -292,7 +293,11 @@ def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories
             raise InputError(f"{file} beside {files[0].name}: {error}") from None
     shared = set(sets[0].notes).intersection(*(one.notes for one in sets))
     named = (
-        replace(one, notes=tuple(note if note in shared else of_file(file.name, note) for note in one.notes))
+        replace(
+            one,
+            notes=tuple(note if note in shared else of_file(file.name, note) for note in one.notes),
+            recordings=tuple(f"{file.name}, {name}" for name in one.recordings) or (file.name,) * len(one),
+        )
         for file, one in zip(files, sets, strict=True)
     )
     return Trajectories.cat(named)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from herglotz.data.checks import EXACT, MIN_SAMPLES, Unusable, out_of_order, quote
+from herglotz.data.checks import EXACT, MIN_SAMPLES, Unusable, numbers_runs, out_of_order, quote
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import with_missing
 from herglotz.data.header_cells import name_and_unit
@@ -57,6 +57,43 @@ def from_table(
     found = with_settings(_trajectories(path, columns, recordings))
     found = replace(found, hold=hold, notes=(*found.notes, *repairs, *unordered, *filled, *too_few))
     return _with_missing(found, columns, recordings)
+
+
+def group_by_values(
+    columns: Columns,
+    wanted: Wanted,
+    values: Any,  # (N, columns.numeric), as in `from_table`
+    labels_of: Callable[[int], list[str]],
+) -> str:
+    """The column that numbers the recordings by its values, where no name says so and time starts anew; "" for none.
+
+    The column has a value of its own between two falls of the time. The user's columns keep their role, and so do
+    inputs: a constant input is one. Rows of stacked tables, which are sorted by time, are one recording.
+    """
+    values = np.asarray(values, dtype=np.float64).reshape(-1, len(columns.numeric))
+    anew = np.diff(values[:, 0]) < 0
+    if columns.trajectory is not None or not anew.any():
+        return ""
+    if not (np.diff(in_order(Recording("", np.arange(len(values)), values)).values[:, 0]) < 0).any():
+        return ""
+    given = {columns.time, columns.s, *columns.p, *columns.u}
+    free = [
+        i for i, name in enumerate(columns.names)
+        if i not in given and wanted.role(name) is None and wanted.before(name) in (None, "dropped")
+    ]  # fmt: skip
+    for i in sorted(free, key=lambda i: i not in columns.q):
+        if numbers_runs(np.array(labels_of(i)), anew):
+            return columns.names[i]
+    return ""
+
+
+def grouped_by_guess(found: Trajectories, group: str) -> Trajectories:
+    """The set with a warning that a column was taken for the number of the recording by its values."""
+    note = (
+        f"warning: {group} is taken for the number of the recording, but by its values alone: it changes wherever time "
+        "starts anew, and nowhere else; if another column numbers the recordings, give --group NAME (group= in Python)"
+    )
+    return replace(found, notes=(*found.notes, note))
 
 
 def _with_missing(found: Trajectories, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
@@ -140,12 +177,12 @@ def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
         if one.label:
             raise Unusable(f"{where}, column '{label}': {quote(one.label)} {has}; delete it or add rows")
         raise Unusable(f"{where}: the file {has}; add rows")
-    back = np.flatnonzero(~(np.diff(t) > 0))
-    if len(back):
-        k = int(back[0])
+    back = ~(np.diff(t) > 0)
+    if back.any():
+        k = int(back.argmax())
         raise Unusable(
             f"{path}, row {one.at[k + 1]}, column '{clock}': {float(t[k + 1])!r} does not increase on {float(t[k])!r} "
-            f"in row {one.at[k]}; {out_of_order(one.values, back + 1, [columns.names[i] for i in columns.numeric])}"
+            f"in row {one.at[k]}; {out_of_order(one.values, back, [columns.names[i] for i in columns.numeric])}"
         )
     return one
 
@@ -175,6 +212,7 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording])
     )
     refuse({since_1970: last > MAX_SECONDS and not columns.units[columns.time]})
     units = tuple(columns.units[i] or "1" for i in columns.q)
+    group = "" if columns.trajectory is None else columns.names[columns.trajectory]
     found = Trajectories.of(
         t[:, 0],
         q,
@@ -189,6 +227,7 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording])
         hold=columns.hold if columns.u else "",
         source=path.name,
         columns=columns.roles(),
+        recordings=[f"{group} {one.label}" for one in recordings] if group else (),
     )
     return replace(found, notes=columns.notes)
 
@@ -206,8 +245,11 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     times = raw[columns.time]
     raw[columns.time] = clock = seconds(times)
     every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]
+    values = np.stack(every, 1)
+    if group := group_by_values(columns, wanted, values, lambda i: list(map(str, raw[i]))):
+        return grouped_by_guess(from_frame(frame, replace(wanted, group=group), where), group)
     labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
-    found = from_table(where, columns, range(first, first + len(clock)), labels, np.stack(every, 1))
+    found = from_table(where, columns, range(first, first + len(clock)), labels, values)
     if clock is times:
         return found
     return in_dates(found, "" if times.dtype.kind == "m" else "date")

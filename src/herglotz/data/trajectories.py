@@ -45,6 +45,8 @@ class Trajectories:
     observed
         (N, n) dimensionless weight of each position in a fit: 0 for a missing position, which q interpolates, else 1;
         None: no position is missing.
+    recordings
+        Name of each trajectory where it has one, a file or a value of the column that groups rows; () for none.
     time_unit, source, columns, notes
         Unit of t; file or scene of origin, for messages; name, role and unit of each column of a table, as read; notes
         on the reading.
@@ -76,6 +78,7 @@ class Trajectories:
     notes: tuple[str, ...] = ()
     v: Tensor | None = None  # (N, n)
     observed: Tensor | None = None  # (N, n)
+    recordings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_arrival(self.source or "trajectories", self.arrival)
@@ -102,6 +105,7 @@ class Trajectories:
         delay: float | None = None,
         lag: float | None = None,
         columns: tuple[tuple[str, str, str], ...] = (),
+        recordings: Sequence[str] = (),
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, with defaults for the rest.
 
@@ -117,6 +121,7 @@ class Trajectories:
             tuple("rad" if a else "1" for a in flags) if units is None else tuple(units), flags,
             None if s is None else as_tensor("s", s), as_columns("p", p), as_columns("u", u), time_unit, source,
             hold, delay, lag, columns, v=as_columns("v", v), observed=as_columns("observed", observed),
+            recordings=tuple(recordings),
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -152,6 +157,12 @@ class Trajectories:
     def trajectory(self) -> Tensor:
         """Trajectory of every sample, (N,) long."""
         return torch.repeat_interleave(torch.arange(len(self)), torch.tensor(self.lengths)).to(self.t.device)
+
+    def label(self, i: int) -> str:
+        """Return the number of a trajectory, and its name if that says more: `trajectory 3 (rec_17.csv)`."""
+        number = f"trajectory {i}"
+        name = self.recordings[i] if self.recordings else number
+        return number if name == number else f"{number} ({name})"
 
     @property
     def complete(self) -> Tensor:
@@ -265,11 +276,10 @@ class Trajectories:
         """
         if bool(kept.all()):
             return self
-        columns = self._map(lambda x: x[kept])
-        if (u := self.inputs_of_steps()) is not None:
-            columns["u"] = inputs_of_kept(self.t, u, self.lengths, kept)
-        counts = (int(own.sum()) for own in kept.split(list(self.lengths)))
-        return replace(self, **columns, lengths=tuple(filter(None, counts)), hold="zero" if self.hold else "")
+        u = self.inputs_of_steps()
+        u = None if u is None else inputs_of_kept(self.t, u, self.lengths, kept)
+        counts = tuple(int(own.sum()) for own in kept.split(list(self.lengths)) if own.any())
+        return replace(self.rows(kept, counts), u=u, hold="zero" if self.hold else "")
 
     def select(self, indices: Iterable[int] | Tensor) -> Trajectories:
         """Return these trajectories, in this order; an index may come twice."""
@@ -283,17 +293,17 @@ class Trajectories:
 
     @classmethod
     def cat(cls, sets: Iterable[Trajectories]) -> Trajectories:
-        """Join sets of the same coordinates, units and optional arrays."""
-        sets = list(sets)
-        if any(one.observed is not None for one in sets):
-            sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
+        """Join sets of the same coordinates, units and optional arrays, after `made_alike`."""
+        sets = made_alike(list(sets))
         check_alike(sets)
         present = [name for name in ARRAYS if getattr(sets[0], name) is not None]
         columns = {name: torch.cat([getattr(one, name) for one in sets]) for name in present}
         lengths = tuple(length for one in sets for length in one.lengths)
         source = ", ".join(dict.fromkeys(one.source for one in sets if one.source))
         notes = tuple(dict.fromkeys(note for one in sets for note in one.notes))
-        return replace(sets[0], **columns, lengths=lengths, source=source, notes=notes)
+        names = [name for one in sets for name in one.recordings or (one.source,) * len(one)]
+        recordings = tuple(names) if len(set(names)) > 1 else ()
+        return replace(sets[0], **columns, lengths=lengths, source=source, notes=notes, recordings=recordings)
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Trajectories:
         """Return the set in another dtype (float32 or float64) or on another device."""
@@ -343,5 +353,20 @@ class Trajectories:
         return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}
 
     def rows(self, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
-        """Return these rows of the concatenation, as trajectories of these lengths."""
-        return replace(self, **self._map(lambda x: x[rows]), lengths=lengths)
+        """Return these rows of the concatenation, as trajectories of these lengths, each named by its first row."""
+        owners = self.trajectory[rows].tolist() if self.recordings else []
+        recordings = tuple(self.recordings[owners[k]] for k in offsets_of(lengths)) if owners else ()
+        return replace(self, **self._map(lambda x: x[rows]), lengths=lengths, recordings=recordings)
+
+
+def made_alike(sets: Sequence[Trajectories]) -> list[Trajectories]:
+    """The sets, ready to be joined although samples are missing in only some of them.
+
+    A set without `observed` has all its positions. Inputs that go in lines or cubics between samples become the means
+    of their steps beside a set that has such means, with the hold "zero" (`Trajectories.keep`).
+    """
+    if any(one.observed is not None for one in sets):
+        sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
+    if any(one.hold == "zero" for one in sets):
+        sets = [replace(one, u=one.inputs_of_steps(), hold="zero") if one.hold else one for one in sets]
+    return list(sets)

@@ -186,7 +186,7 @@ def _errors(run: Run) -> tuple[Block, ...]:
     # NaN if a trajectory has no held-out samples.
     errors = [error.square().mean(0).sqrt().tolist() for error in unseen_errors(run)]
     each = [_of_each(run, dict(zip(data.names, row, strict=True))) for row in errors]
-    rows = [(f"{b}", *(value for _, value in row)) for b, row in enumerate(each)]
+    rows = [(data.label(b).removeprefix("trajectory "), *(value for _, value in row)) for b, row in enumerate(each)]
     table = Table(("trajectory", *(f"RMS {name}" for name in data.names)), tuple(rows[:20]))
     about = [row for row in summary_rows(run) if "RMS" in row[0]]
     return (

@@ -63,7 +63,7 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
             if not _agree(seen, precision(seen.data)):
                 break
             if now == out:
-                return seen, tuple(LeftOut(b, scale[b], least) for b in out)
+                return seen, tuple(LeftOut(b, scale[b], least, data.label(b)) for b in out)
         if 2 * len(now) >= len(data):
             break
         out = now
@@ -98,7 +98,8 @@ def _worst(seen: Look, missed: Sequence[Tensor]) -> LeftOut:
     """The recording that is missed most."""
     scale = [scale_of(own) for own in missed]
     worst = max(range(len(scale)), key=lambda b: scale[b])
-    return LeftOut(worst, scale[worst], _scale(missed, [b for b in range(len(scale)) if b != worst], seen))
+    least = _scale(missed, [b for b in range(len(scale)) if b != worst], seen)
+    return LeftOut(worst, scale[worst], least, seen.data.label(worst))
 
 
 def _scale(missed: Sequence[Tensor], recordings: Sequence[int], seen: Look) -> float:

@@ -169,8 +169,9 @@ class _Ahead:
         t, lengths = torch.cat(times), tuple(map(len, times))
         u = None if data.u is None else data.u[torch.cat(recorded)]
         made = replace(
-            data, t=t, q=data.q.new_zeros(len(t), data.dof), u=u, s=None, p=None, lengths=lengths, observed=None
-        )
+            data, t=t, q=data.q.new_zeros(len(t), data.dof), u=u, s=None, p=None, lengths=lengths, observed=None,
+            recordings=(),
+        )  # fmt: skip
         return cls(made, torch.cat(rows).to(t.device), segments, torch.cat(beyond), horizon)
 
     def stepped_on(self, model: ContactLagrangian, states: Tensor, max_step: float) -> Tensor:

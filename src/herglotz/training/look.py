@@ -66,18 +66,19 @@ class Probe:
 class LeftOut(NamedTuple):
     """A recording, counted from 0, and the scales of what the model of the others misses it and them by.
 
-    In units of q, over the balance of several kinds of coordinates.
+    In units of q, over the balance of several kinds of coordinates. `label` is the recording's (`Trajectories.label`).
     """
 
     recording: int
     missed: float
     others: float
+    label: str
 
     @property
     def reason(self) -> str:
         """The reason of a misfit, with a remedy."""
         far = f"is missed {self.missed / self.others:.2g} times as far as the others, and may be of something else"
-        return f"Trajectory {self.recording}, counted from 0, {far}. Try the fit without it"
+        return f"T{self.label[1:]}, counted from 0, {far}. Try the fit without it"
 
     @property
     def stands_out(self) -> bool:

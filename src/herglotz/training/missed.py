@@ -100,7 +100,7 @@ def reason_of(
     for what, signal, run in kicked:
         if (row := _kick(data, signal, run)) is not None:
             unit = "" if data.time_unit == "1" else data.time_unit
-            when = f"t = {size(float(data.t[row]), unit)} of trajectory {int(data.trajectory[row])}"
+            when = f"t = {size(float(data.t[row]), unit)} of {data.label(int(data.trajectory[row]))}"
             return (
                 f"{what}, the hardest at {when}, as by blows and end stops. Try what strikes as an input (--inputs), "
                 "or recordings that are cut there"

@@ -251,12 +251,13 @@ def of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
 def _check_lengths(data: Trajectories, warmup: int, every: int) -> None:
     """Raise unless every trajectory has two samples after its warm-up."""
     length = min(data.lengths)
+    shortest = data.label(data.lengths.index(length))
     thinned = f", every {every} of the recording" if every > 1 else ""
     shorter, remedy = max(3, length // 2), "leave it out, as no warm-up is short enough"
     remedy = f"use --warmup {shorter} or a longer recording" if length >= 5 else remedy
     refuse({
-        f"{data.source or 'data'}: trajectory {data.lengths.index(length)} has {length} samples{thinned}; a warm-up of "
-        f"{warmup} needs at least {warmup + 2}: {remedy}": length < warmup + 2,
+        f"{data.source or 'data'}: {shortest} has {length} samples{thinned}; a warm-up of {warmup} needs at least "
+        f"{warmup + 2}: {remedy}": length < warmup + 2,
     })  # fmt: skip
 
 

@@ -44,7 +44,7 @@ def outlying_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
     """The recording that stands out where none was left out, with what to do."""
     unit = common_unit(data.units)
     return [
-        f"trajectory {one['recording']}, counted from 0, may be of something else: the model misses it by "
+        f"{_label(one)}, counted from 0, may be of something else: the model misses it by "
         f"{size(one['missed'], unit, digits=2)}, and the others by {size(one['others'], unit, digits=2)}; "
         "fit once more without it"
         for one in metrics.get("outlying", ())
@@ -55,10 +55,15 @@ def left_out_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
     """The recordings that were left out whole, with what the model of the others misses them by."""
     unit = common_unit(data.units)
     return [
-        f"trajectory {one['recording']}, counted from 0, whole: the model of the others misses it by "
+        f"{_label(one)}, counted from 0, whole: the model of the others misses it by "
         f"{size(one['missed'], unit, digits=2)}, and them by {size(one['others'], unit, digits=2)}"
         for one in metrics.get("left_out", ())
     ]
+
+
+def _label(one: Mapping[str, Any]) -> str:
+    """The label of a recording; runs of earlier versions know its number alone."""
+    return one.get("label", f"trajectory {one['recording']}")
 
 
 def summary(run: FittedRun) -> str:

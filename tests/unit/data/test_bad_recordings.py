@@ -134,13 +134,88 @@ def test_several_recordings_are_said_once(tmp_path, capsys):  # fails if every r
     assert "as their number says, and so of 3 more recordings" in err
 
 
+GUESSED = "warning: a.csv: {} is taken for the number of the recording, but by its values alone"
+
+
+@pytest.mark.parametrize("name", ["swing", "test", "Messung", "load[kg]"])
+@pytest.mark.parametrize("lengths", [(4, 5), (4, 5, 4)])
+def test_a_column_that_changes_where_time_starts_anew_numbers_the_recordings(tmp_path, capsys, name, lengths):
+    # fails if the rule needs a word of a list, or three recordings; or if the guess is not said
+    path = written(tmp_path, f"{name},t,x,y", [[*row, row[2] ** 2] for row in recordings(lengths, 1)])
+    data = load(path)
+    own = name.split("[")[0]
+    assert (data.lengths, data.names) == (lengths, ("x", "y"))
+    assert GUESSED.format(own) in (err := capsys.readouterr().err)
+    assert f"{own} is taken for a coordinate" not in err
+    frame = {name: [row[0] for row in recordings(lengths, 1)], "t": data.t.numpy(), "x": data.q[:, 0].numpy()}
+    assert as_trajectories(frame).lengths == lengths
+    # Another table has the same columns, also with a single recording.
+    capsys.readouterr()
+    one = written(tmp_path, f"{name},t,x,y", [[*row, row[2] ** 2] for row in recordings([5], 7)])
+    assert load(one, like=data).names == ("x", "y")
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_a_column_left_aside_may_number_the_recordings(tmp_path):
+    # fails if only coordinates are looked at, or a column that the user drops has a role
+    path = written(tmp_path, "index,t,x", recordings([4, 5], 1))
+    assert load(path).lengths == (4, 5)
+    assert load(path, coordinates="x").lengths == (4, 5)
+    with pytest.raises(InputError, match="does not increase"):
+        load(path, drop="index")
+    # A temperature of each recording stays aside; the coordinate that cannot be one leaves.
+    rows = [[20 + b, b, t, x] for b, t, x in recordings([4, 5], 1)]
+    assert load(written(tmp_path, "temp,load,t,x", rows)).names == ("x",)
+    known = load(written(tmp_path, "temp,load,t,x", [[20, k % 3, t, x] for k, (_, t, x) in enumerate(recordings([9]))]))
+    with pytest.raises(InputError, match="does not increase"):
+        load(written(tmp_path, "load,t,x", recordings([4, 5], 1)), like=known)
+
+
+def test_stacked_tables_are_one_recording(tmp_path):
+    # fails if the rows of a second sensor, behind those of the first, are a second recording without the first's values
+    nan = float("nan")
+    rows = [[0, 0.1 * k, k**2, nan] for k in range(6)] + [[1, 0.1 * k, nan, k**3] for k in range(6)]
+    assert load(written(tmp_path, "index,t,x,y", rows)).lengths == (6,)
+
+
+@pytest.mark.parametrize(
+    ("rows", "row"),
+    [
+        ([[k // 3, 0.1 * (k % 6), k**2] for k in range(12)], 8),
+        ([[int(6 <= k < 9), 0.1 * (k % 6), k**2] for k in range(12)], 8),
+        ([[k // 6 % 2, 0.1 * (k % 6), k**2] for k in range(18)], 8),
+        ([[0, 0.0, 0], [0, 0.1, 1], [0, 0.3, 9], [1, 0.2, 4], [2, 0.15, 3], [3, 0.12, 3]], 5),
+    ],
+    ids=["changes elsewhere too", "two values", "values come again", "rows out of order"],
+)
+def test_other_columns_do_not_number_recordings(tmp_path, rows, row):
+    # fails if a coordinate is taken for a number of recordings where only some of its values fit
+    with pytest.raises(InputError, match=f"row {row}, column 't': .* sort the rows"):
+        load(written(tmp_path, "load,t,x", rows))
+
+
+@pytest.mark.parametrize(
+    "name", ["Versuch", "Essai", "experiment", "recording", "trial_id", "run_nr", "Lauf", "prueba", "Run #", "run no."]
+)
+def test_names_of_recordings_group_rows(tmp_path, capsys, name):
+    # fails if a usual name numbers recordings in other languages as a coordinate, or with a warning
+    data = load(written(tmp_path, f"{name},t,x", [[b, k, x] for k, (b, _, x) in enumerate(recordings([4, 5]))]))
+    assert (data.lengths, data.names) == ((4, 5), ("x",))
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_a_unit_makes_a_quantity_of_a_recordings_name(tmp_path):
+    # fails if the position of a test run, in mm, groups its rows
+    assert load(written(tmp_path, "run[mm],t", [[x, t] for _, t, x in recordings([9])])).names == ("run",)
+
+
 def test_a_column_that_numbers_the_recordings_is_named(tmp_path):
-    # fails if a table of drops, numbered in a column of another name, is told to sort its rows
-    path = written(tmp_path, "drop,t,x", recordings([4, 5, 4], 1))
-    with pytest.raises(InputError, match=r"row 6, column 't': 0.0 does not increase on 0.3\d* in row 5; column 'drop' "
-                       r"changes wherever time starts anew: --group drop \(group= in Python\)"):  # fmt: skip
+    # fails if a table of two recordings, each with another constant torque, is told to sort its rows
+    path = written(tmp_path, "torque,t,x", recordings([4, 5], 1))
+    with pytest.raises(InputError, match=r"row 6, column 't': 0.0 does not increase on 0.3\d* in row 5; column "
+                       r"'torque' changes wherever time starts anew: --group torque \(group= in Python\)"):  # fmt: skip
         load(path)
-    assert load(path, group="drop", show=False).lengths == (4, 5, 4)
+    assert load(path, group="torque", show=False).lengths == (4, 5)
     # One row out of order is no second recording.
     with pytest.raises(InputError, match="sort the rows, delete one, or number the trajectories"):
         load(written(tmp_path, "t,x,y", [[0.0, 1.0, 1.0], [0.2, 1.0, 2.0], [0.1, 2.0, 3.0], [0.3, 2.0, 4.0]]))

@@ -93,7 +93,7 @@ def test_blank_trajectory_column_is_one_trajectory(tmp_path):  # fails if a blan
         ("t,a,b,p_a,p_c\n0,1,2,3,4\n", r"row 1: momentum columns p_a, p_c are not p_a, p_b; rename or delete them"),
         ("t,q\n0,1\n1,abc\n2,3\n", r"data.csv, row 3, column 'q': 'abc' is not a number; correct or delete the row"),
         ("t,q\n\n# x\n0,1\n,2\n2,3\n", r"data.csv, row 5, column 't': a blank cell is not a number; correct or delete"),
-        ("t,q,a\n0,1,ok\n1,2,no\n", r"row 2, column 'a': 'ok' is not a number; leave the column out with --drop a "),
+        ("t,q,a\n0,1,ok\n1,2,no\n", r"row 2, column 'a': 'ok' is not a number; write numbers, .* --group a "),
         ("t,q\n1:00,1\n2:00,2\n", r"row 2, column 't': '1:00' is not a number; write numbers, or dates such"),
         ("t,q,a\ns,5,m\n1,2,3\n", r"row 2, column 't': 's' is not a number; correct or delete the row"),
         ("t,q\n0,1\n1_0,2\n", r"data.csv, row 3, column 't': '1_0' is not a number"),

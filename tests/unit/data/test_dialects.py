@@ -150,9 +150,19 @@ def test_a_folder_of_recordings(tmp_path, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert (lines[0], len(lines)) == ("lab:", 6)
     assert "  2 recordings: a.tsv, b.csv" in lines
+    assert data.recordings == ("a.tsv", "b.csv")
     (folder / "c.csv").write_text("t,y\n0,1\n1,2\n2,3\n")
     with pytest.raises(InputError, match=r"c\.csv beside a\.tsv: sets with different names cannot be joined"):
         load(folder)
+
+
+def test_recordings_have_the_names_of_files_and_groups(tmp_path):
+    # fails if a message about trajectory 17 of a folder leaves it to the reader which file that is
+    for name in ("a.csv", "b.csv"):
+        text = "run,t,x\n" + "".join(f"{run},{i},{i * run}\n" for run in (4, 7) for i in range(3))
+        (tmp_path / name).write_text(text)
+    assert load(tmp_path / "a.csv").label(1) == "trajectory 1 (run 7)"
+    assert load(tmp_path).recordings == ("a.csv, run 4", "a.csv, run 7", "b.csv, run 4", "b.csv, run 7")
 
 
 def test_notes_on_the_files_of_a_folder_name_the_file(tmp_path):

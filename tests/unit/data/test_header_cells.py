@@ -56,6 +56,39 @@ def test_a_letter_is_an_index_beside_another_index(cells, names):  # fails if th
     assert [head and head[0] for head in heads_of(cells.split(","))] == names.split(",")
 
 
+OVER = {
+    "phi/rad": ("phi", "rad", "coordinate"), "phi / °": ("phi", "°", "coordinate"), "s/mm": ("s", "mm", "coordinate"),
+    "F/N": ("F", "N", "input"), "U / V": ("U", "V", "input"), "M/(N m)": ("M", "N m", "input"),
+    "v/(m/s)": ("v", "m/s", "left aside"), "v / m/s": ("v", "m/s", "left aside"), "T/°C": ("T", "°C", "left aside"),
+    "n/min⁻¹": ("n", "min⁻¹", "left aside"), "n/[1/min]": ("n", "1/min", "left aside"),
+    "y/in": ("y", "in", "coordinate"),
+    # Paths, ratios and rates.
+    "pos/vel": ("pos/vel", "", "left aside"), "a/b": ("a/b", "", "coordinate"), "x/s": ("x/s", "", "coordinate"),
+    "left/min": ("left/min", "", "coordinate"), "joint/position": ("joint/position", "", "coordinate"),
+    "joint/position/m": ("joint/position/m", "", "coordinate"), "dx/dt": ("dx/dt", "", "left aside"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("cell", OVER)
+def test_a_quantity_over_its_unit(cell):
+    # fails if the notation of physics, a quantity over its unit, is a name; or a path or a ratio has a unit
+    found = assign(["t/ms", "z/mm", cell], "header")
+    assert found.roles()[0] == ("t", "time", "ms")
+    assert found.roles()[2] == (OVER[cell][0], OVER[cell][2], OVER[cell][1])
+
+
+def test_a_letter_behind_a_slash_is_a_body_beside_another(tmp_path):
+    # fails if the joint of body A is an input in amperes, or a column is not found by its whole cell
+    cells = ["t[s]", "joint/A", "joint/B", "load / N"]
+    assert assign(cells, "header").roles()[1:] == (
+        ("joint/A", "coordinate", ""), ("joint/B", "coordinate", ""), ("load", "input", "N"),
+    )  # fmt: skip
+    path = tmp_path / "a.csv"
+    path.write_text("t / s;x / mm;F / N\n" + "".join(f"0,{k};{k % 3};{k % 4}\n" for k in range(8)))
+    data = load(path, time="t / s", inputs="F / N", coordinates="x")
+    assert (data.names, data.units, data.time_unit, data.input_labels) == (("x",), ("mm",), "s", (("F", "N"),))
+
+
 def test_names_of_another_table_stay():
     # fails if a run of x_A and x_B, or of hub_m, does not know the same column in a table with other columns
     assert [head and head[0] for head in heads_of(["hub_A", "arm_m"], {"hub_A", "arm"})] == ["hub_A", "arm"]

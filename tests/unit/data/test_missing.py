@@ -57,6 +57,25 @@ def test_sets_with_and_without_blanks_are_joined_saved_and_read(tmp_path):
     assert torch.equal(again.observed, both.observed)
 
 
+@pytest.mark.parametrize("hold", ["", "first", "smooth"])
+def test_a_folder_in_which_one_file_has_blanks(tmp_path, hold):
+    # fails if the blank position of one file, or its row left out, refuses the folder; or if the inputs of the other
+    # files keep lines between samples beside the means of steps
+    rows = [f"{k / 10},{k % 7},{k % 5},{k}" for k in range(20)]
+    for name, blank in (("a.csv", {}), ("b.csv", {4: "0.4,,4,4", 9: "0.9,,,9"})):
+        text = "\n".join(blank.get(k, row) for k, row in enumerate(rows))
+        (tmp_path / name).write_text((f"# hold: {hold}\n" if hold else "") + f"t,x,y,u\n{text}\n")
+    data = load(tmp_path)
+    assert data.lengths == (20, 19)
+    assert data.observed is not None
+    assert (data.observed == 0).nonzero().tolist() == [[24, 0]]
+    assert data.hold == ("zero" if hold else "")
+    assert data.u is not None
+    middle = 0.5 if hold else 0.0
+    assert torch.allclose(data.u[:19, 0], torch.arange(19).double() + middle)
+    assert torch.allclose(data.u[20:38, 0][9:], torch.arange(10, 19).double() + middle)
+
+
 def test_noise_is_that_of_readings():
     # fails if cubics through readings count as readings: they follow the motion to a third of this noise
     noise = 1e-3 * torch.randn(2000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

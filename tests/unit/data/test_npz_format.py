@@ -3,6 +3,7 @@
 import io
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +25,11 @@ def read(folder: Path, **arrays) -> Trajectories:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_round_trip_is_exact(tmp_path, dtype):  # fails if an array, a label or the dtype is lost
-    data = rich().select([0]).to(dtype)
+    data = replace(rich().select([0]).to(dtype), recordings=("run 7",))
     write_npz(tmp_path / "a.npz", data)
     back = read_npz(tmp_path / "a.npz")
     assert back.digest() == data.digest()
+    assert back.recordings == ("run 7",)
     assert [x.name for x in tmp_path.iterdir()] == ["a.npz"]
 
 

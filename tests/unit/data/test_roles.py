@@ -35,6 +35,12 @@ ROLES = {
     "commande": "input", "voltaje": "input", "referencia": "input", "erreur": "left aside", "Leistung": "left aside",
     "GRF_z": "input", "ctrl": "input", "action": "input", "reward": "left aside", "imu_ax": "left aside",
     "Sub Frame": "left aside", "Frame#": "left aside", "Winkelabweichung[deg]": "coordinate",
+    # What moves a mechanism from outside, also in compounds.
+    "Fußpunkterregung[mm]": "input", "Bodenanregung[m]": "input", "Erregerwinkel[rad]": "input", "erregung": "input",
+    "Anregungssignal": "input", "Fußpunkt[mm]": "input", "excitación[mm]": "input", "Erregerkraft": "input",
+    # A copy of another column, theta; filters of columns that are not there are names.
+    "theta_filt[rad]": "left aside", "theta_smoothed": "left aside", "filtered theta[deg]": "left aside",
+    "phi_filt[rad]": "coordinate", "filter[mm]": "coordinate", "help": "coordinate",
     # The usual letters, words and counters.
     "force[N]": "input", "F[N]": "input", "F": "input", "torque[Nm]": "input", "Torque": "input", "tau_1": "input",
     "tau2": "input", "u1": "input", "u_0": "input", "M[N*m]": "input", "voltage[V]": "input", "current": "input",
@@ -138,6 +144,7 @@ GUESSES = {
     "x_dot[m]": "is left aside, but it has the unit of a position",
     "dx[m]": "is left aside, but it has the unit of a position",
     "valve[bar]": "is left aside, but it may be an input",
+    "x_lp": "is left aside, but it may be more than a filtered copy of another column; if so, give --inputs x_lp or",
     "pot[V]": "is left aside, but it may be the reading of a position",
     "motor_x": "is taken for a coordinate, but its name may be that of an input",
     "input_angle": "is taken for a coordinate, but its name may be that of an input",
@@ -158,8 +165,15 @@ def test_what_is_a_guess_is_said_in_a_warning(tmp_path, capsys, cell):
     assert "warning" not in capsys.readouterr().err  # it is known by then, or the user has said it
 
 
+def test_raw_values_are_fitted_and_their_filtered_copy_is_not():
+    # fails if both are coordinates, or a force that was filtered by a logger's channel of its own leaves the inputs
+    found = assign(["t[s]", "x_filtered[mm]", "x_raw[mm]", "F[N]", "F_filt[N]"], "header")
+    assert (found.q, found.u) == ((2,), (3, 4))
+
+
 @pytest.mark.parametrize(
-    "header", ["t,a", "t,a,u", "t[s],theta[rad],x[m],F[N]", "t,q1,q2,u", "Zeit,Winkel[°],Moment[Nm],T[°C]"]
+    "header",
+    ["t,a", "t,a,u", "t,x,Erregerkraft", "t[s],theta[rad],x[m],F[N]", "t,q1,q2,u", "Zeit,Winkel[°],Moment[Nm],T[°C]"],
 )
 def test_nothing_is_said_of_what_is_clear(tmp_path, capsys, header):  # fails if every table is warned of
     read(tmp_path, table(header))

@@ -56,6 +56,7 @@ SIX = torch.zeros(6, dtype=torch.float64)
         ({"p": torch.zeros(6, 2, dtype=torch.float64)}, r"f: p must have shape \(6, 1\), got \(6, 2\)"),
         ({"u": SIX[:5]}, r"f: u must have shape \(6, m\), got \(5, 1\)"),
         ({"lengths": ()}, r"f: there is no trajectory; give at least one of 3 samples"),
+        ({"recordings": ("a",)}, r"f: recordings has 1 names for 2 trajectories; give one a trajectory, or none"),
         ({"lengths": (5, 1)}, r"f: trajectory 1 has 1 sample, at least 3 are needed; leave it out"),
         ({"lengths": (2, 4)}, r"f: trajectory 0 has 2 samples, at least 3 are needed"),
         ({"lengths": (3, 4)}, r"f: lengths add up to 7 but t has 6 samples; correct the lengths"),
@@ -210,6 +211,22 @@ def test_cat():  # fails if the lengths or an optional array of the second set a
         Trajectories.cat([data, data.to(torch.float32)])
     with pytest.raises(InputError, match="at least one set"):
         Trajectories.cat([])
+
+
+def test_names_of_recordings_follow_their_samples():
+    # fails if a set that is cut, chosen or joined calls a recording by the name of another
+    data = replace(ragged(), recordings=("a.csv", "b.csv", "trajectory 2"))
+    assert [data.label(b) for b in range(3)] == ["trajectory 0 (a.csv)", "trajectory 1 (b.csv)", "trajectory 2"]
+    assert ragged().label(1) == "trajectory 1"
+    assert data.select([2, 1, 1]).recordings == ("trajectory 2", "b.csv", "b.csv")
+    assert data.rows(torch.tensor([1, 2, 3, 8, 9, 10, 10, 11, 12]), (3, 3, 3)).recordings[1:] == ("trajectory 2",) * 2
+    kept = torch.arange(13) >= 5
+    kept[4:7] = False
+    assert data.keep(kept).recordings == ("trajectory 2",)
+    assert data.split_time(0.5)[1].recordings == ("trajectory 2",)
+    assert Trajectories.cat([data, ragged()]).recordings == (*data.recordings, "set", "set", "set")
+    assert Trajectories.cat([ragged(), replace(ragged(), source="other")]).label(4) == "trajectory 4 (other)"
+    assert Trajectories.cat([ragged(), ragged()]).recordings == ()
 
 
 def test_to():  # fails if an array is left in the old dtype

@@ -1,6 +1,7 @@
 """A recording of something else among good ones is left out whole, and named."""
 
 import math
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -38,15 +39,17 @@ def _good():
 
 def test_one_bad_recording_is_left_out_and_named(capsys):
     # fails if the bad recording bends the model of the others, is not named, or takes another one with it
-    run = fit(_drops(0, 6, 13, bad=4), progress=False)
+    data = replace(_drops(0, 6, 13, bad=4), recordings=tuple(f"rec_{b}.csv" for b in range(6)))
+    run = fit(data, progress=False)
     (out,) = run.metrics["left_out"]
     assert out["recording"] == 4
     assert out["missed"] > 50 * out["others"]
     assert len(run.data) == 5
     assert run.metrics["verdict"].startswith("fits")
     assert run.metrics["extrapolation_rms"] < 2 * 0.0015
-    assert "warning: left out is trajectory 4, counted from 0" in capsys.readouterr().err
-    assert "left out" in run.summary()
+    assert "warning: left out is trajectory 4 (rec_4.csv), counted from 0" in capsys.readouterr().err
+    assert "trajectory 4 (rec_4.csv)" in run.summary()
+    assert run.data.recordings[4] == "rec_5.csv"
 
 
 def test_good_recordings_all_stay():
@@ -160,9 +163,10 @@ def test_a_recording_that_bends_a_plan_is_named():
     # or if the residual is said to be a force that depends on the past
     amplitudes = (0.6, 0.9, 1.2, 1.5, 1.8)
     good = fit(_swings(amplitudes), progress=False)
-    run = fit(_swings(amplitudes, bad=3), plan=good, progress=False)
+    data = replace(_swings(amplitudes, bad=3), recordings=("A", "B", "C", "D", "E"))
+    run = fit(data, plan=good, progress=False)
     assert [one["recording"] for one in run.metrics["outlying"]] == [3]
-    assert "Trajectory 3, counted from 0, is missed " in run.metrics["verdict"]
+    assert "Trajectory 3 (D), counted from 0, is missed " in run.metrics["verdict"]
     assert run.metrics["verdict"].endswith("may be of something else. Try the fit without it")
 
 

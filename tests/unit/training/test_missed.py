@@ -83,14 +83,15 @@ def test_neighbours_are_of_other_times():
 
 
 def test_the_hardest_kick_is_named():  # fails if the place is a row of the windows, or that of any other kick
-    data = Trajectories.of(torch.cat([T, T]), torch.cat([noisy(), noisy()])[:, None], (N, N))
+    both = torch.cat([noisy(), noisy()])[:, None]
+    data = Trajectories.of(torch.cat([T, T]), both, (N, N), recordings=["run 3", "run 8"])
     owner, blows = torch.cat([OWNER, OWNER + N]), 3 * kicks()
     # Noise decides between kicks that are alike.
     blows[130] *= 1.5
     found = reason_of(data, torch.cat([left(0 * T), left(blows)]), owner) or ""
     when = float(found.split("t = ")[1].split()[0])
     assert abs(when - 13.0) <= 5 * H, found  # the second kick, at row 130
-    assert "of trajectory 1" in found
+    assert "of trajectory 1 (run 8)," in found
 
 
 @pytest.mark.parametrize(("hidden", "start", "noise"), [(True, 0.0, 1e-3), (False, 0.5, 5e-4)])

@@ -259,6 +259,10 @@ def test_mistakes_say_what_to_do():
         ({"data": replace(data, units=("m",), angles=(False,))}, "q is in m, the run was fitted in rad; convert"),
         ({"data": two}, "other.csv: the coordinates are a, b; the run was fitted to q: rename"),
         ({"warmup": 80}, "other.csv: trajectory 0 has 81 samples; a warm-up of 80 needs at least 82: use --warmup 40"),
+        (
+            {"data": replace(data, recordings=("run 5", "run 6")), "warmup": 80},
+            r"trajectory 0 \(run 5\) has 81 samples",
+        ),
         ({"data": data.rows(torch.arange(85), (81, 4))}, "at least 22: leave it out, as no warm-up is short enough"),
         ({"warmup": 2}, "warmup must be a whole number >= 3"),
         ({"windows": 3}, "windows and horizon go together"),

@@ -196,7 +196,7 @@ def test_a_misread_recording_is_no_fit_above_the_noise():
     good = replace(errors, windows=0.3, unseen=0.3, free=0.3)
     assert verdict.misread(data, seen, good.missed) == ""
     # fails if a recording that stands out is not named first
-    other = LeftOut(recording=2, missed=9.0, others=1.0)
+    other = LeftOut(recording=2, missed=9.0, others=1.0, label="trajectory 2")
     seen.outlying = (other,)
     assert verdict.misread(data, seen, True) == other.reason
 
