@@ -24,6 +24,8 @@ DEGREES = (3, 5, 7)
 # A residual is at the noise up to this factor times the precision: fitted states, and the estimate of the noise, leave
 # 10 to 30 % more.
 AT_THE_NOISE = 1.5
+# An outlier exceeds this many robust standard deviations, as a share of 6e-7 of normal residuals do.
+TAIL = 5.0
 # Windows, evenly spread: more do not change an RMS.
 MAX_WINDOWS = 4000
 
@@ -59,12 +61,30 @@ def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> T
     if not firsts:
         return torch.full((q.shape[1],), torch.inf, dtype=torch.float64)
     rows = torch.cat(firsts)
-    rows = rows[:: -(-len(rows) // MAX_WINDOWS)].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device)
+    of = torch.repeat_interleave(torch.arange(len(firsts)), torch.tensor([len(own) for own in firsts]))
+    stride = -(-len(rows) // MAX_WINDOWS)
+    rows, of = rows[::stride].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device), of[::stride]
     t, q = t[rows].double().cpu(), q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
     inverses = pseudo_inverses(x, degree)
     r = q - powers(x[: len(inverses)], degree) @ (inverses @ q)
-    return (r.square().mean((0, 1)) * SAMPLES / (SAMPLES - degree - 1)).sqrt()
+    square = r.square()
+    good = torch.stack([_agree(own, of) for own in square.mean(1).T], 1).double()
+    # Without an outlier both factors are 1, and change no bit.
+    mean = (square * good[:, None]).mean((0, 1)) / good.mean(0)
+    return (mean * SAMPLES / (SAMPLES - degree - 1)).sqrt()
+
+
+def _agree(square: Tensor, of: Tensor) -> Tensor:
+    """Windows, (W,) bool, of recordings whose RMS residual is no outlier (`TAIL`) among three or more recordings.
+
+    `square` (W,) are mean squares of residuals, `of` (W,) the recordings. One recording of something else would set the
+    noise of all. A recording whose sensor stands still tells nothing about the noise.
+    """
+    mean = torch.bincount(of, square) / torch.bincount(of).clamp_min(1)
+    known = mean[mean > 0]
+    most = TAIL**2 * float(known.median()) if len(known) >= 3 else torch.inf
+    return mean[of] <= most
 
 
 def precision(data: Trajectories) -> float:
