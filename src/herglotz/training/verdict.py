@@ -301,9 +301,8 @@ def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], be
     if reason := shown(missed):
         return reason
     if not missed:
-        return (
-            beyond or "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
-        )
+        other = "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
+        return beyond or other
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
     return "A force is missing. Try --objective smoothing, another --level (herglotz select), or a --feature for it"
