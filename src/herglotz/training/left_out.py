@@ -60,11 +60,11 @@ def reach(missed: Tensor) -> float:
 def since(missed: Tensor, t: Tensor, scale: float) -> float | None:
     """The time (of t, (N,)) from which on most rows of `missed` (N, n) are outliers of this scale.
 
-    None if that is the first sample.
+    None if no more than a tenth of the samples come before it.
     """
     out = (missed.abs() > TAIL * scale).any(-1).double() - 0.5
     first = int(out.flip(0).cumsum(0).flip(0).argmax()) if len(out) else 0
-    return float(t[first]) if first else None
+    return float(t[first]) if first > FEW * len(out) else None
 
 
 def scale_of_all(missed: Sequence[Tensor], least: float) -> float:

@@ -186,14 +186,15 @@ def test_a_recording_that_slips_is_named_from_then_on(bad, capsys):
 
 
 def test_a_few_samples_are_no_bad_recording():
-    # fails if a tenth of outliers, or none, is far, or if a time is said where the start is bad already
+    # fails if a tenth of outliers, or none, is far, or if a time is said where all but the first samples are bad
     far, t = torch.full((100, 1), 0.1, dtype=torch.float64), torch.arange(100).double()
     far[5:15] = 50.0
     assert reach(far) == 0.1
     far[60:] = 50.0
     assert reach(far) == 50.0
     assert since(far, t, 1.0) == 60.0
-    assert since(far[60:], t[60:], 1.0) is None
+    assert since(far[57:], t[57:], 1.0) is None
+    assert since(far[50:], t[50:], 1.0) == 60.0
     assert reach(far[:0]) == 0.0
     assert since(far[:0], t[:0], 1.0) is None
 
