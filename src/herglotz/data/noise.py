@@ -36,50 +36,52 @@ def roughness(data: Trajectories, degree: int = DEGREE) -> float:
     Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Infinite if no trajectory has
     nine samples. Steps may differ. Angles should be `unwrapped()`.
     """
-    return float(_residuals(data, degree).square().mean().sqrt())
+    return float(_residuals(data, (degree,)).square().mean().sqrt())
 
 
-def _residuals(data: Trajectories, degree: int) -> Tensor:
-    """`roughness` of every coordinate, (n,), by its own readings."""
+def _residuals(data: Trajectories, degrees: Sequence[int]) -> Tensor:
+    """`roughness` of every coordinate by its own readings, (D, n), of recordings that agree at one degree or more."""
     q = data.q / data.balance
     if data.observed is None:
-        return _of_readings(data.t, q, data.lengths, degree)
+        return _of_readings(data.t, q, data.lengths, degrees)
     each = []
     for x, known in zip(q.T, (data.observed > 0).T, strict=True):
         lengths = [int(own.sum()) for own in known.split(data.lengths)]
-        each.append(_of_readings(data.t[known], x[known][:, None], lengths, degree))
-    return torch.cat(each)
+        each.append(_of_readings(data.t[known], x[known][:, None], lengths, degrees))
+    return torch.cat(each, 1)
 
 
-def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> Tensor:
-    """`roughness` of each column of q (N, k), read at times t (N,) of trajectories of these lengths, (k,)."""
+def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degrees: Sequence[int]) -> Tensor:
+    """`roughness` of each column of q (N, k), read at times t (N,) of trajectories of these lengths, (D, k)."""
     firsts = [
         torch.arange(first, first + length - SAMPLES + 1)
         for first, length in zip(offsets_of(tuple(lengths)), lengths, strict=True)
         if length >= SAMPLES
     ]
     if not firsts:
-        return torch.full((q.shape[1],), torch.inf, dtype=torch.float64)
-    rows = torch.cat(firsts)
-    of = torch.repeat_interleave(torch.arange(len(firsts)), torch.tensor([len(own) for own in firsts]))
+        return torch.full((len(degrees), q.shape[1]), torch.inf, dtype=torch.float64)
+    rows, of = torch.cat(firsts), torch.cat([torch.full_like(own, b) for b, own in enumerate(firsts)])
     stride = -(-len(rows) // MAX_WINDOWS)
     rows, of = rows[::stride].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device), of[::stride]
     t, q = t[rows].double().cpu(), q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
-    inverses = pseudo_inverses(x, degree)
-    r = q - powers(x[: len(inverses)], degree) @ (inverses @ q)
-    square = r.square()
-    good = torch.stack([_agree(own, of) for own in square.mean(1).T], 1).double()
-    # Without an outlier both factors are 1, and change no bit.
-    mean = (square * good[:, None]).mean((0, 1)) / good.mean(0)
-    return (mean * SAMPLES / (SAMPLES - degree - 1)).sqrt()
+    squares = []
+    for degree in degrees:
+        inverses = pseudo_inverses(x, degree)
+        squares.append((q - powers(x[: len(inverses)], degree) @ (inverses @ q)).square())
+    agree = torch.stack([torch.stack([_agree(own, of) for own in square.mean(1).T], 1) for square in squares])
+    # Coarse motion is rough at low degrees alone, noise at all of them. One degree does not tell them apart.
+    good = agree.any(0).double() if len(degrees) > 1 else torch.ones_like(squares[0][:, 0])
+    means = [(square * good[:, None]).mean((0, 1)) / good.mean(0) for square in squares]
+    left = [mean * SAMPLES / (SAMPLES - degree - 1) for mean, degree in zip(means, degrees, strict=True)]
+    return torch.stack(left).sqrt()
 
 
 def _agree(square: Tensor, of: Tensor) -> Tensor:
     """Windows, (W,) bool, of recordings whose RMS residual is no outlier (`TAIL`) among three or more recordings.
 
-    `square` (W,) are mean squares of residuals, `of` (W,) the recordings. One recording of something else would set the
-    noise of all. A recording whose sensor stands still tells nothing about the noise.
+    `square` (W,) are mean squares of residuals, `of` (W,) the recordings. A recording whose sensor stands still tells
+    nothing about the noise.
     """
     mean = torch.bincount(of, square) / torch.bincount(of).clamp_min(1)
     known = mean[mean > 0]
@@ -90,9 +92,10 @@ def _agree(square: Tensor, of: Tensor) -> Tensor:
 def precision(data: Trajectories) -> float:
     """Standard deviation of the noise of q, estimated without a model; an upper bound for coarse data.
 
-    inf if no trajectory has nine samples.
+    Of three or more recordings those count whose roughness is no outlier: one of something else would set the noise of
+    all. inf if no trajectory has nine samples.
     """
-    return min(roughness(data, degree) for degree in DEGREES)
+    return float(_residuals(data, DEGREES).square().mean(1).sqrt().min())
 
 
 def spread(data: Trajectories) -> float:
@@ -116,7 +119,7 @@ def coarse(data: Trajectories) -> bool:
 
 def precisions(data: Trajectories) -> Tensor:
     """`precision` of every coordinate, (n,)."""
-    return torch.stack([_residuals(data, degree) for degree in DEGREES]).amin(0)
+    return _residuals(data, DEGREES).amin(0)
 
 
 def part_of(data: Trajectories, most: int) -> Trajectories:
