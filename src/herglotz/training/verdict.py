@@ -169,7 +169,7 @@ def judged(
     reasons = reason_of_set_points(model, train), reason_of_idle_inputs(model, train, states)
     words = ". ".join(filter(None, (misread(kept, seen, errors.missed), *reasons)))
     caveat = caveat_of_inputs(model, train, states)
-    beyond = unseen_outlier(seen, everywhere)
+    beyond = partial(unseen_outlier, seen, everywhere)
     return {"verdict": in_words(errors, ahead, metrics, shown, words, caveat, beyond)} | kept_numbers
 
 
@@ -226,13 +226,13 @@ def in_words(
     shown: Callable[..., str] = lambda *_: "",
     misread: str = "",
     caveat: str = "",
-    beyond: str = "",
+    beyond: Callable[[], str] = str,
 ) -> str:
     """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
 
     `shown` gives the reason of a model that misses the training data, or of one that does not, with a remedy
     (`herglotz.training.missed`, `herglotz.training.feedback`); `misread` says what is wrong with the recording,
-    `caveat` what a model that fits rests on, and `beyond` why unseen data differ from the training data.
+    `caveat` what a model that fits rests on, and `beyond` says why unseen data differ from the training data.
     """
     free, missed = errors.free or 0.0, errors.missed
     if misread:
@@ -296,13 +296,13 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown:
     return f"too little was recorded to tell; {errors}. {changes}. Try {longer}"
 
 
-def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], beyond: str = "") -> str:
+def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], beyond: Callable[[], str] = str) -> str:
     """The remedy, after the reason if one is shown; `missed`: the training error exceeds the noise."""
     if reason := shown(missed):
         return reason
     if not missed:
         other = "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
-        return beyond or other
+        return beyond() or other
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
     return "A force is missing. Try --objective smoothing, another --level (herglotz select), or a --feature for it"
