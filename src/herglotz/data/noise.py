@@ -24,6 +24,8 @@ DEGREES = (3, 5, 7)
 # A residual is at the noise up to this factor times the precision: fitted states, and the estimate of the noise, leave
 # 10 to 30 % more.
 AT_THE_NOISE = 1.5
+# An outlier exceeds this many robust standard deviations, as a share of 6e-7 of normal residuals do.
+TAIL = 5.0
 # Windows, evenly spread: more do not change an RMS.
 MAX_WINDOWS = 4000
 
@@ -34,45 +36,66 @@ def roughness(data: Trajectories, degree: int = DEGREE) -> float:
     Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Infinite if no trajectory has
     nine samples. Steps may differ. Angles should be `unwrapped()`.
     """
-    return float(_residuals(data, degree).square().mean().sqrt())
+    return float(_residuals(data, (degree,)).square().mean().sqrt())
 
 
-def _residuals(data: Trajectories, degree: int) -> Tensor:
-    """`roughness` of every coordinate, (n,), by its own readings."""
+def _residuals(data: Trajectories, degrees: Sequence[int]) -> Tensor:
+    """`roughness` of every coordinate by its own readings, (D, n), of recordings that agree at one degree or more."""
     q = data.q / data.balance
     if data.observed is None:
-        return _of_readings(data.t, q, data.lengths, degree)
+        return _of_readings(data.t, q, data.lengths, degrees)
     each = []
     for x, known in zip(q.T, (data.observed > 0).T, strict=True):
         lengths = [int(own.sum()) for own in known.split(data.lengths)]
-        each.append(_of_readings(data.t[known], x[known][:, None], lengths, degree))
-    return torch.cat(each)
+        each.append(_of_readings(data.t[known], x[known][:, None], lengths, degrees))
+    return torch.cat(each, 1)
 
 
-def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degree: int) -> Tensor:
-    """`roughness` of each column of q (N, k), read at times t (N,) of trajectories of these lengths, (k,)."""
+def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degrees: Sequence[int]) -> Tensor:
+    """`roughness` of each column of q (N, k), read at times t (N,) of trajectories of these lengths, (D, k)."""
     firsts = [
         torch.arange(first, first + length - SAMPLES + 1)
         for first, length in zip(offsets_of(tuple(lengths)), lengths, strict=True)
         if length >= SAMPLES
     ]
     if not firsts:
-        return torch.full((q.shape[1],), torch.inf, dtype=torch.float64)
-    rows = torch.cat(firsts)
-    rows = rows[:: -(-len(rows) // MAX_WINDOWS)].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device)
+        return torch.full((len(degrees), q.shape[1]), torch.inf, dtype=torch.float64)
+    rows, of = torch.cat(firsts), torch.cat([torch.full_like(own, b) for b, own in enumerate(firsts)])
+    stride = -(-len(rows) // MAX_WINDOWS)
+    rows, of = rows[::stride].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device), of[::stride]
     t, q = t[rows].double().cpu(), q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
-    inverses = pseudo_inverses(x, degree)
-    r = q - powers(x[: len(inverses)], degree) @ (inverses @ q)
-    return (r.square().mean((0, 1)) * SAMPLES / (SAMPLES - degree - 1)).sqrt()
+    squares = []
+    for degree in degrees:
+        inverses = pseudo_inverses(x, degree)
+        squares.append((q - powers(x[: len(inverses)], degree) @ (inverses @ q)).square())
+    agree = torch.stack([torch.stack([_agree(own, of) for own in square.mean(1).T], 1) for square in squares])
+    # Coarse motion is rough at low degrees alone, noise at all of them. One degree does not tell them apart.
+    good = agree.any(0).double() if len(degrees) > 1 else torch.ones_like(squares[0][:, 0])
+    means = [(square * good[:, None]).mean((0, 1)) / good.mean(0) for square in squares]
+    left = [mean * SAMPLES / (SAMPLES - degree - 1) for mean, degree in zip(means, degrees, strict=True)]
+    return torch.stack(left).sqrt()
+
+
+def _agree(square: Tensor, of: Tensor) -> Tensor:
+    """Windows, (W,) bool, of recordings whose RMS residual is no outlier (`TAIL`) among three or more recordings.
+
+    `square` (W,) are mean squares of residuals, `of` (W,) the recordings. A recording whose sensor stands still tells
+    nothing about the noise.
+    """
+    mean = torch.bincount(of, square) / torch.bincount(of).clamp_min(1)
+    known = mean[mean > 0]
+    most = TAIL**2 * float(known.median()) if len(known) >= 3 else torch.inf
+    return mean[of] <= most
 
 
 def precision(data: Trajectories) -> float:
     """Standard deviation of the noise of q, estimated without a model; an upper bound for coarse data.
 
-    inf if no trajectory has nine samples.
+    Of three or more recordings those count whose roughness is no outlier: one of something else would set the noise of
+    all. inf if no trajectory has nine samples.
     """
-    return min(roughness(data, degree) for degree in DEGREES)
+    return float(_residuals(data, DEGREES).square().mean(1).sqrt().min())
 
 
 def spread(data: Trajectories) -> float:
@@ -96,7 +119,7 @@ def coarse(data: Trajectories) -> bool:
 
 def precisions(data: Trajectories) -> Tensor:
     """`precision` of every coordinate, (n,)."""
-    return torch.stack([_residuals(data, degree) for degree in DEGREES]).amin(0)
+    return _residuals(data, DEGREES).amin(0)
 
 
 def part_of(data: Trajectories, most: int) -> Trajectories:

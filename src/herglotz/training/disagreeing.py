@@ -2,12 +2,12 @@
 
 Of every recording the part that a fit uses is followed from a start of its own, with the numbers of the model fixed:
 as a whole by a model that a search has found, else over short segments. Twenty steps hide a damping that is a fifth
-larger, or a scale that is wrong by 3 %. A recording disagrees if the scale of its misfit is an outlier (`TAIL`) of the
-misfit of the others, so that more than half of its samples are. A bad recording may have bent the model so far that
-none stands out. Where the model is not at the noise, the recording that it misses most, or else the one whose
-accelerations are least like the others', is left out if the whole dictionary would follow the others to their noise.
-The model is then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is
-an outlier of that model. Most recordings have to agree.
+larger, or a scale that is wrong by 3 %. A recording disagrees if more than a tenth of its samples (`reach`) are
+outliers (`TAIL`) of the misfit of the others: fewer are single samples. A bad recording may have bent the model so far
+that none stands out. Where the model is not at the noise, or has functions, the recording that it misses most, or else
+the one whose accelerations are least like the others', is left out if the whole dictionary would follow the others to
+their noise. The model is then found anew. What is left out stays so if the others agree, whose model is at their noise,
+and if it is an outlier of that model. Most recordings have to agree.
 
 Where nothing is left out, as where no terms are searched (more than three coordinates, a given plan, own terms), an
 outlier of the finished model is named (`outlying`).
@@ -23,14 +23,15 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.noise import AT_THE_NOISE, precision, relative_spread
+from herglotz.data.noise import AT_THE_NOISE, TAIL, precision, relative_spread
 from herglotz.data.splits import cuts_of, held_out_whole, leading
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import differences, estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.errors_of_runs import EXACT_ENOUGH
-from herglotz.training.look import LeftOut, Look, look, read_like
-from herglotz.training.problems.robust import FREEDOM, TAIL, robust_fit, scale_of
+from herglotz.training.left_out import NORMAL_REACH, LeftOut, beside, reach, scale_of_all, since
+from herglotz.training.look import Look, look, read_like
+from herglotz.training.problems.robust import FREEDOM, robust_fit, scale_of
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.structure import MOST, search_between_coupled
@@ -49,21 +50,22 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         if (missed := _missed(seen, data, out)) is None:
             break
         rest = [b for b in range(len(data)) if b not in out]
-        scale = {b: scale_of(own) for b, own in enumerate(missed)}
-        worst = max(rest, key=lambda b: scale[b])
-        outlier = scale[worst] > TAIL * _scale(missed, [b for b in rest if b != worst], seen)
+        far = {b: reach(own) for b, own in enumerate(missed)}
+        worst = max(rest, key=lambda b: far[b])
+        outlier = far[worst] > TAIL * scale_of_all([missed[b] for b in rest if b != worst], _least(seen))
         if not outlier and not out:
             bad = next((b for b in dict.fromkeys((worst, _least_alike(seen))) if _bends(seen, b)), None)
             worst, outlier = (worst, False) if bad is None else (bad, True)
         if outlier:
             now = sorted([*out, worst])
         else:
-            least = _scale(missed, rest, seen)
-            now = [b for b in out if scale[b] > TAIL * least]
+            least = scale_of_all([missed[b] for b in rest], _least(seen))
+            now = [b for b in out if far[b] > TAIL * least]
             if not _agree(seen, precision(seen.data)):
                 break
             if now == out:
-                return seen, tuple(LeftOut(b, scale[b], least, data.label(b)) for b in out)
+                t = _times(_followed(data, seen.settings))
+                return seen, tuple(LeftOut(b, far[b], least, data.label(b), since(missed[b], t[b], least)) for b in out)
         if 2 * len(now) >= len(data):
             break
         out = now
@@ -81,37 +83,40 @@ def outlying(seen: Look, model: ContactLagrangian, sigma: float) -> tuple[LeftOu
     if len(seen.data) < 3:
         return ()
     followed = _followed(seen.data, seen.settings)
-    worst = _worst(seen, _missed_by(seen, model, sigma, followed))
+    worst = _worst(seen, _missed_by(seen, model, sigma, followed), followed)
     others = _but(seen, worst.recording)
     noise = precision(seen.data.select(others))
-    if worst.missed <= max(AT_THE_NOISE * noise, TAIL * EXACT_ENOUGH * relative_spread(seen.data)):
+    if worst.missed <= max(AT_THE_NOISE * NORMAL_REACH * noise, TAIL * _least(seen)):
         return ()
     stages = SegmentStages(replace(seen.task(Stages()), data=followed.select(others)), own := deepcopy(model))
     if (found := stages.fit(stages.lengths[0], noise, None, None)) is None:
-        return (worst,) if worst.stands_out else ()
+        return ()
     found.problem.parameters.set(found.theta)
-    now = _worst(seen, _missed_by(seen, own, noise, followed))
+    now = _worst(seen, _missed_by(seen, own, noise, followed), followed)
     return (now,) if now.stands_out and now.recording == worst.recording else ()
 
 
-def _worst(seen: Look, missed: Sequence[Tensor]) -> LeftOut:
+def _worst(seen: Look, missed: Sequence[Tensor], followed: Trajectories) -> LeftOut:
     """The recording that is missed most."""
-    scale = [scale_of(own) for own in missed]
-    worst = max(range(len(scale)), key=lambda b: scale[b])
-    least = _scale(missed, [b for b in range(len(scale)) if b != worst], seen)
-    return LeftOut(worst, scale[worst], least, seen.data.label(worst))
+    most = max(range(len(missed)), key=lambda b: reach(missed[b]))
+    return beside(most, missed, _times(followed), _least(seen), seen.data.label(most))
 
 
-def _scale(missed: Sequence[Tensor], recordings: Sequence[int], seen: Look) -> float:
-    """The scale of the misfit of these recordings; smaller errors than the verdict counts are none."""
-    return max(scale_of(torch.cat([missed[b] for b in recordings])), EXACT_ENOUGH * relative_spread(seen.data))
+def _times(data: Trajectories) -> list[Tensor]:
+    """The times of the samples of each recording of which all positions were read."""
+    return [t[there] for t, there in zip(data.t.split(data.lengths), data.complete.split(data.lengths), strict=True)]
+
+
+def _least(seen: Look) -> float:
+    """The misfit below which the verdict counts errors as none."""
+    return EXACT_ENOUGH * relative_spread(seen.data)
 
 
 def _agree(seen: Look, noise: float) -> bool:
     """Whether the model misses what it was fitted to by no more than this noise."""
     assert seen.found is not None
     sigma = seen.found.sigma
-    return sigma is not None and sigma <= max(AT_THE_NOISE * noise, EXACT_ENOUGH * relative_spread(seen.data))
+    return sigma is not None and sigma <= max(AT_THE_NOISE * noise, _least(seen))
 
 
 def _least_alike(seen: Look) -> int:
@@ -124,11 +129,12 @@ def _least_alike(seen: Look) -> int:
 
 
 def _bends(seen: Look, recording: int) -> bool:
-    """Whether the model misses the data by more than the noise of the other recordings, and whether the whole
-    dictionary follows these to it.
+    """Whether a recording may have bent the model, and the whole dictionary follows the others to their noise.
+
+    The model misses the data by more than the noise of the others, or has functions, which bend further than a law.
     """
     others = seen.kept.select(_but(seen, recording)).to(torch.float64, "cpu")
-    if _agree(seen, precision(others)):
+    if _agree(seen, precision(others)) and not seen.base.spreads:
         return False
     base = estimate_baseline(others)
     if others.dof > MOST:
@@ -145,7 +151,7 @@ def _but(seen: Look, recording: int) -> list[int]:
 
 
 def _missed(seen: Look, data: Trajectories, out: Sequence[int]) -> list[Tensor] | None:
-    """Sizes of the misfit of each recording, over the balance, at samples of which all positions were read.
+    """Sizes of the misfit (N', n) of each recording, over the balance, at samples of which all positions were read.
 
     Infinite where a step fails. None where no named terms were found, and where recordings differ by zeros of their
     sensors, since those of recordings that are `out` are unknown.
@@ -165,7 +171,7 @@ def _missed_by(
     each = [_misfit(seen, model, sigma, one, whole) for one in read] if found is None else found.split(read.lengths)
     known = read.complete.split(read.lengths)
     return [
-        read.q.new_full((1,), torch.inf) if own is None else (own / read.balance)[there].flatten().abs()
+        read.q.new_full((1, 1), torch.inf) if own is None else (own / read.balance)[there].abs()
         for own, there in zip(each, known, strict=True)
     ]
 

@@ -185,7 +185,7 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
     started = time.perf_counter()
     with stages.bar:
         seen, left_out = (look(data, config, stages, plan), ()) if plan else look_at_agreeing(data, config, stages)
-        found = {"left_out": [one._asdict() for one in left_out]}
+        found = {"left_out": [one.as_dict() for one in left_out]}
         for words in left_out_of(found, data):
             tell(f"{data.source or 'data'}: warning: left out is {words}")
         plan = plan or choose(seen, config)
@@ -193,7 +193,7 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         task = seen.task(stages)
         fitted = OBJECTIVES[plan.objective](task, seen, plan)
         seen = replace(seen, outlying=() if left_out else outlying(seen, fitted.model, fitted.sigma))
-        found["outlying"] = [one._asdict() for one in seen.outlying]
+        found["outlying"] = [one.as_dict() for one in seen.outlying]
         _tell_outlying(found, data)
         run = evaluate(task, seen, plan, fitted, config)
     if seen.found is not None and plan.network == "none":

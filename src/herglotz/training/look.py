@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,10 +21,10 @@ from herglotz.training.baseline import Baseline, across_translations, estimate_b
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
 from herglotz.training.hold import with_arrival
+from herglotz.training.left_out import LeftOut
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import MANY
-from herglotz.training.problems.robust import TAIL
 from herglotz.training.stages import Stages
 from herglotz.training.structure import (
     Structure,
@@ -61,29 +60,6 @@ class Probe:
     def enough(self) -> bool:
         """Whether there are two residuals for each unknown, so that the error measures noise."""
         return self.residuals >= 2 * self.unknowns
-
-
-class LeftOut(NamedTuple):
-    """A recording, counted from 0, and the scales of what the model of the others misses it and them by.
-
-    In units of q, over the balance of several kinds of coordinates. `label` is the recording's (`Trajectories.label`).
-    """
-
-    recording: int
-    missed: float
-    others: float
-    label: str
-
-    @property
-    def reason(self) -> str:
-        """The reason of a misfit, with a remedy."""
-        far = f"is missed {self.missed / self.others:.2g} times as far as the others, and may be of something else"
-        return f"T{self.label[1:]}, counted from 0, {far}. Try the fit without it"
-
-    @property
-    def stands_out(self) -> bool:
-        """Whether the recording is an outlier of the others."""
-        return self.missed > TAIL * self.others
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def fit_own(data: Trajectories, L_d: Any, config: FitConfig, stages: Stages) -> 
         _try_derivatives(model, task.data)
         fitted = _fitted(replace(task, data=task.data.to(device=config.device)), model.to(device=config.device))
         run = evaluate(task, seen, None, fitted, replace(config, objective=fitted.objective))
-        found = [one._asdict() for one in outlying(seen, fitted.model, fitted.sigma)]
+        found = [one.as_dict() for one in outlying(seen, fitted.model, fitted.sigma)]
     run.metrics.update(level=model.config.level, own=model.config.name, outlying=found)
     return run
 

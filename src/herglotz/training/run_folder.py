@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from io import BytesIO, StringIO
 from pathlib import Path
@@ -120,7 +121,7 @@ def save_run(run: Run, folder: str | Path) -> None:
     contents = {
         "model.pt": buffer.getvalue(),
         "config.json": _json_bytes(run.config.to_dict() | ({"reading": run.reading} if run.reading else {})),
-        "metrics.json": _json_bytes(run.metrics),
+        "metrics.json": _json_bytes(_finite(run.metrics)),
         "fit.npz": npz_bytes(run.data),
     }
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
@@ -242,6 +243,15 @@ def _log(history: list[dict[str, Any]]) -> bytes:
     writer.writeheader()
     writer.writerows(history)
     return buffer.getvalue().encode()
+
+
+def _finite(values: Any) -> Any:
+    """The same without numbers that JSON has not: None in the place of each, which says that it is not known."""
+    if isinstance(values, Mapping):
+        return {name: _finite(x) for name, x in values.items()}
+    if isinstance(values, list | tuple):
+        return [_finite(x) for x in values]
+    return None if isinstance(values, float) and not math.isfinite(values) else values
 
 
 def _json_bytes(values: dict[str, Any]) -> bytes:

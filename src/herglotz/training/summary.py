@@ -11,6 +11,7 @@ from herglotz.data import Trajectories
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.equation import Equation
 from herglotz.training.fitted_run import FittedRun
+from herglotz.training.left_out import from_then_on
 from herglotz.training.recorded_range import range_in_words
 
 MAX_FEATURES, COLUMNS = 5, 80
@@ -44,9 +45,8 @@ def outlying_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
     """The recording that stands out where none was left out, with what to do."""
     unit = common_unit(data.units)
     return [
-        f"{_label(one)}, counted from 0, may be of something else: the model misses it by "
-        f"{size(one['missed'], unit, digits=2)}, and the others by {size(one['others'], unit, digits=2)}; "
-        "fit once more without it"
+        f"{_label(one)}, counted from 0, may be of something else: the model {_missed(one, unit)}, "
+        f"and the others by {size(one['others'], unit, digits=2)}; fit once more without it"
         for one in metrics.get("outlying", ())
     ]
 
@@ -55,8 +55,8 @@ def left_out_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
     """The recordings that were left out whole, with what the model of the others misses them by."""
     unit = common_unit(data.units)
     return [
-        f"{_label(one)}, counted from 0, whole: the model of the others misses it by "
-        f"{size(one['missed'], unit, digits=2)}, and them by {size(one['others'], unit, digits=2)}"
+        f"{_label(one)}, counted from 0, whole: the model of the others {_missed(one, unit)}, "
+        f"and them by {size(one['others'], unit, digits=2)}"
         for one in metrics.get("left_out", ())
     ]
 
@@ -64,6 +64,12 @@ def left_out_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
 def _label(one: Mapping[str, Any]) -> str:
     """The label of a recording; runs of earlier versions know its number alone."""
     return one.get("label", f"trajectory {one['recording']}")
+
+
+def _missed(one: Mapping[str, Any], unit: str) -> str:
+    """That a model misses a recording, by how much and from when on; without a number a step of the model fails."""
+    by = "does not follow it" if one["missed"] is None else f"misses it by {size(one['missed'], unit, digits=2)}"
+    return by + from_then_on(one.get("since"))
 
 
 def summary(run: FittedRun) -> str:

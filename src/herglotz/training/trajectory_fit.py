@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.noise import precision, spread
+from herglotz.data.smoothing import smoothed
 from herglotz.models import ContactLagrangian
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
 from herglotz.training.first_states import first_states, states_of_pairs
@@ -136,7 +137,9 @@ class SegmentStages:
         )  # fmt: skip
         if before is None:
             start = problem.parameters.get()
-            states = first_states(problem, start)
+            # Two equal readings are a joint that friction holds, whose motion has no slope by its momentum.
+            smooth = smoothed(task.data) if self.model.capabilities.sticking else None
+            states = first_states(problem, start, smooth)
             problem.guess_from_states(states_of_pairs(self.model, task.data))
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)

@@ -28,9 +28,9 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.noise import AT_THE_NOISE, coarse, precision, precisions
+from herglotz.data.noise import AT_THE_NOISE, coarse, precision, precisions, relative_spread
 from herglotz.data.polar import circles
-from herglotz.data.splits import enough
+from herglotz.data.splits import enough, leading
 from herglotz.data.units import common_unit
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.errors_of_runs import EXACT_ENOUGH, Errors
@@ -43,6 +43,7 @@ from herglotz.training.feedback import (
 from herglotz.training.flow import motion
 from herglotz.training.following import HALF
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
+from herglotz.training.left_out import beside
 from herglotz.training.look import Look
 from herglotz.training.missed import MOST, reason_of, reason_of_data
 from herglotz.training.objectives import Fitted
@@ -168,7 +169,30 @@ def judged(
     reasons = reason_of_set_points(model, train), reason_of_idle_inputs(model, train, states)
     words = ". ".join(filter(None, (misread(kept, seen, errors.missed), *reasons)))
     caveat = caveat_of_inputs(model, train, states)
-    return {"verdict": in_words(errors, ahead, metrics, shown, words, caveat)} | kept_numbers
+    beyond = partial(unseen_outlier, seen, everywhere)
+    return {"verdict": in_words(errors, ahead, metrics, shown, words, caveat, beyond)} | kept_numbers
+
+
+def unseen_outlier(seen: Look, everywhere: Tensor) -> str:
+    """The only one of three or more recordings whose unseen part a free run misses, in words with a remedy; else ""."""
+    data = seen.data
+    miss = ((everywhere[:, : data.dof] - data.q) / data.balance).nan_to_num(nan=torch.inf)
+    unseen = (~leading(data.lengths, seen.train.lengths)).to(miss.device) & data.complete
+    parts = [
+        (b, own[there], t[there])
+        for b, (own, t, there) in enumerate(zip(*(x.split(data.lengths) for x in (miss, data.t, unseen)), strict=True))
+        if bool(there.any())
+    ]
+    if len(parts) < 3:
+        return ""
+    recordings, missed, t = zip(*parts, strict=True)
+    least = EXACT_ENOUGH * relative_spread(data)
+    found = [beside(k, missed, t, least, data.label(b)) for k, b in enumerate(recordings)]
+    out = [one for one in found if one.stands_out]
+    if len(out) != 1:
+        return ""
+    (one,) = out
+    return one._replace(recording=recordings[one.recording], since=one.since or float(t[one.recording][0])).reason
 
 
 def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
@@ -203,26 +227,27 @@ def in_words(
     shown: Callable[..., str] = lambda *_: "",
     misread: str = "",
     caveat: str = "",
+    beyond: Callable[[], str] = str,
 ) -> str:
     """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
 
     `shown` gives the reason of a model that misses the training data, or of one that does not, with a remedy
     (`herglotz.training.missed`, `herglotz.training.feedback`); `misread` says what is wrong with the recording,
-    and `caveat` what a model that fits rests on.
+    `caveat` what a model that fits rests on, and `beyond` says why unseen data differ from the training data.
     """
     free, missed = errors.free or 0.0, errors.missed
     if misread:
         return f"{FAILS}: {errors}. {misread}"
     follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
     if not follows or not math.isfinite(free):
-        return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown)}"
+        return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown, beyond)}"
     # Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: {_unseen_motion(errors)}"
     # Two motions of one kind that know nothing of each other differ by √2 of their spread.
     chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread
     if free > max(errors.lost, chance):
-        return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown)}"
+        return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
     said = f"{_fits(errors)}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors)
@@ -272,12 +297,13 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown:
     return f"too little was recorded to tell; {errors}. {changes}. Try {longer}"
 
 
-def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str]) -> str:
+def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], beyond: Callable[[], str] = str) -> str:
     """The remedy, after the reason if one is shown; `missed`: the training error exceeds the noise."""
     if reason := shown(missed):
         return reason
     if not missed:
-        return "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
+        other = "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
+        return beyond() or other
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
     return "A force is missing. Try --objective smoothing, another --level (herglotz select), or a --feature for it"

@@ -13,10 +13,14 @@ from herglotz import fit
 from herglotz.data import Trajectories, simulate
 from herglotz.data.noise import precision
 from herglotz.scenes import scene
-from herglotz.training import disagreeing, structure
+from herglotz.training import disagreeing, load_run, save_run, structure
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.disagreeing import _bends, _followed
+from herglotz.training.left_out import LeftOut, reach, since
 from herglotz.training.search import Search
+from herglotz.training.stages import Stages
+from herglotz.training.task import Task
 from runge_kutta import step
 
 
@@ -62,7 +66,8 @@ def test_a_model_at_the_noise_of_the_others_needs_no_recording_left_out():
     # fails if the noise is a median over recordings of 11 samples, half of theirs: the model of all of ten drops was a
     # bad one, and good recordings went until a law without air drag followed the others
     data: Any = _drops(4, 10, 11, bad=-1)
-    seen: Any = SimpleNamespace(data=data, kept=data, found=SimpleNamespace(sigma=0.0015))
+    base = SimpleNamespace(spreads={})
+    seen: Any = SimpleNamespace(data=data, kept=data, found=SimpleNamespace(sigma=0.0015), base=base)
     assert sorted(precision(one) for one in data)[4] < 0.6 * 0.0015
     assert not any(_bends(seen, b) for b in range(10))
 
@@ -156,6 +161,68 @@ def test_a_recording_that_short_segments_do_not_tell_is_left_out(damping, scale,
     run = fit(data, progress=False)
     assert [one["recording"] for one in run.metrics["left_out"]] == [2]
     assert run.metrics["verdict"].startswith("fits to the noise")
+
+
+@pytest.mark.parametrize("bad", [150, 300])
+def test_a_recording_that_slips_is_named_from_then_on(bad, capsys):
+    # fails if a recording disagrees only with more than half of its samples (the verdict recommended a simpler level),
+    # or if nobody looks for one whose unseen part alone is of something else
+    of, t, h = torch.Generator().manual_seed(1), 0.04 * torch.arange(390).double(), 0.04
+    x = torch.tensor([(0.8, -1.5, 1.0, 1.3), (0.5, -0.6, 0.9, -0.8)], dtype=torch.float64)
+    q = []
+    for _ in t:
+        q.append(x[0])
+        for _ in range(2):
+            x = step(lambda x: torch.stack([x[1], -9 * x[0].sin() - 0.3 * x[1]]), x, h / 2)
+    read = torch.stack(q, 1) + 0.002 * torch.randn(4, len(t), generator=of, dtype=torch.float64)
+    read[2, bad:] = 1.25 * read[2, bad:] + 0.2
+    run = fit(Trajectories.of(t.repeat(4), read.flatten(), (len(t),) * 4, angles=(True,)), progress=False)
+    if bad < 260:
+        (out,) = run.metrics["left_out"]
+        assert (out["recording"], out["since"]) == (2, float(t[bad]))
+        assert "from t = 6 on" in capsys.readouterr().err
+        assert run.metrics["verdict"].startswith("fits to the noise")
+    else:
+        assert run.metrics["left_out"] == []
+        assert "Trajectory 2, counted from 0, is missed " in run.metrics["verdict"]
+        assert "from t = 12 on, and may be of something else. Try the fit without it" in run.metrics["verdict"]
+
+
+def test_a_few_samples_are_no_bad_recording():
+    # fails if a tenth of outliers, or none, is far, or if a time is said where all but the first samples are bad
+    far, t = torch.full((100, 1), 0.1, dtype=torch.float64), torch.arange(100).double()
+    far[5:15] = 50.0
+    assert reach(far) == 0.1
+    far[60:] = 50.0
+    assert reach(far) == 50.0
+    assert since(far, t, 1.0) == 60.0
+    assert since(far[57:], t[57:], 1.0) is None
+    assert since(far[50:], t[50:], 1.0) == 60.0
+    assert reach(far[:0]) == 0.0
+    assert since(far[:0], t[:0], 1.0) is None
+
+
+def test_a_step_that_fails_loses_no_run(tmp_path):
+    # fails if an infinite misfit is written as a number that JSON has not, or said as "inf m"
+    out = LeftOut(3, math.inf, 0.1, "trajectory 3")
+    assert "is not followed, and may be of something else" in out.reason
+    run = _good()
+    metrics = run.metrics | {"outlying": [out.as_dict()], "compared": [{"held_out": math.inf}, {"held_out": math.nan}]}
+    save_run(replace(run, metrics=metrics), tmp_path)
+    read = load_run(tmp_path)
+    assert read.metrics["compared"] == [{"held_out": None}, {"held_out": None}]
+    assert "may be of something else: the model does not follow it" in " ".join(read.summary().split())
+
+
+def test_no_recording_is_named_where_the_others_are_not_followed(monkeypatch):
+    # fails if the first of several recordings in which a step fails is named
+    data = _drops(0, 6, 13, bad=-1)
+    monkeypatch.setattr(disagreeing, "_missed_by", lambda *_: [torch.full((1, 1), torch.inf)] + [torch.ones(9, 1)] * 5)
+    monkeypatch.setattr(disagreeing.SegmentStages, "fit", lambda *_: None)
+    settings = FitConfig(train_fraction=1.0)
+    task = Task(data, estimate_baseline(data), settings, Stages())
+    seen: Any = SimpleNamespace(data=data, settings=settings, task=lambda _: task)
+    assert disagreeing.outlying(seen, _good().model, 0.0015) == ()
 
 
 def test_a_recording_that_bends_a_plan_is_named():

@@ -19,7 +19,7 @@ from herglotz.training import FitConfig, fit, objectives, verdict
 from herglotz.training.errors_of_runs import Errors
 from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
-from herglotz.training.look import LeftOut
+from herglotz.training.left_out import LeftOut
 from herglotz.training.verdict import in_words
 
 evaluate_module = importlib.import_module("herglotz.training.evaluate")
@@ -345,7 +345,7 @@ def test_gross_errors_have_no_say(wrong, told):
 
 def test_a_recording_of_something_else_does_not_end_a_fit():
     # fails if the fit rejects all but two samples of one recording, and its judge refuses these two: 10 of 36 such sets
-    generator = torch.Generator().manual_seed(6)
+    generator = torch.Generator().manual_seed(9)
     t, q = 0.05 * torch.arange(12).double(), []
     for b in range(10):
         speed = torch.rand(1, generator=generator).double()

@@ -14,12 +14,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from herglotz.data.noise import TAIL
 from herglotz.least_squares import least_squares
 
 # ν, with 96 % efficiency for normal residuals.
 FREEDOM = 4.0
-# An outlier exceeds this many robust standard deviations, as a share of 6e-7 of normal residuals do.
-TAIL = 5.0
 # Residuals are heavy-tailed if more than this share are outliers, or if one exceeds FAR robust standard deviations.
 SHARE, FAR = 3e-3, 10.0
 # Largest share of samples that may be left out as outliers; with more, a heavy-tailed loss is needed.
