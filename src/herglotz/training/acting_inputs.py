@@ -27,10 +27,10 @@ from herglotz.training.trials import Trial, Variant
 
 # Levels of an input that are tried, and the least level over the largest value of the input.
 LEVELS, LOWEST = 24, 0.05
-# A level is sharpened within this factor to either side of the first guess.
+# Factor between the first levels that are tried beside a guess.
 AROUND = 1.5
-# Golden sections: 16 leave 0.05 % of that range.
-SECTIONS, GOLDEN = 16, (5**0.5 - 1) / 2
+# Parabolas of the misfit through three levels, and how much closer the levels are from one to the next: 0.5 % at last.
+PARABOLAS, SHRINKS = 3, 1 / 9
 
 
 def offered_terms(data: Trajectories) -> tuple[str, ...]:
@@ -106,8 +106,9 @@ def _of_kind(search: Search, kind: str, terms: Sequence[str], trial: Trial) -> t
     names, taken = [name for name, _ in search.data.input_labels], taken_terms(found, every)
     alone = {names.index(of[2]) for term in taken if (of := saturation(term))}
     beside_it = {name for name in found.taken if name.startswith(INPUTS) and _column(name, found) in alone}
+    sharp = every
     for own in dict.fromkeys((found.taken, found.taken - beside_it)):
-        sharp = _sharpened(search, replace(found, taken=own), every)
+        sharp = _sharpened(search, replace(found, taken=own), sharp)
         other = search.driven_by(sharp)
         again = other.again(replace(found, taken=own))
         if again is not None and search.better(best[1], settled := other.settled(again)) is settled:
@@ -156,27 +157,29 @@ def _sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str,
         def missed(x: float, place: int = place, start: str = f"{kind}({name}/") -> float:
             terms[place] = f"{start}{math.exp(x):.5g})"
             fit = search.driven_by(terms).again(found)
-            return math.inf if fit is None else fit.rms
+            return math.inf if fit is None else fit.rms**2
 
         missed(_least(missed, math.log(level), math.log(AROUND)))
     return tuple(terms)
 
 
 def _least(f: Callable[[float], float], x: float, step: float) -> float:
-    """The minimum of f near x: golden sections around the lowest of points a step apart, downhill from x."""
-    for way in (step, -step):
-        while f(x + way) < f(x):
-            x += way
-    low, high = x - step, x + step
-    x, y = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    of_x, of_y = f(x), f(y)
-    for _ in range(SECTIONS):
-        if of_x < of_y:
-            high, y, of_y = y, x, of_x
-            x = high - GOLDEN * (high - low)
-            of_x = f(x)
-        else:
-            low, x, of_x = x, y, of_y
-            y = low + GOLDEN * (high - low)
-            of_y = f(y)
-    return x if of_x < of_y else y
+    """The minimum of f near x, by parabolas through three points each, which are closer from parabola to parabola."""
+    for _ in range(PARABOLAS):
+        low, middle, high = f(x - step), f(x), f(x + step)
+        # Downhill until the lowest point is in the middle.
+        while min(low, high) < middle:
+            if low < high:
+                x, low, middle, high = x - step, f(x - 2 * step), low, middle
+            else:
+                x, low, middle, high = x + step, middle, high, f(x + 2 * step)
+        x, step = _lowest(x, step, low, middle, high), step * SHRINKS
+    return x
+
+
+def _lowest(x: float, step: float, low: float, middle: float, high: float) -> float:
+    """The lowest point, within a step of x, of the parabola through three points a step apart; x if it has none."""
+    bend = low - 2 * middle + high
+    if not 0 < bend < math.inf:
+        return x
+    return x + step * max(-1.0, min(1.0, (low - high) / (2 * bend)))

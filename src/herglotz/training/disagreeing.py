@@ -4,10 +4,10 @@ Of every recording the part that a fit uses is followed from a start of its own,
 as a whole by a model that a search has found, else over short segments. Twenty steps hide a damping that is a fifth
 larger, or a scale that is wrong by 3 %. A recording disagrees if more than a tenth of its samples (`reach`) are
 outliers (`TAIL`) of the misfit of the others: fewer are single samples. A bad recording may have bent the model so far
-that none stands out. Where the model is not at the noise, or has functions, the recording that it misses most, or else
-the one whose accelerations are least like the others', is left out if the whole dictionary would follow the others to
-their noise. The model is then found anew. What is left out stays so if the others agree, whose model is at their noise,
-and if it is an outlier of that model. Most recordings have to agree.
+that none stands out. Where the model is not at the noise, the recording that it misses most, or else the one whose
+accelerations are least like the others', is left out if the whole dictionary would follow the others to their noise.
+The model is then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is
+an outlier of that model before it leaves the range of the others. Most recordings have to agree.
 
 Where nothing is left out, as where no terms are searched (more than three coordinates, a given plan, own terms), an
 outlier of the finished model is named (`outlying`).
@@ -129,12 +129,11 @@ def _least_alike(seen: Look) -> int:
 
 
 def _bends(seen: Look, recording: int) -> bool:
-    """Whether a recording may have bent the model, and the whole dictionary follows the others to their noise.
-
-    The model misses the data by more than the noise of the others, or has functions, which bend further than a law.
+    """Whether the model misses the data by more than the noise of the other recordings, and whether the whole
+    dictionary follows these to it.
     """
     others = seen.kept.select(_but(seen, recording)).to(torch.float64, "cpu")
-    if _agree(seen, precision(others)) and not seen.base.spreads:
+    if _agree(seen, precision(others)):
         return False
     base = estimate_baseline(others)
     if others.dof > MOST:

@@ -112,6 +112,9 @@ class Questions:
             if (found := read.run()) and self.read.better(self.best, found) is found:
                 self.hold = hold
                 self._drive(left, wanted, read, found)
+        # Beside wrong forces of the inputs no zeros were clear.
+        if self.differ is None and self.zeros():
+            self.best = self.read.better(self.best, self.read.run())
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
         """Keep these terms of the inputs, the search of the part that has them, and its model."""

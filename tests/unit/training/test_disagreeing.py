@@ -66,8 +66,7 @@ def test_a_model_at_the_noise_of_the_others_needs_no_recording_left_out():
     # fails if the noise is a median over recordings of 11 samples, half of theirs: the model of all of ten drops was a
     # bad one, and good recordings went until a law without air drag followed the others
     data: Any = _drops(4, 10, 11, bad=-1)
-    base = SimpleNamespace(spreads={})
-    seen: Any = SimpleNamespace(data=data, kept=data, found=SimpleNamespace(sigma=0.0015), base=base)
+    seen: Any = SimpleNamespace(data=data, kept=data, found=SimpleNamespace(sigma=0.0015))
     assert sorted(precision(one) for one in data)[4] < 0.6 * 0.0015
     assert not any(_bends(seen, b) for b in range(10))
 
@@ -143,11 +142,11 @@ def test_a_recording_that_differs_little_is_left_out():
     ("damping", "scale", "starts"),
     [
         (0.36, 1.0, ((0.8, 0.5), (-1.5, -0.6), (1.0, 0.9), (-1.9, 0.3), (1.3, -0.8))),
-        (0.3, 1.03, ((0.8, 0.5), (-1.5, -0.6), (1.7, 0.9), (-0.9, 0.3), (1.3, -0.8))),
+        (0.3, 1.06, ((0.8, 0.5), (-1.5, -0.6), (1.0, 0.9), (-1.9, 0.3), (1.3, -0.8))),
     ],
 )
 def test_a_recording_that_short_segments_do_not_tell_is_left_out(damping, scale, starts):
-    # fails if recordings are followed over 20 steps alone: a fifth more damping, or 3 % of scale, bent the model, and
+    # fails if recordings are followed over 20 steps alone: a fifth more damping, or 6 % of scale, bent the model, and
     # the verdict was that the force depends on the past
     of, t, q = torch.Generator().manual_seed(1), 0.04 * torch.arange(200).double(), []
     x = torch.tensor(starts, dtype=torch.float64).T

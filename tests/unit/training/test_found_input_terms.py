@@ -244,6 +244,10 @@ class Asked:
     def settled(self, _):
         return self.trial(self.left)
 
+    def with_zeros(self, best):
+        self.zeros_asked = True
+        return self, best, None
+
     def better(self, _, other):
         return other
 
@@ -271,6 +275,7 @@ def test_terms_that_stood_for_a_hold_leave(monkeypatch, left):
     assert (asked.hold, asked.wanted.data.hold, asked.read.data.hold) == ("smooth",) * 3
     assert asked.wanted.terms == asked.read.terms == asked.best.terms == left
     assert asked.input_terms == tuple(term for term in left if term == "u^2")
+    assert asked.read.zeros_asked  # beside wrong forces of the inputs no zeros were clear
 
 
 @pytest.mark.parametrize("needed", [True, False])
