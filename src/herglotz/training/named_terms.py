@@ -92,14 +92,14 @@ def _of_one(data: Trajectories) -> list[str]:
     return [name for name in every if data.u is None or name != CONSTANT]
 
 
-def moves_one_way(data: Trajectories, i: int) -> bool:
-    """True if a coordinate never turns back for 1/50 of a recording: forces even in v are then as those odd in v."""
+def turns_one_way(data: Trajectories, i: int) -> bool:
+    """True if an angle never turns back for 1/50 of a recording: dry friction is then a constant force."""
     signs = []
     for one in data:
         lag = max(1, one.samples // PARTS_OF_RECORDING)
         signs.append((one.q[lag:, i] - one.q[:-lag, i]).sign())
     seen = torch.cat(signs)
-    return bool((seen == seen[0]).all()) and float(seen[0]) != 0
+    return data.angles[i] and bool((seen == seen[0]).all()) and float(seen[0]) != 0
 
 
 def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTerms:

@@ -130,7 +130,7 @@ class Questions:
         if trial is not None:
             turning = trial.taken.difference(offer.name for offer in line.fitter(Variant(line.order)).offers)
             # No model on a line is simpler than one with a single term for each coordinate.
-            if trial.lacks_nothing and len(turning) <= read.data.dof:
+            if trial.lacks_nothing and (len(turning) <= read.data.dof or not line.meets_segments):
                 return False
             # A search on the line is worth its time only if its first model is no worse.
             if trial.whole and (line.first is None or trial.replaces(line.first)):

@@ -148,6 +148,11 @@ class Search:
         fitter = self.fitter(Variant(self.order))
         return fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
 
+    @property
+    def meets_segments(self) -> bool:
+        """True if the model of the whole dictionary meets the shortest segments to the noise."""
+        return self._every_term is not None and self._every_term.segments_at_the_noise
+
     def fitter_of_functions(self, variant: Variant) -> Fitter | None:
         """The fitter of a variant with all functions; None with translations, or if a kernel cannot have so many."""
         functions = () if self.config.translations else tuple(bands(self.range_data, self.base))

@@ -27,7 +27,7 @@ from herglotz.training.errors_of_runs import EXACT_ENOUGH
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
-from herglotz.training.named_terms import DRY, NamedTerms, candidates, moves_one_way, settings_of, started
+from herglotz.training.named_terms import DRY, NamedTerms, candidates, settings_of, started, turns_one_way
 from herglotz.training.offers import ALWAYS, offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import Grids, segment_lengths
@@ -263,12 +263,10 @@ class Fitter:
         fixed = {f"kinetic.log_diagonal[{own[0] - 1}]" for own in apart}
         self.always = tuple(name for name in self.always if name not in fixed)
         without_offers(self.model, every_offer)
-        # On a coordinate that moves one way, a load is the same force as dry friction, and v² the same as |v| v, which
-        # are offered already.
-        one_way = [i + 1 for i in range(data.dof) if moves_one_way(data, i)]
-        loads, alike = {f"load {i}" for i in one_way}, {f"v{i}^2" for i in one_way}
-        self.offers = [offer for offer in every_offer if offer.name not in loads | alike]
-        self.loads = [offer for offer in every_offer if offer.name in loads]
+        # On a joint that turns one way, a load is the same force as dry friction, which is offered already.
+        one_way = [f"load {i + 1}" for i in range(data.dof) if turns_one_way(data, i)]
+        self.offers = [offer for offer in every_offer if offer.name not in one_way]
+        self.loads = [offer for offer in every_offer if offer.name in one_way]
         self.start = dict(zip(every.numbers, every.get().tolist(), strict=True))
         self.place = {key: name for name, key in self.keys.items()}
         # Names of the coefficients of the waves of each function.

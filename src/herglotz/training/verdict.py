@@ -30,6 +30,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.noise import AT_THE_NOISE, coarse, precision, precisions, relative_spread
 from herglotz.data.polar import circles
+from herglotz.data.sensors import measured
 from herglotz.data.splits import enough, leading
 from herglotz.data.units import common_unit
 from herglotz.stepping import Stepper, state_of
@@ -201,7 +202,8 @@ def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
     Two positions with one degree of freedom (`bound`) are wrong whatever the errors. If the training data are `missed`
     by more than the noise, so is a recording that stands out, and what `reason_of_data` finds.
     """
-    if (words := bound(kept)) or not missed:
+    # A drift may make up for a constraint, which the readings keep.
+    if (words := bound(measured(kept, drifts=[-rate for rate in seen.drifts]))) or not missed:
         return words
     return "".join(one.reason for one in seen.outlying) or reason_of_data(seen.train.liveliest(MOST))
 

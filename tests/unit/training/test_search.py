@@ -216,22 +216,18 @@ def test_offers_join_segments_that_are_missed(whole, at_the_noise, joined):
     assert (Search.joined(search, trial) is met) is joined
 
 
-@pytest.mark.parametrize(
-    ("friction", "terms"),
-    [(lambda v: abs(v) - 1.5 * v, {"|v1|"}), (lambda v: 1.5 * v * v - 3 * abs(v) * v - 0.4 * v, {"|v1| v1", "v1^2"})],
-)
-def test_friction_of_one_direction_is_found(friction, terms):
-    # z″ = −40 z − 1.5 z′ + |z′|, and quadratic drag that differs by direction: fails if no such offer is even in speed
+def test_friction_of_one_direction_is_found():
+    # z″ = −40 z − 1.5 z′ + |z′|: fails if no offer is even in the speed
     x, v, path = 0.1, 0.0, []
     for _ in range(200):
         path.append(x)
         for _ in range(20):
-            v += 0.001 * (-40 * x + friction(v))
+            v += 0.001 * (-40 * x - 1.5 * v + abs(v))
             x += 0.001 * v
     q = torch.tensor(path, dtype=torch.float64)
     q = q + 2e-4 * torch.randn(200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = there(searched(Trajectories.of(0.02 * torch.arange(200, dtype=torch.float64), q)).run())
-    assert found.taken == {"q1^2", *terms}
+    assert found.taken == {"q1^2", "|v1|"}
 
 
 @pytest.mark.parametrize(("rate", "word"), [(0.3, "friction.coulomb"), (-0.3, "load 1")])

@@ -315,8 +315,8 @@ class OnALine:
     config = SimpleNamespace(translations=())
     order, first = 2, SimpleNamespace(length=20)
 
-    def __init__(self):
-        self.searched = False
+    def __init__(self, meets):
+        self.searched, self.meets_segments = False, meets
 
     def on_a_line(self):
         return self
@@ -329,19 +329,20 @@ class OnALine:
 
 
 @pytest.mark.parametrize(
-    ("whole", "worse", "lacks", "terms", "searched"),
+    ("whole", "worse", "lacks", "meets", "terms", "searched"),
     [
-        (True, True, True, ("cos(q1)",), False), (True, False, True, ("cos(q1)",), True),
-        (False, True, True, ("cos(q1)",), True), (True, False, False, ("cos(q1)", "|v1| v1"), False),
-        (True, False, False, ("cos(q1)", "cos(3q1)"), True),
+        (True, True, True, True, ("cos(q1)",), False), (True, False, True, False, ("cos(q1)",), True),
+        (False, True, True, True, ("cos(q1)",), True), (True, False, False, True, ("cos(q1)", "|v1| v1"), False),
+        (True, False, False, True, ("cos(q1)", "cos(3q1)"), True),
+        (True, False, False, False, ("cos(q1)", "cos(3q1)"), False),
     ],
 )  # fmt: skip
-def test_a_line_is_searched_where_its_model_may_be_better(whole, worse, lacks, terms, searched):
+def test_a_line_is_searched_where_its_model_may_be_better(whole, worse, lacks, meets, terms, searched):
     # fails if a model that follows no whole trajectory ends the question (two magnets under a pendulum are powers), if
     # a search is made where its first model is worse than one that follows them, or where no model on a line can be
     # simpler than one that lacks nothing; a coil spring is found as harmonics of the angle that lack nothing
     asked: Any = object.__new__(questions.Questions)
-    asked.read = OnALine()
+    asked.read = OnALine(meets)
     trial: Any = SimpleNamespace(whole=whole, lacks_nothing=not lacks, taken=frozenset(terms), replaces=lambda _: worse)
     asked.best = trial
     assert not asked.better_on_a_line()

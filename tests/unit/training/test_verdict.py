@@ -188,7 +188,7 @@ def test_a_misread_recording_is_no_fit_above_the_noise():
     q = (1000 * torch.randn(60, 1, generator=random, dtype=torch.float64)).round()
     note = f"warning: wheel may be {COUNTS}"
     data = replace(Trajectories.of(torch.arange(60).double(), q), names=("wheel",), notes=(note,))
-    seen: Any = SimpleNamespace(train=data, outlying=())
+    seen: Any = SimpleNamespace(train=data, outlying=(), drifts=())
     errors = Errors(34.0, 34.0, 34.0, noise=0.29, spread=1000.0)
     said = verdict.misread(data, seen, errors.missed)
     assert in_words(errors, KNOWN, GOOD, misread=said).startswith("does not fit: ")
