@@ -127,33 +127,15 @@ class Questions:
         if not any(read.data.angles) or read.config.translations:
             return False
         line = read.on_a_line()
-        if trial is not None:
-            turning = trial.taken.difference(offer.name for offer in line.fitter(Variant(line.order)).offers)
-            # No model on a line is simpler than one with a single term for each coordinate.
-            if trial.lacks_nothing and (len(turning) <= read.data.dof or not line.meets_segments):
-                return False
-            # A search on the line is worth its time only if its first model is no worse.
-            if trial.whole and (line.first is None or trial.replaces(line.first)):
-                return False
+        if trial is not None and not _may_be_better(line, trial):
+            return False
         other = line.run()
         if read.data.u is not None and not (other and other.at_the_noise):
             # Terms of the inputs that are found beside wrong forces of the angle may be wrong, too.
             asked = Questions(self.unread.part.on_a_line(), self.holds)
             asked.how_inputs_act()
             other = read.better(other, asked.best)
-        if other is None or trial is None:
-            return other is not None
-        # Both readings are compared over segments that both models follow.
-        length = min(trial.length, other.length)
-        trial, other = (x if x.length == length else x.fitter.over(x, length) for x in (trial, other))
-        if trial is None or other is None or read.better(trial, other) is trial:
-            return trial is None and other is not None
-        ahead, its = other.fitter.free_run_score(other), trial.fitter.free_run_score(trial)
-        if ahead is None or its is None:
-            return ahead is not None
-        if its.numbers > ahead.numbers:
-            return not its.replaces(ahead, trial.fitter.offered)
-        return ahead.replaces(its, trial.fitter.offered)
+        return other is not None and (trial is None or _is_better(other, trial, read))
 
     def functions(self) -> None:
         """Find a better model with learned functions."""
@@ -180,3 +162,29 @@ def _asked(read: Search, best: Trial) -> tuple[tuple[str, ...], Search, Trial] |
     driven = read.driven_by(terms)
     found = driven.run()
     return None if found is None or not found.replaces(best) else (terms, driven, found)
+
+
+def _may_be_better(line: Search, trial: Trial) -> bool:
+    """True if a search on a line is worth its time beside a model of angles."""
+    turning = trial.taken.difference(offer.name for offer in line.fitter(Variant(line.order)).offers)
+    # No model on a line is simpler than one with a single term for each coordinate.
+    if trial.lacks_nothing and (len(turning) <= line.data.dof or not line.meets_segments):
+        return False
+    # The first model on a line must be no worse.
+    return not trial.whole or (line.first is not None and not trial.replaces(line.first))
+
+
+def _is_better(other: Trial, trial: Trial, read: Search) -> bool:
+    """True if the model `other` on a line is better than a model of angles, over segments that both follow.
+
+    Free runs over held-out time must not say otherwise. Of models that are alike the simpler one is better.
+    """
+    length = min(trial.length, other.length)
+    turning, line = (x if x.length == length else x.fitter.over(x, length) for x in (trial, other))
+    if turning is None or line is None or read.better(turning, line) is turning:
+        return turning is None and line is not None
+    its, ahead = (x.fitter.free_run_score(x) for x in (turning, line))
+    if ahead is None or its is None:
+        return ahead is not None
+    offered = trial.fitter.offered
+    return not its.replaces(ahead, offered) if its.numbers > ahead.numbers else ahead.replaces(its, offered)
