@@ -55,8 +55,8 @@ COMPOUND = re.compile(
 )
 # A column that was filtered from another: theta_filt beside theta, x_smoothed beside x_raw.
 COPY = re.compile(
-    r"(?:filt(?:ered)?|smooth(?:ed)?)[ _-]?(?P<before>.+)|(?P<behind>.+?)[ _-]?"
-    r"(?:filt(?:ered)?|smooth(?:ed)?|lowpass|lp|gefiltert|geglättet|filtrée?|filtrad[oa]|filtrat[oa])"
+    r"(?:filt(?:ered)?|smooth(?:ed)?)[ _-]?(?P<before>.+)|(?P<behind>.+?)(?:[ _-]lp|[ _-]?"
+    r"(?:filt(?:ered)?|smooth(?:ed)?|lowpass|gefiltert|geglättet|filtrée?|filtrad[oa]|filtrat[oa]))"
 )
 # Words without accents: ángulo is here as angulo. Kinds of words that need a reason:
 # side: quantities that are measured beside a motion. attribute: of a position (motor_angle), or else of an input.

@@ -162,7 +162,7 @@ class Trajectories:
         """Return the number of a trajectory, and its name if that says more: `trajectory 3 (rec_17.csv)`."""
         number = f"trajectory {i}"
         name = self.recordings[i] if self.recordings else number
-        return number if name == number else f"{number} ({name})"
+        return number if name in ("", number) else f"{number} ({name})"
 
     @property
     def complete(self) -> Tensor:
@@ -368,5 +368,13 @@ def made_alike(sets: Sequence[Trajectories]) -> list[Trajectories]:
     if any(one.observed is not None for one in sets):
         sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
     if any(one.hold == "zero" for one in sets):
-        sets = [replace(one, u=one.inputs_of_steps(), hold="zero") if one.hold else one for one in sets]
+        sets = [_of_steps(one) if one.hold else one for one in sets]
     return list(sets)
+
+
+def _of_steps(one: Trajectories) -> Trajectories:
+    """The set with inputs that are means of its steps, and a note where they were not."""
+    if one.hold == "zero":
+        return one
+    note = f"warning: inputs with hold {one.hold} are means of steps, because a recording beside them has hold zero"
+    return replace(one, u=one.inputs_of_steps(), hold="zero", notes=(*one.notes, note))

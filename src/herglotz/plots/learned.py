@@ -133,7 +133,7 @@ def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
             ax.set_xlim(float(t[0]), float(t[-1]))
             reaches.append(float(max(residual.abs().max(), measured.max())))
             if len(data) > 1:
-                ax.set_title(data.label(b))
+                ax.set_title(data.label(b), parse_math=False)
             ax.set_ylabel(with_unit(f"residual of {data.names[i]}", data.units[i]))
         units = [data.units[i] for _, i in cells]
         # Panels of the same unit have the same scale, so that a reader can compare them.

@@ -40,7 +40,7 @@ def plot_data(data: Trajectories) -> Figure:
             ax[0].plot(t, q, ".", color=INK, ms=3)
             ax[0].set(ylabel=with_unit(data.names[i], data.units[i]), xlabel=with_unit("time", data.time_unit))
             if len(data) > 1:
-                ax[0].set_title(data.label(b))
+                ax[0].set_title(data.label(b), parse_math=False)
     return figure
 
 
@@ -89,7 +89,7 @@ def _drawn(motion: _Motion, title: str, trajectory: int | None = None) -> Figure
             _draw_motion(motion, b, i, ax[0], ax[1], labelled=(b, i) == cells[0])
             ax[1].set_xlabel(with_unit("time", data.time_unit))
             if len(data) > 1:
-                ax[0].set_title(data.label(b))
+                ax[0].set_title(data.label(b), parse_math=False)
     return figure
 
 

@@ -153,8 +153,13 @@ def _sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str,
             continue
         kind, level, name = of
         place = terms.index(term)
+        # Far above the largest input a saturation is the input itself, and far below it a sign.
+        labels = [label for label, _ in search.data.input_labels]
+        most = float(search.data.u[:, labels.index(name)].abs().max()) if search.data.u is not None else 0.0
 
-        def missed(x: float, place: int = place, start: str = f"{kind}({name}/") -> float:
+        def missed(x: float, place: int = place, start: str = f"{kind}({name}/", most: float = most) -> float:
+            if not LOWEST * most <= math.exp(x) <= most / LOWEST:
+                return math.inf
             terms[place] = f"{start}{math.exp(x):.5g})"
             fit = search.driven_by(terms).again(found)
             return math.inf if fit is None else fit.rms**2

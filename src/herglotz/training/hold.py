@@ -4,7 +4,8 @@ Each arrival (`herglotz.data.driving`) makes other inputs of the steps. One line
 by differences against `acceleration_terms`, dry friction and the forces of other joints. Differences amplify noise, so
 that the problem is turned back into one of positions over short windows, whose noise is white. An arrival is taken if
 it lowers the error by more than a tenth and beyond the spread of that gain over blocks of time: first a hold, then a
-delay or a lag, then both. Where the rates of the inputs lower it as much beyond a delay, there is none.
+delay or a lag, then both. There is no delay or lag where inputs that act at once, by their rates too, are better than
+it by the same measure.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class LeftOut(NamedTuple):
         """The reason of a misfit, with a remedy."""
         times = f"missed {self.missed / self.others:.2g} times as far as the others"
         far = f"is {times if math.isfinite(self.missed) else 'not followed'}{from_then_on(self.since)}"
-        what = f"T{self.label[1:]}, counted from 0, {far}, and may be of something else"
+        what = f"{self.label[:1].upper()}{self.label[1:]}, counted from 0, {far}, and may be of something else"
         return f"{what}. Try the fit without it"
 
     @property
@@ -60,13 +60,16 @@ def reach(missed: Tensor) -> float:
 
 
 def since(missed: Tensor, t: Tensor, scale: float) -> float | None:
-    """The time (of t, (N,)) from which on most rows of `missed` (N, n) are outliers of this scale.
+    """The time (of t, (N,)) from which on most rows of `missed` (N, n) are outliers of this scale, few being before.
 
-    None if no more than a tenth of the samples come before it.
+    None if there is no such time, or no more than a tenth of the samples come before it.
     """
-    out = (missed.abs() > TAIL * scale).any(-1).double() - 0.5
-    first = int(out.flip(0).cumsum(0).flip(0).argmax()) if len(out) else 0
-    return float(t[first]) if first > FEW * len(out) else None
+    out = (missed.abs() > TAIL * scale).any(-1).double()
+    if not bool(out.any()):
+        return None
+    first = int((out - 0.5).flip(0).cumsum(0).flip(0).argmax())
+    later, length = float(out[first:].sum()), len(out) - first
+    return float(t[first]) if first > FEW * len(out) and 2 * later > max(length, float(out.sum())) else None
 
 
 def scale_of_all(missed: Sequence[Tensor], least: float) -> float:

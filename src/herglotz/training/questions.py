@@ -132,7 +132,7 @@ class Questions:
         other = line.run()
         if read.data.u is not None and not (other and other.at_the_noise):
             # Terms of the inputs that are found beside wrong forces of the angle may be wrong, too.
-            asked = Questions(self.unread.part.on_a_line(), self.holds)
+            asked = Questions(self.unread.on_a_line(), self.holds[:-1])
             asked.how_inputs_act()
             other = read.better(other, asked.best)
         return other is not None and (trial is None or _is_better(other, trial, read))

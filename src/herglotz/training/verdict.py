@@ -193,7 +193,8 @@ def unseen_outlier(seen: Look, everywhere: Tensor) -> str:
     if len(out) != 1:
         return ""
     (one,) = out
-    return one._replace(recording=recordings[one.recording], since=one.since or float(t[one.recording][0])).reason
+    since = float(t[one.recording][0]) if one.since is None else one.since
+    return one._replace(recording=recordings[one.recording], since=since).reason
 
 
 def misread(kept: Trajectories, seen: Look, missed: bool) -> str:

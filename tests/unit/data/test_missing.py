@@ -70,6 +70,7 @@ def test_a_folder_in_which_one_file_has_blanks(tmp_path, hold):
     assert data.observed is not None
     assert (data.observed == 0).nonzero().tolist() == [[24, 0]]
     assert data.hold == ("zero" if hold else "")
+    assert any(f"inputs with hold {hold} are means of steps" in note for note in data.notes) == bool(hold)
     assert data.u is not None
     middle = 0.5 if hold else 0.0
     assert torch.allclose(data.u[:19, 0], torch.arange(19).double() + middle)

@@ -225,7 +225,9 @@ def test_names_of_recordings_follow_their_samples():
     assert data.keep(kept).recordings == ("trajectory 2",)
     assert data.split_time(0.5)[1].recordings == ("trajectory 2",)
     assert Trajectories.cat([data, ragged()]).recordings == (*data.recordings, "set", "set", "set")
-    assert Trajectories.cat([ragged(), replace(ragged(), source="other")]).label(4) == "trajectory 4 (other)"
+    both = Trajectories.cat([replace(ragged(), source=""), replace(ragged(), source="other")])
+    assert both.label(4) == "trajectory 4 (other)"
+    assert both.label(0) == "trajectory 0"  # no empty brackets where a set has no source
     assert Trajectories.cat([ragged(), ragged()]).recordings == ()
 
 

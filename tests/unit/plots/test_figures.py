@@ -135,10 +135,12 @@ def test_bands_of_one_unit_share_their_scale():  # fails if a panel of small res
     run = fake_run(trajectories=3, steps=20)
     q = run.data.q.clone()
     q[: run.data.lengths[0]] += 0.5
-    run = replace(run, data=replace(run.data, q=q, recordings=("a", "trajectory 1", "c")))
+    run = replace(run, data=replace(run.data, q=q, recordings=("a_$_$", "trajectory 1", "c")))
     figure = plot_bands(run, Bands(run.states.q, torch.full_like(q, 0.01), torch.tensor([0.01])))
     assert len({ax.get_ylim() for ax in figure.axes}) == 1
-    assert [ax.get_title(loc="left") for ax in figure.axes] == ["trajectory 0 (a)", "trajectory 1", "trajectory 2 (c)"]
+    titles = ["trajectory 0 (a_$_$)", "trajectory 1", "trajectory 2 (c)"]
+    assert [ax.get_title(loc="left") for ax in figure.axes] == titles
+    figure.canvas.draw()  # fails if a name of a file is read as mathematics
 
 
 @pytest.mark.parametrize("angles", [(True,), (False,), (True, True), (False, False), (False, True), (False,) * 3])

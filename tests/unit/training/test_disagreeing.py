@@ -199,6 +199,11 @@ def test_a_few_samples_are_no_bad_recording():
     assert since(far[50:], t[50:], 1.0) == 60.0
     assert reach(far[:0]) == 0.0
     assert since(far[:0], t[:0], 1.0) is None
+    # fails if the last sample is said to be the first bad one where bad samples are early, or scattered
+    early, scattered = (torch.full((100, 1), 0.1, dtype=torch.float64) for _ in range(2))
+    early[20:50], scattered[::5] = 50.0, 50.0
+    assert since(early, t, 1.0) is None
+    assert since(scattered.flip(0), t, 1.0) is None
 
 
 def test_a_step_that_fails_loses_no_run(tmp_path):
