@@ -15,7 +15,7 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import saturation
 from herglotz.models import ModelConfig
 from herglotz.training import questions
-from herglotz.training.acting_inputs import asked_terms, beside, offered_terms, taken_terms
+from herglotz.training.acting_inputs import _least, asked_terms, beside, offered_terms, taken_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import by_motion, dictionary
@@ -93,6 +93,14 @@ def test_the_level_at_which_an_input_saturates_is_found():
     assert found is not None
     assert (found[0], found[2]) == ("sat", "u")
     assert found[1] == pytest.approx(0.6, rel=0.01)
+
+
+def test_the_best_level_is_found_far_from_the_first_guess():
+    # fails if levels are tried near the guess alone, or near a wrong minimum of the first, wide parabola
+    asked = []
+    broken = lambda x: asked.append(x) or (1e3 if x > 3.2 else 1 + (x - 3) ** 2)  # noqa: E731
+    assert _least(broken, 0.0, 0.4) == pytest.approx(3, abs=5e-3)
+    assert len(asked) < 40
 
 
 def test_an_input_that_saturates_softly_acts_by_nothing_else():

@@ -175,7 +175,7 @@ def test_a_drift_hides_no_circle():
     seen: Any = SimpleNamespace(train=data, outlying=(), drifts=drifts)
     kept = sensors.measured(data, drifts=drifts)
     assert verdict.bound(kept) == ""
-    assert "stay on a circle" in verdict.misread(kept, seen, True)
+    assert "stay on a circle" in verdict.misread(kept, seen, False)
 
 
 def test_a_verdict_asks_for_circles(monkeypatch):  # fails if nobody asks, or the data of the fit are not what is asked
