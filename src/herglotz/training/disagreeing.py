@@ -7,7 +7,7 @@ outliers (`TAIL`) of the misfit of the others: fewer are single ones. A bad reco
 that none stands out. Where the model is not at the noise, the recording that it misses most, or else the one whose
 accelerations are least like the others', is left out if the whole dictionary would follow the others to their noise.
 The model is then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is
-an outlier of that model before it leaves the range of the others. Most recordings have to agree.
+an outlier of that model. Most recordings have to agree.
 
 Where nothing is left out, as where no terms are searched (more than three coordinates, a given plan, own terms), an
 outlier of the finished model is named (`outlying`).
