@@ -42,7 +42,7 @@ leaves the range of positions and momenta that the model was fitted to: which, h
 --out FILE writes the predicted positions and velocities (and momenta with --momenta), and FILE.png beside it: data,
 free run and their difference.
 Where the recordings of the fit differ in what their sensors read at 0, those zeros that suit the first samples best
-are taken off this recording; --sensor-zeros says it instead, relative to the longest recording of the fit.
+are taken off this recording; --sensor-zeros says it instead, beside the model's own.
 With --windows W --horizon T, W windows spread over the recording are scored instead, each K samples and then a free
 run over the time T: for motions that no model follows for long.
 

@@ -108,7 +108,7 @@ def _of_kind(search: Search, kind: str, terms: Sequence[str], trial: Trial) -> t
     beside_it = {name for name in found.taken if name.startswith(INPUTS) and _column(name, found) in alone}
     sharp = every
     for own in dict.fromkeys((found.taken, found.taken - beside_it)):
-        sharp = _sharpened(search, replace(found, taken=own), sharp)
+        sharp = sharpened(search, replace(found, taken=own), sharp)
         other = search.driven_by(sharp)
         again = other.again(replace(found, taken=own))
         if again is not None and search.better(best[1], settled := other.settled(again)) is settled:
@@ -145,8 +145,11 @@ def _column(gain: str, found: Trial) -> int:
     return int(gain.partition("[")[2].rstrip("]") or 0) % len(found.fitter.data.input_labels)
 
 
-def _sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
-    """The terms; those that a model has taken have the levels at which the model misses the data least."""
+def sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str, ...]:
+    """The terms; those that a model has taken have the levels at which the model misses the data of a search least.
+
+    The model may have been found with other levels, or with other zeros of sensors.
+    """
     terms = list(every)
     for term in taken_terms(found, every):
         if (of := saturation(term)) is None:

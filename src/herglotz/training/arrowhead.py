@@ -68,19 +68,36 @@ class Arrowhead:
 
     def _solved(self, b: Tensor, damping: Tensor) -> Tensor | None:
         """The solution by eliminating the states first, in float64."""
+        P, (S, d) = len(self.corner), self.border.shape[:2]
+        if (found := self._reduced(b[P:].reshape(S, d, 1), damping)) is None:
+            return None
+        reduced, solved, taken = found
+        factor, info = torch.linalg.cholesky_ex(reduced)
+        if int(info) != 0:
+            return None
+        top = torch.cholesky_solve((b[:P] - taken[:, 0])[:, None], factor)[:, 0]
+        step = torch.cat([top, (solved[..., -1] - solved[..., :-1] @ top).flatten()])
+        return step if bool(torch.isfinite(step).all()) else None
+
+    def _reduced(self, columns: Tensor, damping: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+        """The matrices C − Bᵀ T⁻¹ B, T⁻¹ (B, columns) and Bᵀ T⁻¹ columns, damped; None if T is not positive."""
         P, (S, d), border = len(self.corner), self.border.shape[:2], self.border.double()
         blocks = self.blocks.double() + torch.diag_embed(damping[P:].reshape(S, d))
-        columns = torch.cat([border, b[P:].reshape(S, d, 1)], -1)
-        if (solved := self.eliminate(blocks, self.upper.double(), columns)) is None:
+        if (solved := self.eliminate(blocks, self.upper.double(), torch.cat([border, columns], -1))) is None:
             return None
         taken = border.flatten(0, 1).T @ solved.flatten(0, 1)
         reduced = self.corner.double() + torch.diag(damping[:P]) - taken[:, :P]
-        factor, info = torch.linalg.cholesky_ex((reduced + reduced.T) / 2)
-        if int(info) != 0:
-            return None
-        top = torch.cholesky_solve((b[:P] - taken[:, P])[:, None], factor)[:, 0]
-        step = torch.cat([top, (solved[..., -1] - solved[..., :-1] @ top).flatten()])
-        return step if bool(torch.isfinite(step).all()) else None
+        return (reduced + reduced.T) / 2, solved, taken[:, P:]
+
+    def covariance(self) -> Tensor | None:
+        """The corner of the inverse, (P, P): the covariance of parameters; None if T is not positive.
+
+        What no residual determines has the variance 0.
+        """
+        P, (S, d) = len(self.corner), self.border.shape[:2]
+        zero = self.border.new_zeros(P + S * d, dtype=torch.float64)
+        found = self._reduced(zero.new_zeros(S, d, 0), zero)
+        return None if found is None else torch.linalg.pinv(found[0], hermitian=True)
 
 
 def eliminated(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:

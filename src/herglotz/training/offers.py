@@ -23,8 +23,10 @@ EXCESS_OF = {"friction.breakaway": "friction.coulomb"}
 INPUTS = "friction.input_map"
 # Zeros of all inputs.
 ZEROS = "friction.input_zero"
+# Constant forces at rest, for which a zero of the sensor can stand.
+TILT = "potential.tilt"
 # Parameters of the simplest model, beside `ALWAYS`.
-SIMPLE = ("potential.stiffness", "potential.tilt", INPUTS)
+SIMPLE = ("potential.stiffness", TILT, INPUTS)
 
 
 class Offer(NamedTuple):

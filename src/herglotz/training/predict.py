@@ -153,8 +153,8 @@ def predict(
         Score this many windows, spread evenly over the recording, instead of one free run to the end of each
         trajectory. A window has K samples of warm-up and a free run over the time `horizon`.
     same_zeros
-        True: the sensors have the zeros of the run's reference recording. False: if recordings of the fit differ in
-        their zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
+        True: the sensors read 0 where the model's coordinates are 0. False: if recordings of the fit differ in their
+        zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
 
     Returns
     -------
@@ -213,7 +213,7 @@ def missed_from_best_start(run: FittedRun, data: Trajectories) -> tuple[float, .
 
 
 def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:
-    """The distinct zeros of the sensors in the recordings of the fit; first (), the zeros of the reference."""
+    """The distinct zeros of the sensors in the recordings of the fit; first (), which are all 0."""
     zeros, n = (run.metrics.get("plan") or {}).get("zeros") or (), run.data.dof
     every = dict.fromkeys(tuple(zeros[i : i + n]) for i in range(0, len(zeros), n))
     return [(), *(zero for zero in every if any(zero))]

@@ -15,8 +15,10 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from herglotz.data.input_terms import saturation
+from herglotz.data.sensors import measured
 from herglotz.models.drag import input_columns
-from herglotz.training.acting_inputs import asked_terms, taken_terms
+from herglotz.training.acting_inputs import asked_terms, sharpened, taken_terms
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
 from herglotz.training.trials import Trial, Variant
@@ -34,7 +36,7 @@ class Questions:
     def __init__(self, wanted: Search, holds: Sequence[str]):
         # The hold of the data is among the candidates, because it is tried again after another hold was found.
         self.unread, self.wanted, self.holds = wanted, wanted, (*holds, *([wanted.data.hold] if holds else []))
-        self.hold, self.input_terms = "", ()
+        self.hold, self.terms, self.input_terms, self.undriven = "", (), (), wanted
         self.read: Search = wanted.part
         self.best: Trial | None = None
         self.differ: tuple[Tensor, Tensor] | None = None
@@ -42,7 +44,10 @@ class Questions:
         # A model that misses segments by more than the noise need not be grown to whole trajectories for that answer.
         if wanted.part.misses_segments or (simple := wanted.part.first) is None or not simple.at_the_noise:
             # The whole dictionary lacks no term for which zeros or another hold could make up.
-            self.best = wanted.part.full
+            read, found, differ = self.read.with_zeros_of_segments()
+            if found is not None:
+                read.full, self.read, self.differ = found, read, differ
+            self.best = self.read.full
             asked = self.best is not None and self.best.whole
             if asked and any([self.zeros(), self.how_inputs_hold(by_residuals=True)]):
                 self.read.full = self.best
@@ -118,8 +123,8 @@ class Questions:
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
         """Keep these terms of the inputs, the search of the part that has them, and its model."""
-        self.input_terms, self.wanted = input_columns(terms), wanted.driven_by(terms)
-        self.read, self.best = read, found
+        self.terms, self.input_terms, self.undriven = tuple(terms), input_columns(terms), wanted
+        self.wanted, self.read, self.best = wanted.driven_by(terms), read, found
 
     def better_on_a_line(self) -> bool:
         """True if a model is better with every angle taken for a position on a line, as of a coil spring."""
@@ -145,14 +150,26 @@ class Questions:
         """Fit the model of a part to all data, and ask these for zeros, more terms and, if not yet asked, the hold."""
         if self.wanted.part is self.wanted:
             if self.best is not None and self.differ is not None:
-                self.read, best, self.differ = self.wanted.zeros_again(self.read, self.best, self.differ)
-                self.best = best and (best if best is self.best else self.read.settled(best))
+                found = self._zeros_again(self.best, self.differ)
+                self.best = found if found is self.best else self.read.settled(found)
             return
         longer = self.wanted.part.step_ratio > 1
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
         if longer and self.best is not None and (hold := self.read.better_hold(self.best, self.holds)):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
+
+    def _zeros_again(self, best: Trial, differ: tuple[Tensor, Tensor]) -> Trial:
+        """The model with zeros fitted once more, and with the levels at which its inputs saturate beside these."""
+        self.read, best, self.differ = self.wanted.zeros_again(self.read, best, differ)
+        if any(map(saturation, self.terms)):
+            plain = self.undriven.of(measured(self.undriven.data, self.differ[0].flatten().tolist()))
+            terms = sharpened(plain, best, self.terms)
+            driven = plain.driven_by(terms)
+            if (found := driven.again(best)) is not None and found.rms < best.rms:
+                self._drive(terms, self.undriven, driven, found)
+                self.read, best, self.differ = self.wanted.zeros_again(driven, found, self.differ)
+        return best
 
 
 def _asked(read: Search, best: Trial) -> tuple[tuple[str, ...], Search, Trial] | None:

@@ -34,7 +34,7 @@ from herglotz.training.offers import INPUTS
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.sensor_zeros import clear, differing_zeros
+from herglotz.training.sensor_zeros import clear, differing_zeros, means
 from herglotz.training.task import build_model
 from herglotz.training.trials import (
     ALIKE,
@@ -58,8 +58,10 @@ FITS_OF_A_KIND = 3
 # Largest number of model steps in a recorded step, and in all trajectories.
 MAX_SUBSTEPS, MAX_STEPS = 16, 40_000
 
-# A search of readings less the zeros of their sensors, its model, and the zeros (B, n) with standard deviations.
-Zeroed = tuple["Search", Trial | None, tuple[Tensor, Tensor] | None]
+# Zeros (B, n) of the sensors, with standard deviations.
+Zeros = tuple[Tensor, Tensor]
+# A search of readings less the zeros of their sensors, its model, and the zeros.
+Zeroed = tuple["Search", Trial | None, Zeros | None]
 
 
 class Search:
@@ -139,19 +141,42 @@ class Search:
     @cached_property
     def full(self) -> Trial | None:
         """The model of the whole dictionary over the longest segments that the model follows."""
-        trial = self._every_term
+        trial = self.every_term
         return trial and self.finer(trial.fitter.grow(self.finer(trial)))
 
     @cached_property
-    def _every_term(self) -> Trial | None:
+    def every_term(self) -> Trial | None:
         """The model of the whole dictionary over the shortest segments."""
+        return self._over_the_shortest(offer.name for offer in self.fitter(Variant(self.order)).offers)
+
+    def _over_the_shortest(self, taken: Iterable[str]) -> Trial | None:
         fitter = self.fitter(Variant(self.order))
-        return fitter.fit([offer.name for offer in fitter.offers], {}, fitter.lengths[0], None, 2 * ITERATIONS)
+        return fitter.fit(taken, {}, fitter.lengths[0], None, 2 * ITERATIONS)
+
+    def with_zeros_of_segments(self) -> Zeroed:
+        """Zeros, found over the shortest segments, with which a model is at the noise of whole trajectories, or None.
+
+        Zeros as large as the motion leave no model that whole trajectories could be followed with. The shorter the
+        segments, the more linear is the motion in the zeros, too, which start at the means of the readings. They are
+        asked of the simplest model, then of the whole dictionary, both without constant forces, for which zeros stand.
+        """
+        fitter = self.fitter(Variant(self.order))
+        for offers in (fitter.simple, {offer.name for offer in fitter.offers}):
+            short = self._over_the_shortest(offers - fitter.constant_forces)
+            read, short, differ = self.with_zeros(short, start=means(self.data))
+            if short is None or differ is None:
+                continue
+            grown = read.first if offers is fitter.simple else read.finer(short.fitter.grow(read.finer(short)))
+            if grown is not None and grown.whole:
+                read, grown, differ = self.zeros_again(read, grown, differ)
+                if grown.at_the_noise:
+                    return read, grown, differ
+        return self, None, None
 
     @property
     def meets_segments(self) -> bool:
         """True if the model of the whole dictionary meets the shortest segments to the noise."""
-        return self._every_term is not None and self._every_term.segments_at_the_noise
+        return self.every_term is not None and self.every_term.segments_at_the_noise
 
     def fitter_of_functions(self, variant: Variant) -> Fitter | None:
         """The fitter of a variant with all functions; None with translations, or if a kernel cannot have so many."""
@@ -170,7 +195,7 @@ class Search:
         """
         if (fitter := self.fitter_of_functions(Variant(self.order))) is None:
             return None
-        trial, named, every = None, self._every_term, tuple(fitter.functions)
+        trial, named, every = None, self.every_term, tuple(fitter.functions)
         forces = tuple(name for name in every if not name.startswith("mass"))
         for functions in dict.fromkeys((forces, every)):
             if trial is None or not trial.segments_at_the_noise:
@@ -350,40 +375,44 @@ class Search:
         base = estimate_baseline(data, outliers=self.freedom is not None)
         return Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
 
-    def zeros(self, trial: Trial) -> tuple[Tensor, Tensor] | None:
+    def zeros(
+        self, trial: Trial, start: Tensor | None = None, taken: Tensor | None = None
+    ) -> tuple[Tensor, Tensor] | None:
         """Zeros of the sensors (B, n), fitted with the numbers and states of a model, and standard deviations.
 
-        None if there is one recording, the fit fails, the settings exclude zeros or, unless they ask for zeros, the
-        model is at the noise.
+        The fit begins with `start`, or else 0; the zeros `taken` off these readings are added (`differing_zeros`).
+        None if there is one recording, or if the fit fails.
         """
-        wanted = self.config.find_zeros
-        if len(self.data) == 1 or not (wanted or (wanted is None and not trial.at_the_noise)):
+        if len(self.data) == 1:
             return None
         names = trial.problem.parameters.numbers
         problem = trial.problem.of(names, trial.problem.sigma, trial.prior)
-        return differing_zeros(problem, problem.unknowns(trial.theta, trial.path))
+        return differing_zeros(problem, problem.unknowns(trial.theta, trial.path), start, taken)
 
-    def with_zeros(self, best: Trial | None, accepted: bool = False) -> Zeroed:
+    def with_zeros(self, best: Trial | None, *, accepted: bool = False, start: Tensor | None = None) -> Zeroed:
         """The search of the readings less the zeros, and the model there, if the score is better with zeros.
 
-        `accepted`: a part of these recordings has been found to have zeros, and the score does not decide again.
+        Zeros are not asked for if the settings exclude them or, unless they ask for zeros, the model is at the noise.
+        Their fit begins with `start`, or else 0. `accepted`: a part of these recordings has been found to have zeros,
+        and the score does not decide again.
         """
-        differ = best and self.zeros(best)
+        wanted = self.config.find_zeros
+        asked = wanted or (wanted is None and best is not None and not best.at_the_noise)
+        differ = self.zeros(best, start) if best is not None and asked else None
         if best is None or differ is None or not (accepted or bool(clear(*differ).any())):
             return self, best, None
         read = self.of(measured(self.data, differ[0].flatten().tolist()))
-        other, more = read.again(best), (len(self.data) - 1) * self.data.dof
+        other, more = read.again(best), int((differ[1] > 0).sum())
         if other is None or not (accepted or other.fits_better(best, more)):
             return self, best, None
         return read, other, differ
 
-    def zeros_again(self, read: Search, best: Trial, differ: tuple[Tensor, Tensor]) -> Zeroed:
+    def zeros_again(self, read: Search, best: Trial, differ: Zeros) -> tuple[Search, Trial, Zeros]:
         """The zeros fitted again with the model `best`, which was found in `read` with the zeros of another model."""
-        if (more := read.zeros(best)) is not None:
-            zeros = differ[0] + more[0]
-            other = self.of(measured(self.data, zeros.flatten().tolist()))
+        if (zeros := read.zeros(best, taken=differ[0])) is not None:
+            other = self.of(measured(self.data, zeros[0].flatten().tolist()))
             if (found := other.again(best)) is not None:
-                return other, found, (zeros, more[1])
+                return other, found, zeros
         return read, best, differ
 
     def better_hold(self, trial: Trial, holds: Sequence[str], *, by_residuals: bool = False) -> str:

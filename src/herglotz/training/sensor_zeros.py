@@ -1,9 +1,10 @@
 """Zeros of sensors that differ between recordings, y = q + z, or drift, y = q + d t.
 
-A model can follow each of several recordings alone, but not all together, if the zeros z of their sensors differ. The
-recording with the most samples is the reference, with z = 0. The zeros of the others are fitted with the parameters
-and states, starting from 0 (`problems.zeros`), and are kept if the fit is better for its number of parameters
-(`score.fitted_score`). With frozen parameters, `zeros_of_one` fits the zeros of a new recording.
+A model can follow each of several recordings alone, but not all together, if the zeros z of their sensors differ. They
+are fitted with the parameters and states, starting from 0 (`problems.zeros`), and are kept if the fit is better for its
+number of parameters (`score.fitted_score`). Where the model does not tell them apart from a force, they are those
+beside the recording with the most samples, the reference. With frozen parameters, `zeros_of_one` fits the zeros of a
+new recording.
 
 Drifts are fitted in the same way with the whole dictionary, one rate d for each coordinate (`drifts`).
 """
@@ -19,12 +20,11 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.sensors import measured, since_start
 from herglotz.models import ContactLagrangian
-from herglotz.training.arrowhead import dense
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.problems.zeros import WithZeros, reference_of
+from herglotz.training.problems.zeros import WithZeros
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.trajectory_fit import STAGE
 
@@ -34,6 +34,11 @@ DRIFT_FITS = 5
 SIGNIFICANT = 5.0
 # Strides in the parts of a recording whose zeros are fitted: all parts, or every m-th if some cannot be followed.
 STRIDES = (1, 2, 4, 8)
+
+
+def reference_of(data: Trajectories) -> int:
+    """The recording of most samples, the first of several."""
+    return max(range(len(data)), key=lambda b: data.lengths[b])
 
 
 def clear(z: Tensor, deviations: Tensor) -> Tensor:
@@ -60,38 +65,58 @@ def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_st
     theta = problem.parameters.get()
     x = problem.pack(theta, first_states(problem, theta, data))
     found = fitted(WithZeros(problem, shared=True, held=True), x)
-    return None if found is None else tuple(torch.where(clear(*found), found[0], 0.0).tolist())
+    if found is None:
+        return None
+    return tuple(torch.where(clear(found[0], deviations_of(found[1])), found[0], 0.0).tolist())
 
 
-def fitted(target: WithZeros, x: Tensor) -> tuple[Tensor, Tensor] | None:
-    """The zeros (count,), fitted from 0 with all other unknowns starting at x, and their standard deviations.
+def fitted(target: WithZeros, x: Tensor, start: Tensor | None = None) -> tuple[Tensor, Tensor] | None:
+    """The zeros (C,), fitted from `start`, or else 0, with all other unknowns at x, and their covariance (C, C).
 
     None if the fit fails.
     """
-    problem, x = target.problem, torch.cat([x, x.new_zeros(target.count)])
-    result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
+    problem = target.problem
+    result = levenberg_marquardt(target, target.start(x, start), max_iterations=STAGE, rtol=1e-4, patience=3)
     if not math.isfinite(result.cost):
         return None
-    _, A, _ = target.normal_equations(result.x)
-    A = dense(A)
-    assert problem.path is not None
+    covariance = target.normal_equations(result.x)[1].covariance()
+    if covariance is None or problem.path is None:
+        return None
     rms = float(problem.misfit(problem.path)[problem.data.complete].square().mean().sqrt())
-    variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-target.count :] * (rms / problem.sigma) ** 2
-    return result.x[-target.count :], variance.clamp_min(0).sqrt()
+    own = slice(problem.P, problem.P + target.count)
+    return target.zeros_of(result.x), covariance[own, own] * (rms / problem.sigma) ** 2
 
 
-def differing_zeros(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Zeros (B, n) of B recordings, 0 for the reference, and their standard deviations; None if the fit fails.
+def deviations_of(covariance: Tensor) -> Tensor:
+    """Standard deviations, the roots of the diagonal."""
+    return covariance.diagonal().clamp_min(0).sqrt()
 
-    x are the unknowns of the fitted problem without zeros.
+
+def means(data: Trajectories) -> Tensor:
+    """The mean positions (B, n) of each recording, about which a body on a spring moves."""
+    each = zip(data.q.split(data.lengths), data.complete.split(data.lengths), strict=True)
+    return torch.stack([q[there].mean(0).nan_to_num() for q, there in each])
+
+
+def differing_zeros(
+    problem: ShootingProblem, x: Tensor, start: Tensor | None = None, taken: Tensor | None = None
+) -> tuple[Tensor, Tensor] | None:
+    """Zeros (B, n) of B recordings and their standard deviations; None if the fit fails.
+
+    x are the unknowns of the fitted problem without zeros, from which the fit begins with zeros `start`, or else 0. The
+    zeros `taken` off the readings before are added. Where the model does not tell the zero of the reference, zeros are
+    those beside the reference, whose own is 0: a model with a constant force has any.
     """
-    found = fitted(WithZeros(problem), x)
+    found = fitted(WithZeros(problem), x, start)
     if found is None:
         return None
-    rows = [b for b in range(len(problem.data)) if b != reference_of(problem.data)]
-    z, deviations = (x.new_zeros(len(problem.data), problem.n) for _ in range(2))
-    z[rows], deviations[rows] = (y.reshape(-1, problem.n) for y in found)
-    return z, deviations
+    B, n, reference = len(problem.data), problem.n, reference_of(problem.data)
+    z, covariance = found[0].reshape(B, n), found[1].reshape(B, n, B, n)
+    z, deviations = z if taken is None else z + taken, deviations_of(found[1]).reshape(B, n)
+    told = clear(z[reference], deviations[reference])
+    beside = covariance - covariance[reference]
+    beside = deviations_of((beside - beside[:, :, reference, None]).reshape(B * n, B * n)).reshape(B, n)
+    return torch.where(told, z, z - z[reference]), torch.where(told, deviations, beside)
 
 
 def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
@@ -112,9 +137,9 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
         problem = trial.problem.of(trial.problem.parameters.numbers, trial.problem.sigma, trial.prior)
         target = WithZeros(problem, shared=True, grow=t / t.max())
         found = fitted(target, problem.unknowns(trial.theta, trial.path))
-        if found is None or not bool(clear(*found).any()):
+        if found is None or not bool(clear(found[0], deviations_of(found[1])).any()):
             break
-        rates, deviations = rates + found[0] / t.max(), found[1] / t.max()
+        rates, deviations = rates + found[0] / t.max(), deviations_of(found[1]) / t.max()
         trial = search.of(measured(search.data, drifts=rates.tolist())).again(trial)
         if trial is None:
             return None
@@ -124,7 +149,8 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
 
 def in_words(z: Tensor, deviations: Tensor, reference: int) -> str:
     """The zeros and their standard deviations, as a note for the report."""
-    return f"zeros that differ from those of recording {reference}: {sure(z, deviations)}"
+    beside = "" if bool((deviations[reference] > 0).any()) else f" that differ from those of recording {reference}"
+    return f"zeros{beside}: {sure(z, deviations)}"
 
 
 def sure(z: Tensor, deviations: Tensor) -> str:

@@ -38,11 +38,10 @@ from herglotz.training.named_terms import MOVING, by_term, distances, holders, p
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
-from herglotz.training.problems.zeros import reference_of
 from herglotz.training.pruning import prune
 from herglotz.training.questions import Questions
 from herglotz.training.search import Search
-from herglotz.training.sensor_zeros import drifts, in_words, sure
+from herglotz.training.sensor_zeros import drifts, in_words, reference_of, sure
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model

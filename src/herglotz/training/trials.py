@@ -27,8 +27,16 @@ from herglotz.training.errors_of_runs import EXACT_ENOUGH
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.functions import Band, prior_spreads, terms_with
 from herglotz.training.held_out import HeldOut
-from herglotz.training.named_terms import DRY, NamedTerms, candidates, settings_of, started, turns_one_way
-from herglotz.training.offers import ALWAYS, offers_of, without_offers
+from herglotz.training.named_terms import (
+    DRY,
+    NamedTerms,
+    candidates,
+    own_terms,
+    settings_of,
+    started,
+    turns_one_way,
+)
+from herglotz.training.offers import ALWAYS, TILT, offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import Grids, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
@@ -257,6 +265,10 @@ class Fitter:
         self.always, every_offer, self.simple = offers_of(
             self.model, list(self.keys.values()), bands, len(input_terms_of(data.columns))
         )
+        # Forces at rest, for which a zero of the sensor can stand.
+        own = own_terms(data.angles)
+        rest = {key for key, (parameter, _) in own.items() if parameter == TILT}
+        self.constant_forces = rest.union(key for number, key in self.keys.items() if number.startswith(TILT))
         # Positions do not determine the scale of the mass of coordinates that no term joins to the first one. Were it
         # free, a larger mass would stand, to first order, for all forces that leave.
         apart = groups(config.features, data.angles)[1:] if config.features else []

@@ -160,6 +160,11 @@ class Asked:
         differ = self.answer("zeros") if not accepted else self.told["zeros"]
         return (self, best, None) if differ is None else (self.of(self.data), best, differ)
 
+    def with_zeros_of_segments(self):
+        differ = self.told.get("large zeros")
+        found = self.model("linear", 0.2, noise=True)
+        return (self, None, None) if differ is None else (self.of(self.data, "zeroed"), found, differ)
+
     def zeros_again(self, read, best, differ):
         self.seen.append((self.name, "zeros again"))
         return read, best, differ
@@ -250,6 +255,15 @@ def test_terms_are_asked_where_the_whole_dictionary_follows_nothing(asked):
     found, seen = asked(**{"hard": True, "hold of cos(q1)": "smooth"})
     assert found.hold == "smooth"
     assert [name for name, question in seen if question == "run"] == ["whole", "whole'"]
+
+
+def test_zeros_that_short_segments_show_are_those_of_the_search(asked):
+    # fails if the terms are searched in the readings as they are, or zeros of the found model are not fitted again
+    zeros = torch.tensor([[0.5], [-0.7]]), torch.tensor([[0.01], [0.01]])
+    found, seen = asked(**{"large zeros": zeros})
+    assert found.zeros == pytest.approx((0.5, -0.7))
+    assert [name for name, question in seen if question == "run"] == ["zeroed"]
+    assert ("whole", "zeros again") in seen
 
 
 def test_no_zeros_are_asked_of_the_dictionary_where_terms_are_at_the_noise(asked):

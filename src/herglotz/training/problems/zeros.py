@@ -1,26 +1,25 @@
-"""Zeros of sensors as unknowns of a fit: y = q + z, with z = 0 in the reference, the recording of most samples."""
+"""Zeros of sensors as unknowns of a fit: y = q + z."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
-from herglotz.training.arrowhead import dense
+from herglotz.training.arrowhead import Arrowhead
 from herglotz.training.problems.shooting import ShootingProblem
 
-
-def reference_of(data: Trajectories) -> int:
-    """The recording of most samples, the first of several."""
-    return max(range(len(data)), key=lambda b: data.lengths[b])
+# Standard deviation of the prior of a zero, over the balance of its coordinate. A zero that positions do not determine
+# stays 0.
+PRIOR = 10.0
 
 
 class WithZeros:
-    """A shooting problem with zeros of sensors as further unknowns: (unknowns of the problem, then (B − 1) · n).
+    """A shooting problem with zeros of sensors as further unknowns: parameters (P,), zeros (Z · n,), then states.
 
-    Each recording but the reference has zeros of its own. Zeros that are `shared` are n numbers, the same in all
-    recordings. With `held` parameters only zeros and states are fitted. With `grow`, (N,), each sample has so many
-    times its zero.
+    Each recording has zeros of its own, Z = B. Zeros that are `shared` are n numbers, the same in all recordings. With
+    `held` parameters only zeros and states are fitted. With `grow`, (N,), each sample has so many times its zero.
     """
 
     def __init__(
@@ -31,66 +30,84 @@ class WithZeros:
         held: bool = False,
         grow: Tensor | None = None,
     ):
-        data, reference = problem.data, reference_of(problem.data)
-        b = torch.arange(len(data), device=data.t.device)
-        others = torch.where(b < reference, b, b - 1).where(b != reference, -1)
-        own = torch.zeros_like(b) if shared else others
-        self.problem, self.which, self.held = problem, own[data.trajectory], held
-        self.count, self.grow = (int(own.max()) + 1) * problem.n, torch.ones_like(data.t) if grow is None else grow
+        data = problem.data
+        self.which = torch.zeros_like(data.trajectory) if shared else data.trajectory
+        self.problem, self.held = problem, held
+        self.count, self.grow = (
+            (1 if shared else len(data)) * problem.n,
+            torch.ones_like(data.t) if grow is None else grow,
+        )
+        self.deviations = (PRIOR * data.balance).repeat(self.count // problem.n)
 
     @property
     def at_once(self) -> bool:
         """As the problem."""
         return self.problem.at_once
 
-    def cost(self, x: Tensor) -> Tensor:
-        """½|r|² with q + z − y as the residuals of the data."""
-        return self.problem.cost(self._set(x))
+    def start(self, x: Tensor, zeros: Tensor | None = None) -> Tensor:
+        """The unknowns x of the problem with these zeros (Z, n), else 0; positions are readings less the zeros."""
+        problem, x = self.problem, x.clone()
+        zeros = x.new_zeros(self.count // problem.n, problem.n) if zeros is None else zeros
+        of = self.which[problem.grid.start_sample]
+        x[problem.P :].unflatten(0, (-1, problem.d))[:, : problem.n] -= zeros[of]
+        return torch.cat([x[: problem.P], zeros.flatten(), x[problem.P :]])
 
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def zeros_of(self, x: Tensor) -> Tensor:
+        """The zeros (Z · n,) among the unknowns."""
+        return x[self.problem.P : self.problem.P + self.count]
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½|r|² with q + z − y as the residuals of the data, and the prior of the zeros."""
+        return self.problem.cost(self._set(x)) + (self.zeros_of(x) / self.deviations).square().sum() / 2
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Arrowhead, Tensor]:
         """(cost, JᵀJ, Jᵀr) of all unknowns."""
-        rows = x.new_zeros(*self.problem.data.q.shape, self.problem.P + self.problem.d)
-        cost, A, b = self.problem.normal_equations(self._set(x), rows=rows)
-        if not bool(torch.isfinite(cost)):
-            return cost, x.new_zeros(len(x), len(x)), torch.zeros_like(x)
-        A = dense(A)
-        columns, diagonal, slope = self._by_zeros(rows)
-        C = columns.flatten(1)
-        A = torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)])
-        b = torch.cat([b, slope.flatten()])
+        problem, P = self.problem, self.problem.P
+        rows = x.new_zeros(*problem.data.q.shape, P + problem.d)
+        cost, A, b = problem.normal_equations(self._set(x), rows=rows)
+        zeros = self.zeros_of(x) / self.deviations
+        finite = bool(torch.isfinite(cost))
+        by_theta, border, diagonal, slope = self._by_zeros(rows) if finite else self._nothing(A)
+        diagonal, slope = diagonal + self.deviations**-2, slope + zeros / self.deviations
         if self.held:
-            own = slice(self.problem.P)
-            A[own], A[:, own], b[own] = 0.0, 0.0, 0.0
-            A[own, own].diagonal().fill_(1.0)
-        return cost, A, b
+            A.corner.copy_(torch.eye(P, dtype=x.dtype, device=x.device))
+            A.border.zero_()
+            by_theta, b[:P] = torch.zeros_like(by_theta), 0.0
+        corner = torch.cat([torch.cat([A.corner, by_theta], 1), torch.cat([by_theta.T, diagonal.diag()], 1)])
+        whole = replace(A, corner=corner, border=torch.cat([A.border, border], -1))
+        return cost + zeros.square().sum() / 2, whole, torch.cat([b[:P], slope, b[P:]])
 
     def _set(self, x: Tensor) -> Tensor:
         """The problem's own unknowns, its zeros being those of x."""
-        z = torch.cat([x[-self.count :].reshape(-1, self.problem.n), x.new_zeros(1, self.problem.n)])
-        self.problem.zeros = self.grow[:, None] * z[self.which]
-        return x[: -self.count]
+        problem = self.problem
+        problem.zeros = self.grow[:, None] * self.zeros_of(x).reshape(-1, problem.n)[self.which]
+        return torch.cat([x[: problem.P], x[problem.P + self.count :]])
 
-    def _by_zeros(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The parts of (JᵀJ, Jᵀr) that belong to the zeros: columns (unknowns, Z, n), diagonal and gradient (Z, n).
+    def _nothing(self, A: Arrowhead) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The parts of `_by_zeros` where a step fails: 0."""
+        zero, (S, d) = A.corner.new_zeros, A.border.shape[:2]
+        return zero(len(A.corner), self.count), zero(S, d, self.count), zero(self.count), zero(self.count)
 
-        They hold where the normal equations of all other unknowns were made last, with these `rows` (N, n, P + d) of J.
+    def _by_zeros(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The parts of (JᵀJ, Jᵀr) that belong to the zeros, of which there are C = Z · n.
+
+        These are the columns by parameters (P, C) and by states (S, d, C), the diagonal and the gradient (C,). They
+        hold where the normal equations of all other unknowns were made last, with these `rows` (N, n, P + d) of J.
         """
-        problem, which, grow = self.problem, self.which, self.grow[:, None]
+        problem, grow = self.problem, self.grow[:, None]
         assert problem.path is not None
-        count, segments = self.count // problem.n, problem.grid.segments
+        P, n, S, d = problem.P, problem.n, problem.grid.segments, problem.d
         fit = problem._missed_by(problem.path.x)
-        by = problem.weight * problem.root_weights(fit) / problem.deviations  # (N, n) ∂r/∂q
-        rows = rows * (by * grow)[..., None]
+        # ∂r/∂q, (N, n)
+        by = problem.weight * problem.root_weights(fit) / problem.deviations
+        rows = (rows * (by * grow)[..., None]).mT  # (N, P + d, n)
+        by_theta = rows.new_zeros(self.count // n, P, n).index_add(0, self.which, rows[:, :P])
         # Samples of a segment have the same zero.
-        of = torch.full((segments,), -1, device=which.device)
-        of[problem.grid.segment] = which
-        own = rows.new_zeros(segments, *rows.shape[:0:-1]).index_add(0, problem.grid.segment, rows.mT)
-        columns = rows.new_zeros(problem.P + segments * problem.d, count, problem.n)
-        for z in range(count):
-            columns[: problem.P, z] = own[of == z, : problem.P].sum(0)
-            columns[problem.P :, z] = torch.where((of == z)[:, None, None], own[:, problem.P :], 0.0).flatten(0, 1)
-        kept = which >= 0
-        zero = rows.new_zeros(count, problem.n)
-        diagonal = zero.index_add(0, which[kept], (by * grow)[kept].square())
-        slope = by * problem.root_weights(fit) * fit * grow
-        return columns, diagonal, zero.index_add(0, which[kept], slope[kept])
+        border = rows.new_zeros(S, d, self.count // n, n)
+        own = rows.new_zeros(S, d, n).index_add(0, problem.grid.segment, rows[:, P:])
+        border[torch.arange(S), :, self.which[problem.grid.start_sample]] = own
+        sums = rows.new_zeros(2, self.count // n, n)
+        sums[0].index_add_(0, self.which, (by * grow).square())
+        sums[1].index_add_(0, self.which, by * problem.root_weights(fit) * fit * grow)
+        diagonal, slope = sums.flatten(1)
+        return by_theta.transpose(0, 1).flatten(1), border.flatten(2), diagonal, slope
