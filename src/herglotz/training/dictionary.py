@@ -22,6 +22,8 @@ from herglotz.training.waves import BRAKES, waves_of
 
 # Highest power of a length in the potential of one coordinate: forces up to x⁵.
 HIGHEST = 6
+# Potentials of the weight of a body that turns, where its angle is taken for a position on a line.
+WEIGHTS = ("cos(q1)", "sin(q1)")
 # Highest harmonic of one angle.
 WAVES = 3
 COEFFICIENTS = re.compile(r"(potential\.features\.sum|kinetic\.sum|drag|action)\.coefficient(?:\[(\d+)\])?")
@@ -77,7 +79,7 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
     if len(angles) == 1:
         if angles[0]:
             return tuple(f"{f}({'' if k == 1 else k}q1)" for k in range(1, WAVES + 1) for f in ("cos", "sin"))
-        return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", "|q1| q1", "|q1|^3")
+        return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", "|q1| q1", "|q1|^3", *WEIGHTS)
     if any(angles):
         still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
         return (*revolute(angles), *still, *slides(angles), *spherical(angles))

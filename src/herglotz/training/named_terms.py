@@ -15,7 +15,7 @@ from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.models.translations import differences, directions, unchanged
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.dictionary import HIGHEST, WAVES, drag_of, features_of
+from herglotz.training.dictionary import HIGHEST, WAVES, WEIGHTS, drag_of, features_of
 from herglotz.training.parameter_vector import ParameterVector
 
 # Minimum ratio of the smaller to the larger excursion from 0. Below it the data say nothing about a kink at 0.
@@ -80,8 +80,8 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
 
 
 def special(data: Trajectories) -> tuple[str, ...]:
-    """Powers of the distance, and kinks at 0: terms that are nearly collinear with the others."""
-    return (*distances(data), *kinks(data))
+    """Powers of the distance, kinks at 0 and weights: terms that are nearly collinear with the others."""
+    return (*distances(data), *kinks(data), *weights(data))
 
 
 def _of_one(data: Trajectories) -> list[str]:
@@ -128,6 +128,14 @@ def kinks(data: Trajectories) -> tuple[str, ...]:
     away, beyond = sorted((abs(float(data.q.min())), abs(float(data.q.max()))))
     crossed = float(data.q.min()) < 0 < float(data.q.max()) and away > MIN_EXCURSION_RATIO * beyond
     return ("|q1| q1", "|q1|^3") if data.dof == 1 and not any(data.angles) and crossed else ()
+
+
+def weights(data: Trajectories) -> tuple[str, ...]:
+    """Potentials of the weight of a body that turns about a pivot, if one angle is taken for a position on a line.
+
+    Of a pendulum with a torsion spring the potential has a square beside the cosine.
+    """
+    return WEIGHTS if data.angles == (False,) and data.units == ("rad",) else ()
 
 
 def central(data: Trajectories, every: NamedTerms) -> list[NamedTerms]:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 
 from herglotz.models import ContactLagrangian
+from herglotz.training.dictionary import WEIGHTS
 from herglotz.training.functions import Band
 from herglotz.training.named_terms import own_terms
 from herglotz.training.parameter_vector import ParameterVector
@@ -71,7 +72,7 @@ def offers_of(
             always.append(number)
         elif stem not in no_offers:
             found.append(_offer(number, key, stem, numbers))
-            if (stem in SIMPLE and number not in of_terms) or key in springs:
+            if (stem in SIMPLE and number not in of_terms) or key in springs or key == WEIGHTS[0]:
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
     found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]

@@ -19,6 +19,7 @@ from herglotz.data.input_terms import saturation
 from herglotz.data.sensors import measured
 from herglotz.models.drag import input_columns
 from herglotz.training.acting_inputs import asked_terms, sharpened, taken_terms
+from herglotz.training.dictionary import WEIGHTS
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
 from herglotz.training.trials import Trial, Variant
@@ -183,9 +184,11 @@ def _asked(read: Search, best: Trial) -> tuple[tuple[str, ...], Search, Trial] |
 
 def _may_be_better(line: Search, trial: Trial) -> bool:
     """True if a search on a line is worth its time beside a model of angles."""
-    turning = trial.taken.difference(offer.name for offer in line.fitter(Variant(line.order)).offers)
-    # No model on a line is simpler than one with a single term for each coordinate.
-    if trial.lacks_nothing and (len(turning) <= line.data.dof or not line.meets_segments):
+    straight = {offer.name for offer in line.fitter(Variant(line.order)).offers}.difference(WEIGHTS)
+    turning = trial.taken - straight
+    # No model on a line is simpler than one with a single term for each coordinate. Of several coordinates these terms,
+    # stiffness, have the same names for angles.
+    if trial.lacks_nothing and (len(turning) <= (line.data.dof == 1) or not line.meets_segments):
         return False
     # The first model on a line must be no worse.
     return not trial.whole or (line.first is not None and not trial.replaces(line.first))
