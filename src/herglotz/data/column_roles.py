@@ -7,17 +7,20 @@ from collections.abc import Collection
 from typing import NamedTuple
 from unicodedata import combining, normalize
 
-ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|Grad|degrés|grados|gradi|gon|rev|turns?")
+ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|Grad|degrés|grados|gradi|gon|revs?|turns?|arcmin|arcsec")
 # Kinds of units, in the order of trial. With other units, such as counts or 1, the name decides the role.
 KINDS = {
-    "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
+    "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch(es)?|ft|feet|mils?|thou|px|pixels?"),
     "time": re.compile(r"s|ms|us|µs|μs|ns|min|h|secs?|seconds?|msec|usec"),
-    "effort": re.compile(r"[kmMµμ]?N([ *·.⋅]?[cm]?m)?|lbf|kgf"),
+    "effort": re.compile(
+        r"[kmMµμ]?N([ *·.⋅-]?[cm]?m)?|kgf|lbs?|(lbf?|ozf?)([ *·.⋅-]?(ft|in))?|(ft|in)[ *·.⋅-]?(lbf?|ozf?)"
+    ),
     "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|volts?|amps?|%|percent"),
+    "field": re.compile(r"[mµμun]?(Wb|T)|V[ *·⋅]s|[mµμun]?H|[mµμunp]F"),
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi|s?lpm|gpm|(m?[lL]|m3|m³)/ ?(s|min|h)"),
     "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
     "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|(.+[ ·*])?(s|min)(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
-    "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
+    "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|VA|m?[AW]h|bool"),
 }
 NUMBERED = r"(_?\d+|_.*)?"
 # Names that have a role whatever their words, unless the unit is of another kind.
@@ -231,8 +234,8 @@ def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
         read = words & WORDS["reading"] and not words & (WORDS["effort"] | WORDS["attribute"])
         read = read or re.fullmatch(SYMBOL + r"_?\d*", key)
         return Guess("dropped", READING) if kind == "electric" and read else Guess("input")
-    if kind == "pressure":
-        return Guess("dropped", "it may be an input")
+    if kind in ("pressure", "field"):
+        return Guess("dropped", READING if kind == "field" else "it may be an input")
     return Guess("rate" if kind in ("rate", "acceleration") else "dropped")
 
 

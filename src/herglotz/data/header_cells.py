@@ -120,8 +120,9 @@ def _may_have(name: str, unit: str) -> bool:
     timed = _is_timed(name)
     length = part == "position" and not ANGLES.fullmatch(base)
     letter = len(unit) == 1 and unit.isalpha() and not AMBIGUOUS.fullmatch(unit)
-    # x_in is the input beside x_out.
-    if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or base == "in":
+    # x_in is the input beside x_out, x_lb the lower bound, and left_feet are feet.
+    word = base in ("in", "feet", "lb")
+    if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or word:
         return False
     return role_of(name, unit).role not in ("action", "momentum", "counter")
 
