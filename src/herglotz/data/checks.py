@@ -236,14 +236,15 @@ def number(text: str, where: str) -> float:
     return value
 
 
-def numbers_runs(column: np.ndarray, anew: np.ndarray) -> bool:
+def numbers_runs(column: np.ndarray, anew: np.ndarray, again: bool = False) -> bool:
     """Whether a column (N,) has a value of its own in each run of rows, most of which have three rows or more.
 
-    `anew` (N - 1,) bool: a run begins at the next row, because time falls there.
+    `anew` (N - 1,) bool: a run begins at the next row, because time falls there. A value may come `again` in a run
+    that is not the next one.
     """
     runs = np.diff(np.flatnonzero(anew), prepend=-1, append=len(anew))
     constant = bool(((column[1:] != column[:-1]) == anew).all())
-    return constant and len(np.unique(column)) == len(runs) and float(np.median(runs)) >= MIN_SAMPLES
+    return constant and (again or len(np.unique(column)) == len(runs)) and float(np.median(runs)) >= MIN_SAMPLES
 
 
 def out_of_order(values: np.ndarray, anew: np.ndarray, names: Sequence[str]) -> str:

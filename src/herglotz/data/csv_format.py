@@ -25,7 +25,7 @@ from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, i
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.header_cells import name_and_unit
 from herglotz.data.sensors import calibrated
-from herglotz.data.table import from_table, group_by_values, grouped_by_guess, in_dates, moment, with_units
+from herglotz.data.table import Sheet, from_sheet, in_dates, is_text_cell, moment, with_units
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 
@@ -190,10 +190,11 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time.
     Times may be dates in ISO 8601, which become seconds since the first row. `trajectory`, `trial`, `run`,
     `experiment`, `Versuch`, `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a
-    warning, a column that changes wherever time starts anew, and nowhere else, does. `s` is the action, `p`/`p_*` are
-    momenta. Of other columns the unit decides before the name
-    (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions; N, Nm, A, V, % inputs; m/s, rad/s, rpm rates;
-    rates are left aside, and so are °C, Pa, W. A set value of a motion is an input in any unit: goal, target, set
+    warning, a column that changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or
+    text. Beside it text, and numbers without a unit and a usual name, that are the same in every row are left aside.
+    `s` is the action, `p`/`p_*` are momenta. Of other columns the unit decides before the name
+    (`herglotz.data.column_roles`): rad, deg, m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs; m/s, rad/s, rpm
+    rates; rates are left aside, and so are °C, Pa, W, and, unless no other column is a coordinate, Wb, T, H and F. A set value of a motion is an input in any unit: goal, target, set
     point, desired, reference, command, soll; so is what shakes a mechanism: road, ground, excitation, Erregung. Without
     a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`,
     `qd1` rates; errors, temperatures, batteries, counters (`index`, `frame`, a first column without a name) and
@@ -215,22 +216,31 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     """
     path = Path(path)
     lines = read_lines(path)
-    columns, rows, notes = _header(path, lines, wanted)
-    _check_kinds(path, columns, rows)
+    heads, where, rows, notes = _header(path, lines, wanted)
     comments = [line for line in lines if line.lstrip().startswith("#")]
-    values = _plain_numbers(columns, rows)
-    values = _parse_rows(path, columns, rows) if values is None else values
-    if group := group_by_values(columns, wanted, values, lambda i: [cells_of(line)[i] for _, line in rows]):
-        return grouped_by_guess(read_csv(path, replace(wanted, group=group)), group)
-    labels, at = _labels(path, columns, rows), [i for i, _ in rows]
-    found = from_table(path, columns, at, labels, values, lambda found: _with_settings(found, comments))
-    if rows and not is_number(cells_of(rows[0][1])[columns.time]):
+
+    def cells(i: int) -> list[str]:
+        return ["".join(cells_of(line)[i : i + 1]) for _, line in rows]
+
+    def is_text(i: int) -> bool:
+        two = [own for own in (cells_of(line) for _, line in rows[:2]) if len(own) == len(heads)]
+        return len(two) == 2 and all(is_text_cell(own[i]) for own in two)
+
+    def numbers(columns: Columns) -> np.ndarray:
+        _check_clock(path, columns, rows, is_text)
+        values = _plain_numbers(columns, rows)
+        values = _parse_rows(path, columns, rows) if values is None else values
+        return np.asarray(values, dtype=np.float64).reshape(len(rows), len(columns.numeric))
+
+    sheet = Sheet(path, where, heads, [i for i, _ in rows], cells, is_text, numbers)
+    found = from_sheet(sheet, wanted, lambda found: _with_settings(found, comments))
+    if rows and not is_number(cells(assign(heads, where, wanted).time)[0]):
         found = in_dates(found)
     return replace(found, notes=(*notes, *found.notes))
 
 
-def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[Columns, Rows, tuple[str, ...]]:
-    """The columns of a table, its rows below the header and a row of units, and notes on its text."""
+def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[list[str], str, Rows, tuple[str, ...]]:
+    """The header of a table, its place, the rows below the header and a row of units, and notes on its text."""
     rows, notes = in_commas(path, lines)
     if not rows:
         raise InputError(f"{path}: there is no header; add a first line such as t[s],q[rad]")
@@ -240,7 +250,7 @@ def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[Columns, 
     refuse({f"{where}: {quote(header)} is no header; delete the lines above the table, or begin them with #": is_title})
     if len(rows) > 1 and (named := with_units(cells, cells_of(rows[1][1]), where, wanted)):
         cells, notes = named, (*notes, f"units stand in row {rows.pop(1)[0]}")
-    return assign(cells, where, wanted), rows[1:], notes
+    return cells, where, rows[1:], notes
 
 
 def _plain_numbers(columns: Columns, rows: Rows) -> np.ndarray | None:
@@ -268,17 +278,6 @@ def _with_nan(line: str) -> str:
     return line
 
 
-def _labels(path: Path, columns: Columns, rows: Rows) -> list[str]:
-    """The label of the trajectory of each row; raise if some rows have a label and others have not."""
-    if columns.trajectory is None:
-        return [""] * len(rows)
-    labels = [cells_of(line)[columns.trajectory] for _, line in rows]
-    if any(labels) and not all(labels):
-        where = f"{path}, row {rows[labels.index('')][0]}, column 'trajectory'"
-        raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
-    return labels
-
-
 def _parse_rows(path: Path, columns: Columns, rows: Rows) -> list[list[float]]:
     """The numbers of every row, cell by cell: dates become seconds, and an error names row and column."""
     width, values = len(columns.names), []
@@ -300,20 +299,12 @@ def _parse_rows(path: Path, columns: Columns, rows: Rows) -> list[list[float]]:
     return values
 
 
-def _check_kinds(path: Path, columns: Columns, rows: Rows) -> None:
-    """Raise if a column of text would be read as numbers: neither of its first two cells is a number."""
-    two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
-    for i in columns.numeric if len(two) == 2 else ():
-        name, pair = columns.names[i], [cells[i] for cells in two]
-        remedy = (
-            f"write numbers, leave the column out with --drop {name} (drop= in Python), or group the rows by it with "
-            f"--group {name} (group= in Python)"
-        )
-        is_date = i == columns.time and any(map(moment, pair))
-        if i == columns.time:
-            remedy = "write numbers, or dates such as 2026-03-01 12:00:00.25"
-        if not is_date and not any(is_number(x) or x.casefold() in MISSING for x in pair):
-            raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(pair[0])} is not a number; {remedy}")
+def _check_clock(path: Path, columns: Columns, rows: Rows, is_text: Callable[[int], bool]) -> None:
+    """Raise if times are text, but no dates."""
+    if is_text(columns.time) and not any(moment(cells_of(line)[columns.time]) for _, line in rows[:2]):
+        where = f"{path}, row {rows[0][0]}, column '{columns.names[columns.time]}'"
+        wrong = quote(cells_of(rows[0][1])[columns.time])
+        raise InputError(f"{where}: {wrong} is not a number; write numbers, or dates such as 2026-03-01 12:00:00.25")
 
 
 def _since(first: datetime, date: datetime, where: str) -> float:

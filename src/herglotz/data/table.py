@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, time
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,8 +13,9 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from herglotz.data.checks import EXACT, MIN_SAMPLES, Unusable, numbers_runs, out_of_order, quote
-from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
+from herglotz.data.checks import EXACT, MIN_SAMPLES, MISSING, Unusable, numbers_runs, out_of_order, quote
+from herglotz.data.column_roles import is_usual, kind_of
+from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, as_names, assign, is_number, same_everywhere
 from herglotz.data.gaps import with_missing
 from herglotz.data.header_cells import name_and_unit
 from herglotz.data.rates import Recording, completed, in_order, without_repeats
@@ -59,41 +61,129 @@ def from_table(
     return _with_missing(found, columns, recordings)
 
 
-def group_by_values(
-    columns: Columns,
-    wanted: Wanted,
-    values: Any,  # (N, columns.numeric), as in `from_table`
-    labels_of: Callable[[int], list[str]],
-) -> str:
-    """The column that numbers the recordings by its values, where no name says so and time starts anew; "" for none.
+@dataclass(frozen=True)
+class Sheet:
+    """A header and the rows below it, as a file or a DataFrame holds them.
 
-    The column has a value of its own between two falls of the time. The user's columns keep their role, and so do
-    inputs: a constant input is one. Rows of stacked tables, which are sorted by time, are one recording.
+    `where` names the header in messages. Of a column, by its number, `cells` are the cells as text, and `is_text` says
+    whether they are no numbers. `numbers` are the numeric columns, (N, columns.numeric), NaN for a missing value.
     """
-    values = np.asarray(values, dtype=np.float64).reshape(-1, len(columns.numeric))
+
+    path: Path
+    where: str
+    heads: Sequence[str]
+    at: Sequence[int]  # (N,) number of each row, for messages
+    cells: Callable[[int], list[str]]
+    is_text: Callable[[int], bool]
+    numbers: Callable[[Columns], np.ndarray]
+
+    def is_constant(self, i: int) -> bool:
+        """Whether a column has the same cell in every row."""
+        return len(set(self.cells(i))) == 1
+
+
+def from_sheet(
+    sheet: Sheet, wanted: Wanted, with_settings: Callable[[Trajectories], Trajectories] = lambda found: found
+) -> Trajectories:
+    """The recordings of a sheet; see `from_table`.
+
+    Where no name says so and time starts anew, a column groups the rows by its values (`_group_by_values`), with a
+    warning. Beside a column that groups the rows, one that is the same in every row says nothing: text and unusual
+    names without a unit are left aside, and a note says so. Raise InputError for any other column of text, and as
+    `herglotz.data.csv_columns.assign` and `from_table`.
+    """
+    columns = assign(sheet.heads, sheet.where, wanted, sheet.is_constant)
+    wanted = wanted.by_name(sheet.heads, columns.names)
+    texts = [i for i in columns.numeric if i != columns.time and sheet.is_text(i)]
+    bare = columns.without(texts)
+    _refuse_text(sheet, columns, [i for i in texts if not (bare.q and _is_free(columns, wanted, i))])
+    values = sheet.numbers(bare)
+    group, notes = columns.trajectory, []
+    if group is None and (group := _group_by_values(sheet, bare, wanted, values)) is not None:
+        kind = "name" if sheet.is_text(group) else "number"
+        notes = [
+            f"warning: {columns.names[group]} is taken for the {kind} of the recording, but by its values alone: it "
+            "changes wherever time starts anew, and nowhere else; if another column numbers the recordings, give "
+            "--group NAME (group= in Python)"
+        ]
+    aside = [] if group is None else _same_everywhere(sheet, bare, wanted, values, texts)
+    _refuse_text(sheet, columns, [i for i in texts if i not in (group, *aside)])
+    if group is None:
+        return from_table(sheet.path, columns, sheet.at, [""] * len(values), values, with_settings)
+    if aside or notes:
+        names = [columns.names[i] for i in aside]
+        chosen = replace(wanted, drop=(*as_names(wanted.drop), *names), group=columns.names[group])
+        columns = assign(sheet.heads, sheet.where, chosen)
+        values = values[:, [bare.numeric.index(i) for i in columns.numeric]]
+        notes += [same_everywhere(names)] if names else []
+    found = from_table(sheet.path, columns, sheet.at, _labels(sheet, columns, values), values, with_settings)
+    return replace(found, notes=(*found.notes, *notes))
+
+
+def _is_free(columns: Columns, wanted: Wanted, i: int) -> bool:
+    """Whether a column may group the rows: it is no position by its unit, and nobody has given it another role."""
+    name, fixed = columns.names[i], i in (columns.time, columns.s, *columns.p)
+    told = wanted.role(name) is not None or wanted.before(name) not in (None, "dropped")
+    return not (fixed or told or kind_of(columns.units[i]) == "position")
+
+
+def _refuse_text(sheet: Sheet, columns: Columns, texts: Sequence[int]) -> None:
+    """Raise if there is a column of text that would be read as numbers."""
+    for i in texts:
+        name, where = columns.names[i], f"{sheet.path}, row {sheet.at[0]}"
+        raise InputError(
+            f"{where}, column '{name}': {quote(sheet.cells(i)[0])} is not a number; write numbers, leave the column "
+            f"out with --drop {name} (drop= in Python), or group the rows by it with --group {name} (group= in Python)"
+        )
+
+
+def _group_by_values(sheet: Sheet, columns: Columns, wanted: Wanted, values: np.ndarray) -> int | None:
+    """The column whose values change wherever time starts anew, and nowhere else; None for no column.
+
+    Numbers differ from recording to recording, texts may come again. A position groups no rows, and neither does an
+    input: a constant input is one. Rows of stacked tables, which are sorted by time, are one recording.
+    """
     anew = np.diff(values[:, 0]) < 0
-    if columns.trajectory is not None or not anew.any():
-        return ""
+    if not anew.any():
+        return None
     if not (np.diff(in_order(Recording("", np.arange(len(values)), values)).values[:, 0]) < 0).any():
-        return ""
-    given = {columns.time, columns.s, *columns.p, *columns.u}
-    free = [
-        i for i, name in enumerate(columns.names)
-        if i not in given and wanted.role(name) is None and wanted.before(name) in (None, "dropped")
-    ]  # fmt: skip
+        return None
+    free = [i for i in range(len(columns.names)) if i not in columns.u and _is_free(columns, wanted, i)]
     for i in sorted(free, key=lambda i: i not in columns.q):
-        if numbers_runs(np.array(labels_of(i)), anew):
-            return columns.names[i]
-    return ""
+        if (columns.q != (i,)) and numbers_runs(np.array(sheet.cells(i)), anew, again=sheet.is_text(i)):
+            return i
+    return None
 
 
-def grouped_by_guess(found: Trajectories, group: str) -> Trajectories:
-    """The set with a warning that a column was taken for the number of the recording by its values."""
-    note = (
-        f"warning: {group} is taken for the number of the recording, but by its values alone: it changes wherever time "
-        "starts anew, and nowhere else; if another column numbers the recordings, give --group NAME (group= in Python)"
-    )
-    return replace(found, notes=(*found.notes, note))
+def _same_everywhere(
+    sheet: Sheet, columns: Columns, wanted: Wanted, values: np.ndarray, texts: Sequence[int]
+) -> list[int]:
+    """Columns of text, and coordinates without a unit and a usual name, that are the same in every row."""
+    still = [columns.numeric[k] for k in np.flatnonzero((values == values[:1]).all(0))]
+    unusual = [i for i in columns.q if i in still and not is_usual(columns.names[i], columns.units[i])]
+    free = [i for i in unusual if _is_free(columns, wanted, i)]
+    return [*filter(sheet.is_constant, texts), *(free if len(free) < len(columns.q) else [])]
+
+
+def _labels(sheet: Sheet, columns: Columns, values: np.ndarray) -> list[str]:
+    """The label of each row's recording, with a number if an earlier recording has the same: up, down, up (2).
+
+    Raise if some rows have a label and others have not.
+    """
+    assert columns.trajectory is not None
+    labels = sheet.cells(columns.trajectory)
+    if any(labels) and not all(labels):
+        where = f"{sheet.path}, row {sheet.at[labels.index('')]}, column 'trajectory'"
+        raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
+    anew = np.diff(values[:, 0]) < 0
+    if not len(labels) or not numbers_runs(np.array(labels), anew, again=True):
+        return labels
+    found: list[str] = []
+    seen: Counter[str] = Counter()
+    for label, begins in zip(labels, [True, *anew.tolist()], strict=True):
+        seen[label] += begins
+        found.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
+    return found
 
 
 def _with_missing(found: Trajectories, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
@@ -241,18 +331,30 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     frame = _with_index(frame)
     raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
     heads, first = _heads(frame, raw, where, wanted)
-    columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
-    times = raw[columns.time]
-    raw[columns.time] = clock = seconds(times)
-    every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]
-    values = np.stack(every, 1)
-    if group := group_by_values(columns, wanted, values, lambda i: list(map(str, raw[i]))):
-        return grouped_by_guess(from_frame(frame, replace(wanted, group=group), where), group)
-    labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
-    found = from_table(where, columns, range(first, first + len(clock)), labels, values)
-    if clock is times:
+    raw = [column[first:] for column in raw]
+    clock = assign(heads, str(where), wanted).time
+    times, raw[clock] = raw[clock], seconds(raw[clock])
+    rows = range(first, first + len(times))
+
+    def is_text(i: int) -> bool:
+        pair = raw[i][:2].tolist() if raw[i].dtype.kind in "OU" else []
+        return len(pair) == 2 and all(isinstance(x, str) and is_text_cell(x) for x in pair)
+
+    def numbers(columns: Columns) -> np.ndarray:
+        every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]
+        return np.stack(every, 1)
+
+    found = from_sheet(
+        Sheet(where, str(where), heads, rows, lambda i: list(map(str, raw[i])), is_text, numbers), wanted
+    )
+    if raw[clock] is times:
         return found
     return in_dates(found, "" if times.dtype.kind == "m" else "date")
+
+
+def is_text_cell(cell: str) -> bool:
+    """Whether a cell is neither a number nor a word for a missing value."""
+    return not is_number(cell) and cell.casefold() not in MISSING
 
 
 def _heads(frame: Any, raw: Sequence[np.ndarray], where: Path, wanted: Wanted) -> tuple[list[str], int]:
