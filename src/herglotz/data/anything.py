@@ -20,8 +20,8 @@ from herglotz.data.header_cells import name_and_unit
 from herglotz.data.polar import named_by
 from herglotz.data.readers import angles_like, as_meant, finished, load
 from herglotz.data.sensors import calibrated
+from herglotz.data.sheet import from_frame, plain, seconds
 from herglotz.data.simulate import OF_AN_L_D
-from herglotz.data.table import from_frame, plain, seconds
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse, tell
@@ -198,7 +198,7 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
             names["group"] is not None or names["drop"],
     })  # fmt: skip
     n = len(q)
-    clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time))
+    clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time), lambda k: f"sample {k}")
     t = np.arange(n) * float(h) if h is not None else _floats("time", clock)
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
     missing = q.isnan().reshape(n, -1)

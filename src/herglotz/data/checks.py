@@ -215,24 +215,25 @@ def quote(text: str) -> str:
     return repr(text if len(text) <= MAX_QUOTED else text[:MAX_QUOTED] + "…")
 
 
-def number(text: str, where: str) -> float:
+def number(cell: Any, where: str, remedy: str = "correct or delete the row", if_infinite: str = "") -> float:
     """The finite number in a cell.
 
-    Raise InputError, which begins with `where` (file, row and column), if the cell is blank, not a number, NaN,
-    infinite, or an integer that float64 rounds.
+    Raise InputError, which begins with `where` (file, row and column) and ends with the remedy, if the cell is blank,
+    not a number, NaN, infinite, or an integer that float64 rounds.
     """
     try:
-        value = float(text)
-    except ValueError:
+        value = float(cell)
+    except (TypeError, ValueError):
         value = None
+    text = str(cell)
+    shown = quote(text) if isinstance(cell, str) or value is None else text
     # Python reads 1_000 as a number; in a data file the underscore is a mistake.
     if value is None or "_" in text:
-        what = quote(text) if text else "a blank cell"
-        raise InputError(f"{where}: {what} is not a number; correct or delete the row")
+        raise InputError(f"{where}: {shown if text else 'a blank cell'} is not a number; {remedy}")
     if abs(value) >= EXACT and text.strip("+-").isdecimal() and int(text) != value:
-        raise InputError(f"{where}: {quote(text)} is above 2^53 and would be rounded; subtract the first one from all")
+        raise InputError(f"{where}: {shown} is above 2^53 and would be rounded; subtract the first one from all")
     if not math.isfinite(value):
-        raise InputError(f"{where}: {quote(text)} is not finite; correct or delete the row")
+        raise InputError(f"{where}: {shown} is not finite; {if_infinite or remedy}")
     return value
 
 
