@@ -102,8 +102,12 @@ class Guess(NamedTuple):
 def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     """The role of a column by its own name and unit; `others` are the names of all columns: dx is the rate of x."""
     guess = _own_role(name, unit, others)
-    is_copy = guess.role == "q" and _is_copy(name.casefold(), [other.casefold() for other in others])
-    return Guess("dropped", "it may be more than a filtered copy of another column") if is_copy else guess
+    copy = COPY.fullmatch(name.casefold()) if guess.role == "q" else None
+    base = copy and (copy["before"] or copy["behind"])
+    # The other column, or its raw values.
+    if base and {base, f"{base}_raw", f"raw_{base}"}.intersection(other.casefold() for other in others):
+        return Guess("dropped", "it may be more than a filtered copy of another column")
+    return guess
 
 
 def _own_role(name: str, unit: str, others: Collection[str]) -> Guess:
@@ -113,7 +117,9 @@ def _own_role(name: str, unit: str, others: Collection[str]) -> Guess:
     key = name.casefold() if len(name) > 1 else name
     words = words_of(name)
     if whole := _whole(key, kind):
-        return Guess(whole, _letter(key) if kind == "position" else "")
+        # An input in the unit of a position that only its letter u names.
+        letter = kind == "position" and re.fullmatch(r"u_?([xyz]|\d*)", key)
+        return Guess(whole, "it has the unit of a position" if letter else "")
     if words & WORDS["side"]:
         return Guess("dropped")
     if is_goal(words):
@@ -208,11 +214,6 @@ def _whole(key: str, kind: str) -> str:
     return "" if role == "input" and not meant else role
 
 
-def _letter(key: str) -> str:
-    """The doubt about an input in the unit of a position that only its letter u names."""
-    return "it has the unit of a position" if re.fullmatch(r"u_?([xyz]|\d*)", key) else ""
-
-
 def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
     """The role of a column in the unit of a position: a coordinate, unless the name is usual for an excitation."""
     if words and words <= GIVEN:
@@ -255,13 +256,6 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
     if attribute and re.fullmatch(SYMBOL, last):
         return Guess("q", "its name may be that of an input")
     return Guess("input" if attribute or words & WORDS["effort"] else "q")
-
-
-def _is_copy(key: str, others: Collection[str]) -> bool:
-    """Whether a name is that of another column, or of its raw values, and a word for a filter."""
-    match = COPY.fullmatch(key)
-    base = match and (match["before"] or match["behind"])
-    return bool(base) and bool({base, f"{base}_raw", f"raw_{base}"}.intersection(others))
 
 
 def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:

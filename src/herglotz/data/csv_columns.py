@@ -173,23 +173,28 @@ def assign(
     else:
         q = tuple(place[x] for x in as_names(wanted.coordinates))
     q = q or (() if wanted.motion else u[:1])
-    groups, same = roles["trajectory"], []
-    if is_constant is None:
-        groups = groups[:1]
-    elif len(groups) > 1:
-        same = [i for i in groups if is_constant(i)]
-        groups = [i for i in groups if i not in same] or groups
-    both = " and a column ".join(names[i] for i in groups)
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
         f"{where}: no coordinate column, only {every}; {_remedy(names, roles)}": not q,
-        f"{where}: both a column {both}; keep one: --group NAME (group= in Python)": len(groups) > 1,
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
+    groups, same = _varying(where, names, roles["trajectory"], is_constant)
     trajectory, action = (next(iter(own), None) for own in (groups, roles["action"]))
     found = Columns(names, units, clock, q, trajectory, action, p, u, wanted.hold)
-    notes = [same_everywhere([names[i] for i in same])] if same else []
-    return replace(found, notes=(*_warnings(found, guesses, wanted), *notes))
+    return replace(found, notes=(*_warnings(found, guesses, wanted), *same))
+
+
+def _varying(
+    where: str, names: Sequence[str], groups: Sequence[int], is_constant: Callable[[int], bool] | None
+) -> tuple[Sequence[int], list[str]]:
+    """The column that groups the rows, of those with the name of a group, and a note on those that never change."""
+    if is_constant is None or len(groups) < 2:
+        return groups, []
+    same = [i for i in groups if is_constant(i)]
+    varying = [i for i in groups if i not in same] or groups
+    both = " and a column ".join(names[i] for i in varying)
+    refuse({f"{where}: both a column {both}; keep one: --group NAME (group= in Python)": len(varying) > 1})
+    return varying, [same_everywhere([names[i] for i in same])]
 
 
 def same_everywhere(names: Sequence[str]) -> str:

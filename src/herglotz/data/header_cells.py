@@ -54,8 +54,10 @@ def name_and_unit(cell: str) -> tuple[str, str] | None:
     match = CELL.fullmatch(cell)
     if not match or not cell.isprintable():
         return None
-    if (slash := SLASH.fullmatch(cell)) and _is_over(slash[1], slash[2] or slash[3]):
-        return slash[1], slash[2] or slash[3]
+    if slash := SLASH.fullmatch(cell):
+        name, unit = slash[1], slash[2] or slash[3]
+        if kind_of(unit) and _is_timed(name) == (kind_of(unit) == "time"):
+            return name, unit
     if match[2] is not None or match[3] is not None:
         return match[1], (match[2] or match[3]).strip()
     if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
@@ -100,11 +102,6 @@ def _split(text: str) -> tuple[str, str]:
         if _may_have(name, unit):
             return name, unit
     return text, ""
-
-
-def _is_over(name: str, unit: str) -> bool:
-    """Whether a name over this text is a quantity over its unit."""
-    return bool(kind_of(unit)) and _is_timed(name) == (kind_of(unit) == "time")
 
 
 def _is_timed(name: str) -> bool:

@@ -99,42 +99,46 @@ def from_sheet(sheet: Sheet, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     names without a unit are left aside, and a note says so. Raise InputError for any other column of text, and as
     `herglotz.data.csv_columns.assign` and `from_table`.
     """
-    notes: list[str] = []
+    units: list[str] = []
     if named := with_units(sheet.heads, sheet.first, sheet.where, wanted):
-        notes.append(f"units stand in row {sheet.at[0]}")
+        units = [f"units stand in row {sheet.at[0]}"]
         # The rows below.
         column = sheet.column
         sheet = replace(sheet, heads=named, at=sheet.at[1:], column=lambda i: column(i)[1:])
-    wanted = replace(wanted, hold=wanted.hold or sheet.settings.get("hold", ""))
-    columns = assign(sheet.heads, sheet.where, wanted, sheet.is_constant)
-    wanted = wanted.by_name(sheet.heads, columns.names)
-    texts = [i for i in columns.numeric if i != columns.time and sheet.is_text(i)]
-    bare = columns.without(texts)
-    _refuse_text(sheet, columns, [i for i in texts if not (bare.q and _is_free(columns, wanted, i))])
-    values = sheet.numbers(bare)
-    group = columns.trajectory
-    if group is None and (group := _group_by_values(sheet, bare, wanted, values)) is not None:
-        kind = "name" if sheet.is_text(group) else "number"
-        notes.append(
-            f"warning: {columns.names[group]} is taken for the {kind} of the recording, but by its values alone: it "
-            "changes wherever time starts anew, and nowhere else; if another column numbers the recordings, give "
-            "--group NAME (group= in Python)"
-        )
-    aside = [] if group is None else _same_everywhere(sheet, bare, wanted, values, texts)
-    _refuse_text(sheet, columns, [i for i in texts if i not in (group, *aside)])
-    if group is not None and (aside or group != columns.trajectory):
-        names = [columns.names[i] for i in aside]
-        chosen = replace(wanted, drop=(*as_names(wanted.drop), *names), group=columns.names[group])
-        columns = assign(sheet.heads, sheet.where, chosen)
-        values = values[:, [bare.numeric.index(i) for i in columns.numeric]]
-        notes += [same_everywhere(names)] if names else []
+    columns, values, notes = _grouped(sheet, replace(wanted, hold=wanted.hold or sheet.settings.get("hold", "")))
     found = from_table(sheet.path, columns, sheet.at, _labels(sheet, columns, values), values)
-    found = _with_settings(replace(found, notes=(*sheet.notes, *found.notes, *notes)), sheet.settings)
+    found = _with_settings(replace(found, notes=(*sheet.notes, *found.notes, *units, *notes)), sheet.settings)
     times = sheet.column(columns.time)
     if times.dtype.kind in "Mm" or (times.dtype.kind in "OU" and not is_number(str(times[0]))):
         # The table has durations, which have a unit, in the place of dates.
         return in_dates(found, "" if times.dtype.kind == "m" else "date")
     return found
+
+
+def _grouped(sheet: Sheet, wanted: Wanted) -> tuple[Columns, np.ndarray, list[str]]:
+    """The columns with the one that groups the rows, without those that say nothing; their numbers; and notes."""
+    columns = assign(sheet.heads, sheet.where, wanted, sheet.is_constant)
+    wanted = wanted.by_name(sheet.heads, columns.names)
+    texts = [i for i in columns.numeric if i != columns.time and sheet.is_text(i)]
+    bare = columns.without(texts)
+    _refuse_text(sheet, columns, [i for i in texts if not (bare.q and _is_free(columns, wanted, i))])
+    values, notes = sheet.numbers(bare), []
+    group = _group_by_values(sheet, bare, wanted, values) if columns.trajectory is None else columns.trajectory
+    aside = [] if group is None else _same_everywhere(sheet, bare, wanted, values, texts)
+    _refuse_text(sheet, columns, [i for i in texts if i not in (group, *aside)])
+    if group is None or not (aside or group != columns.trajectory):
+        return columns, values, notes
+    if group != columns.trajectory:
+        notes = [
+            f"warning: {columns.names[group]} is taken for the {'name' if sheet.is_text(group) else 'number'} of the "
+            "recording, but by its values alone: it changes wherever time starts anew, and nowhere else; if another "
+            "column numbers the recordings, give --group NAME (group= in Python)"
+        ]
+    names = [columns.names[i] for i in aside]
+    chosen = replace(wanted, drop=(*as_names(wanted.drop), *names), group=columns.names[group])
+    columns = assign(sheet.heads, sheet.where, chosen)
+    values = values[:, [bare.numeric.index(i) for i in columns.numeric]]
+    return columns, values, [*notes, *([same_everywhere(names)] if names else [])]
 
 
 def _is_free(columns: Columns, wanted: Wanted, i: int) -> bool:

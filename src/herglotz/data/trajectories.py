@@ -368,13 +368,10 @@ def made_alike(sets: Sequence[Trajectories]) -> list[Trajectories]:
     if any(one.observed is not None for one in sets):
         sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
     if any(one.hold == "zero" for one in sets):
-        sets = [_of_steps(one) if one.hold else one for one in sets]
+        note = "warning: inputs with hold {} are means of steps, because a recording beside them has hold zero"
+        sets = [
+            replace(one, u=one.inputs_of_steps(), hold="zero", notes=(*one.notes, note.format(one.hold)))
+            if one.hold not in ("", "zero") else one
+            for one in sets
+        ]  # fmt: skip
     return list(sets)
-
-
-def _of_steps(one: Trajectories) -> Trajectories:
-    """The set with inputs that are means of its steps, and a note where they were not."""
-    if one.hold == "zero":
-        return one
-    note = f"warning: inputs with hold {one.hold} are means of steps, because a recording beside them has hold zero"
-    return replace(one, u=one.inputs_of_steps(), hold="zero", notes=(*one.notes, note))
