@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from herglotz.choices import FIGURES
 from herglotz.cli.common import check_output_folder, flag, import_torch
 from herglotz.cli.flags import READING, columns_of
 from herglotz.errors import refuse
 
-# A copy of `plots.style.FORMATS`, so that help does not import matplotlib; a test compares both.
-FORMATS = ("png", "svg", "pdf")
 DESCRIPTION = """\
 Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training and the plan; with
 --animate, animation.gif instead, of data and model moving. Of DATA: its samples. Of a SCENE, and with --theory of a
@@ -31,7 +30,7 @@ FLAGS = (
     flag("--theory", "figures of the generating function, of a run (a scene has no others)", action="store_true"),
     flag("--out", "folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
          type=Path, metavar="FOLDER"),
-    flag("--format", "kind of file (default %(default)s)", choices=FORMATS, default="png"),
+    flag("--format", "kind of file (default %(default)s)", choices=FIGURES, default="png"),
     flag("--animate", "of a run: animation.gif, of its first trajectory", action="store_true"),
     *READING,
 )  # fmt: skip

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
+from herglotz.data.column_roles import name_and_unit
 from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import with_missing
-from herglotz.data.header_cells import name_and_unit
 from herglotz.data.polar import named_by
 from herglotz.data.readers import angles_like, as_meant, finished, load
 from herglotz.data.sensors import calibrated

@@ -13,6 +13,7 @@ from herglotz.data.column_roles import (
     READING,
     ROLES,
     Guess,
+    heads_of,
     is_of_others,
     is_recorded_effort,
     is_set_point,
@@ -22,7 +23,6 @@ from herglotz.data.column_roles import (
     role_of,
     words_of,
 )
-from herglotz.data.header_cells import heads_of
 from herglotz.errors import InputError, refuse
 
 # Fields of `Wanted` that give columns a role, and the role.

@@ -18,10 +18,9 @@ import numpy as np
 import torch
 
 from herglotz.data.checks import MISSING, number, quote
-from herglotz.data.column_roles import is_time, kind_of
+from herglotz.data.column_roles import is_time, kind_of, name_and_unit
 from herglotz.data.csv_columns import HEADER_DECIDES, Wanted, assign, is_number
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.header_cells import name_and_unit
 from herglotz.data.sheet import Sheet, from_sheet
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
@@ -174,7 +173,7 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
 
     **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
     The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
-    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.header_cells` says where the end of
+    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says where the end of
     a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
     of their own below the header. Other lines that start with # and blank lines are skipped, except for these comments:
     `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples, `# delay: 0.004` and `# lag: 0.02`

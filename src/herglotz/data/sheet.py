@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from herglotz.data.checks import EXACT, MISSING, number, numbers_runs, quote
-from herglotz.data.column_roles import is_usual, kind_of
+from herglotz.data.column_roles import is_usual, kind_of, name_and_unit
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, as_names, assign, is_number, same_everywhere
-from herglotz.data.header_cells import name_and_unit
 from herglotz.data.rates import Recording, in_order
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import from_table

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from herglotz.data import load
+from herglotz.data.column_roles import heads_of
 from herglotz.data.csv_columns import assign
-from herglotz.data.header_cells import heads_of
 
 # Cells, and name, unit and role of each.
 UNITS = {
