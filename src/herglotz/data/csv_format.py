@@ -37,7 +37,7 @@ THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
 THOUSANDS_OR_DECIMALS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 # Rows of the file, from 1: their text, and their cells.
 Lines = list[tuple[int, str]]
-Rows = list[tuple[int, list[str]]]
+Rows = list[tuple[int, Sequence[str]]]
 
 
 def cells_of(line: str, separator: str = ",") -> list[str]:
@@ -66,8 +66,9 @@ def table_of(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
     separator = (_separator(lines_of[0][1], lines_of[1][1]) if len(lines_of) > 1 else None) or ","
     if separator != ",":
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
-    rows = [(i, cells_of(line, separator)) for i, line in lines_of]
-    if any("," in cell for _, cells in rows[1:] for cell in cells):
+    rows: Rows = [(i, tuple(cells_of(line, separator))) for i, line in lines_of]
+    may_have_commas = separator != "," or any('"' in line for _, line in lines_of)
+    if may_have_commas and any("," in cell for _, cells in rows[1:] for cell in cells):
         _check_decimals(path, rows[1:], separator)
         notes = [f"{notes[-1]}, and decimals by commas"] if separator != "," else ["decimals are written with commas"]
         rows[1:] = [(i, [cell.replace(",", ".") for cell in cells]) for i, cells in rows[1:]]
