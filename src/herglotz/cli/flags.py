@@ -12,22 +12,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from herglotz.choices import DTYPES, HOLDS, LEVELS, OBJECTIVES, OPTIMISERS, ROBUST, SUPERVISION
 from herglotz.cli.common import Flag, check_output_folder, count, existing, finite, flag, positive, say, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
     from herglotz.data import Trajectories
     from herglotz.training import FitConfig
-
-
-# Copies of the package's values, so that help does not import PyTorch; a test compares them.
-SUPERVISION = ("q", "qs", "qps")
-ROBUST = ("auto", "on", "off")
-HOLDS = ("zero", "first", "smooth")
-LEVELS = ("conservative", "linear", "affine", "full", "forced")
-OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
-OPTIMISERS = ("lm", "adam", "adamw")
-DTYPES = ("float64", "float32")
 
 
 def settings_of(arguments: argparse.Namespace) -> FitConfig:

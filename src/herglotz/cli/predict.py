@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from herglotz.choices import WARMUP
 from herglotz.cli.common import (
     check_output_file,
     count,
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from herglotz.training import Run
     from herglotz.training.predict import Prediction
 
-# A copy of the default of `Run.predict`, so that help does not import PyTorch; a test compares both.
-WARMUP = 20
 DESCRIPTION = """\
 Score a trained model on a recording it has not seen: another start, other steps, its own inputs. The state is
 estimated from the first K samples of each trajectory, the model held; from there the model runs on alone, driven by

@@ -7,10 +7,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+from herglotz.choices import LEVELS
 from herglotz.cli.common import count, exit_code, flag, import_torch, print_json, print_next_of
 from herglotz.cli.fit import USAGE as USAGE
 from herglotz.cli.flags import (
-    LEVELS,
     MACHINE,
     PROGRESS,
     READING,

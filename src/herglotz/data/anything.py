@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
+from herglotz.data.column_roles import name_and_unit
 from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import with_missing
-from herglotz.data.header_cells import name_and_unit
 from herglotz.data.polar import named_by
 from herglotz.data.readers import angles_like, as_meant, finished, load
 from herglotz.data.sensors import calibrated
+from herglotz.data.sheet import from_frame, plain, seconds
 from herglotz.data.simulate import OF_AN_L_D
-from herglotz.data.table import from_frame, plain, seconds
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse, tell
@@ -93,10 +93,14 @@ def as_trajectories(
     InputError
         If arrays come without times, or as `load` and `read_csv` do.
     """
-    names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
+    names: dict[str, Any] = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
+    # Arrays and indices of names, such as a DataFrame's columns.
+    names |= {k: x.tolist() for k, x in names.items() if hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU"}
     meant = {"angles": angles, "degrees": degrees, "polar": polar, "input_terms": input_terms, "like": like}
     sensors = (sensor_zeros, sensor_scales)
-    data = _by_field(data)
+    if fields := getattr(getattr(data, "dtype", None), "names", None):
+        # A structured array, as numpy.genfromtxt makes.
+        data = {name: data[name] for name in fields}
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
     if isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
@@ -105,7 +109,8 @@ def as_trajectories(
         refuse({COLUMNS_ARE_FIXED: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         changed = any(x is not None for x in (degrees, polar, input_terms))
         found = as_meant(data, NO_HEADER, **meant) if changed else data
-    elif _is_table(data, h):
+    elif h is None if hasattr(data, "columns") else isinstance(data, Mapping):
+        # Named columns with their own time: a dict, or a DataFrame for which no step h is given.
         wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
         found = as_meant(_table(data, wanted), wanted, **meant)
         found = finished(found if like is None else angles_like(found, like), angles, *sensors)
@@ -127,23 +132,6 @@ def as_trajectories(
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The options of `as_trajectories` among keyword arguments, and the others."""
     return {k: v for k, v in settings.items() if k in OPTIONS}, {k: v for k, v in settings.items() if k not in OPTIONS}
-
-
-def _lists(roles: dict[str, Any]) -> dict[str, Any]:
-    """The settings of the columns, with a list for each array or index of names, such as a DataFrame's columns."""
-    are_names = {role: hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU" for role, x in roles.items()}
-    return {role: x.tolist() if are_names[role] else x for role, x in roles.items()}
-
-
-def _by_field(data: Any) -> Any:
-    """A structured array, as numpy.genfromtxt makes, as a dict of its columns; all other data unchanged."""
-    fields = getattr(getattr(data, "dtype", None), "names", None)
-    return {name: data[name] for name in fields} if fields else data
-
-
-def _is_table(data: Any, h: float | None) -> bool:
-    """Whether data are named columns with their own time: a dict, or a DataFrame for which no step h is given."""
-    return h is None if hasattr(data, "columns") else isinstance(data, Mapping)
 
 
 def _is_list_of_recordings(data: Any) -> bool:
@@ -198,7 +186,7 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
             names["group"] is not None or names["drop"],
     })  # fmt: skip
     n = len(q)
-    clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time))
+    clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time), lambda k: f"sample {k}")
     t = np.arange(n) * float(h) if h is not None else _floats("time", clock)
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
     missing = q.isnan().reshape(n, -1)

@@ -215,35 +215,37 @@ def quote(text: str) -> str:
     return repr(text if len(text) <= MAX_QUOTED else text[:MAX_QUOTED] + "…")
 
 
-def number(text: str, where: str) -> float:
+def number(cell: Any, where: str, remedy: str = "correct or delete the row", if_infinite: str = "") -> float:
     """The finite number in a cell.
 
-    Raise InputError, which begins with `where` (file, row and column), if the cell is blank, not a number, NaN,
-    infinite, or an integer that float64 rounds.
+    Raise InputError, which begins with `where` (file, row and column) and ends with the remedy, if the cell is blank,
+    not a number, NaN, infinite, or an integer that float64 rounds.
     """
     try:
-        value = float(text)
-    except ValueError:
+        value = float(cell)
+    except (TypeError, ValueError):
         value = None
+    text = str(cell)
+    shown = quote(text) if isinstance(cell, str) or value is None else text
     # Python reads 1_000 as a number; in a data file the underscore is a mistake.
     if value is None or "_" in text:
-        what = quote(text) if text else "a blank cell"
-        raise InputError(f"{where}: {what} is not a number; correct or delete the row")
+        raise InputError(f"{where}: {shown if text else 'a blank cell'} is not a number; {remedy}")
     if abs(value) >= EXACT and text.strip("+-").isdecimal() and int(text) != value:
-        raise InputError(f"{where}: {quote(text)} is above 2^53 and would be rounded; subtract the first one from all")
+        raise InputError(f"{where}: {shown} is above 2^53 and would be rounded; subtract the first one from all")
     if not math.isfinite(value):
-        raise InputError(f"{where}: {quote(text)} is not finite; correct or delete the row")
+        raise InputError(f"{where}: {shown} is not finite; {if_infinite or remedy}")
     return value
 
 
-def numbers_runs(column: np.ndarray, anew: np.ndarray) -> bool:
+def numbers_runs(column: np.ndarray, anew: np.ndarray, again: bool = False) -> bool:
     """Whether a column (N,) has a value of its own in each run of rows, most of which have three rows or more.
 
-    `anew` (N - 1,) bool: a run begins at the next row, because time falls there.
+    `anew` (N - 1,) bool: a run begins at the next row, because time falls there. A value may come `again` in a run
+    that is not the next one.
     """
     runs = np.diff(np.flatnonzero(anew), prepend=-1, append=len(anew))
     constant = bool(((column[1:] != column[:-1]) == anew).all())
-    return constant and len(np.unique(column)) == len(runs) and float(np.median(runs)) >= MIN_SAMPLES
+    return constant and (again or len(np.unique(column)) == len(runs)) and float(np.median(runs)) >= MIN_SAMPLES
 
 
 def out_of_order(values: np.ndarray, anew: np.ndarray, names: Sequence[str]) -> str:

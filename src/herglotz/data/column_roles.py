@@ -1,23 +1,42 @@
-"""The role of a column by its name and unit: an explicit unit decides first, then the words of the name."""
+"""What a cell of a header says: its name and its unit, and the role of the column by both.
+
+An explicit unit decides the role first, then the words of the name.
+
+Names and units of a header's cells: `x[m]`, `x (m)`, `x(m)`, `x/m`, `v/(m/s)`, `x_mm` and `angleDeg`.
+
+A slash stands before a known unit (ISO 80000-1: a quantity over its unit), unless another column has the same name
+before a slash: `arm/A` beside `arm/B` is a path. A unit of time stands behind the name of a time alone, unlike `x/s`.
+
+A unit that ends a name without brackets is one of `KINDS`. It is none where it is an index or a word:
+
+* a unit of time behind another name than that of a time: `x_min`;
+* a length behind the name of an angle: theta_m is the angle of a motor;
+* a letter or a word (`AMBIGUOUS`) behind a name that says another role than the unit, as in `tau_m` and `x_A`, or
+  beside a column of the same name with an index that is no unit: `joint_A` beside `joint_B`, `F_N` beside `F_T`.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 from unicodedata import combining, normalize
 
-ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|Grad|degrés|grados|gradi|gon|rev|turns?")
+ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|Grad|degrés|grados|gradi|gon|revs?|turns?|arcmin|arcsec")
 # Kinds of units, in the order of trial. With other units, such as counts or 1, the name decides the role.
 KINDS = {
-    "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
+    "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch(es)?|ft|feet|mils?|thou|px|pixels?"),
     "time": re.compile(r"s|ms|us|µs|μs|ns|min|h|secs?|seconds?|msec|usec"),
-    "effort": re.compile(r"[kmMµμ]?N([ *·.⋅]?[cm]?m)?|lbf|kgf"),
+    "effort": re.compile(
+        r"[kmMµμ]?N([ *·.⋅-]?[cm]?m)?|kgf|lbs?|(lbf?|ozf?)([ *·.⋅-]?(ft|in))?|(ft|in)[ *·.⋅-]?(lbf?|ozf?)"
+    ),
     "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|volts?|amps?|%|percent"),
+    "field": re.compile(r"[mµμun]?(Wb|T)|V[ *·⋅]s|[mµμun]?H|[mµμunp]F"),
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi|s?lpm|gpm|(m?[lL]|m3|m³)/ ?(s|min|h)"),
     "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
     "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|(.+[ ·*])?(s|min)(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
-    "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
+    "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|VA|m?[AW]h|bool"),
 }
 NUMBERED = r"(_?\d+|_.*)?"
 # Names that have a role whatever their words, unless the unit is of another kind.
@@ -99,8 +118,12 @@ class Guess(NamedTuple):
 def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     """The role of a column by its own name and unit; `others` are the names of all columns: dx is the rate of x."""
     guess = _own_role(name, unit, others)
-    is_copy = guess.role == "q" and _is_copy(name.casefold(), [other.casefold() for other in others])
-    return Guess("dropped", "it may be more than a filtered copy of another column") if is_copy else guess
+    copy = COPY.fullmatch(name.casefold()) if guess.role == "q" else None
+    base = copy and (copy["before"] or copy["behind"])
+    # The other column, or its raw values.
+    if base and {base, f"{base}_raw", f"raw_{base}"}.intersection(other.casefold() for other in others):
+        return Guess("dropped", "it may be more than a filtered copy of another column")
+    return guess
 
 
 def _own_role(name: str, unit: str, others: Collection[str]) -> Guess:
@@ -110,7 +133,9 @@ def _own_role(name: str, unit: str, others: Collection[str]) -> Guess:
     key = name.casefold() if len(name) > 1 else name
     words = words_of(name)
     if whole := _whole(key, kind):
-        return Guess(whole, _letter(key) if kind == "position" else "")
+        # An input in the unit of a position that only its letter u names.
+        letter = kind == "position" and re.fullmatch(r"u_?([xyz]|\d*)", key)
+        return Guess(whole, "it has the unit of a position" if letter else "")
     if words & WORDS["side"]:
         return Guess("dropped")
     if is_goal(words):
@@ -205,11 +230,6 @@ def _whole(key: str, kind: str) -> str:
     return "" if role == "input" and not meant else role
 
 
-def _letter(key: str) -> str:
-    """The doubt about an input in the unit of a position that only its letter u names."""
-    return "it has the unit of a position" if re.fullmatch(r"u_?([xyz]|\d*)", key) else ""
-
-
 def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
     """The role of a column in the unit of a position: a coordinate, unless the name is usual for an excitation."""
     if words and words <= GIVEN:
@@ -231,8 +251,8 @@ def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
         read = words & WORDS["reading"] and not words & (WORDS["effort"] | WORDS["attribute"])
         read = read or re.fullmatch(SYMBOL + r"_?\d*", key)
         return Guess("dropped", READING) if kind == "electric" and read else Guess("input")
-    if kind == "pressure":
-        return Guess("dropped", "it may be an input")
+    if kind in ("pressure", "field"):
+        return Guess("dropped", READING if kind == "field" else "it may be an input")
     return Guess("rate" if kind in ("rate", "acceleration") else "dropped")
 
 
@@ -254,13 +274,6 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
     return Guess("input" if attribute or words & WORDS["effort"] else "q")
 
 
-def _is_copy(key: str, others: Collection[str]) -> bool:
-    """Whether a name is that of another column, or of its raw values, and a word for a filter."""
-    match = COPY.fullmatch(key)
-    base = match and (match["before"] or match["behind"])
-    return bool(base) and bool({base, f"{base}_raw", f"raw_{base}"}.intersection(others))
-
-
 def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:
     """Whether a name is usual for a rate; vx in the unit of a position, or dx without a column x, is no rate."""
     if kind == "position":
@@ -268,3 +281,111 @@ def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str
         if LETTERS.fullmatch(key) or (of and of[1] not in {name.casefold() for name in others}):
             return False
     return bool(RATE.fullmatch(key) or words & WORDS["rate"])
+
+
+CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
+# A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
+TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
+# A quantity over its unit: t/s, phi / °, v/(m/s).
+SLASH = re.compile(r"([^/\[\]()]+?)\s*/\s*(?:[\[(](.+)[\])]|([^\[\]()]+?))\s*")
+# Units that are read in any case, and as the last word of a name in camel case.
+CASELESS = re.compile(r"(?:deg|rad)(?:/s2?)?|mm|rpm|s|ms|us|ns|min", re.I)
+# A name, and a unit of two parts or one at its end. The momentum of x_deg is p_x_deg.
+ENDS = (
+    re.compile(r"(?!p_)(.+)_(?!per_)([^\W_]+)_(?:per_)?(s2?|min|h|m)"),
+    re.compile(r"(?!p_)(.+)_([^_]+)"),
+    re.compile(rf"(?!p_)(.*[a-z\d])(?=[A-Z])((?i:{CASELESS.pattern}))"),
+)
+# What a unit of two parts begins with, beside lengths and angles: turns in French and German, litres, newtons.
+PARTS = re.compile(r"tr|U|m?[lL]|[km]?N")
+# Units that are letters of bodies or words as well.
+AMBIGUOUS = re.compile(r"[mNAV]|cm|km|psi|bar")
+INDEX = re.compile(r"[^\W_]|\d+")
+
+
+def name_and_unit(cell: str) -> tuple[str, str] | None:
+    """Name and unit of a header's cell, "" if the cell alone shows no unit; None for any other text."""
+    match = CELL.fullmatch(cell)
+    if not match or not cell.isprintable():
+        return None
+    if slash := SLASH.fullmatch(cell):
+        name, unit = slash[1], slash[2] or slash[3]
+        if kind_of(unit) and _is_timed(name) == (kind_of(unit) == "time"):
+            return name, unit
+    if match[2] is not None or match[3] is not None:
+        return match[1], (match[2] or match[3]).strip()
+    if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
+        return tight[1], tight[2]
+    name, unit = _split(match[1])
+    return (match[1], "") if AMBIGUOUS.fullmatch(unit) else (name, unit)
+
+
+def heads_of(cells: Sequence[str], known: Collection[str] = ()) -> list[tuple[str, str] | None]:
+    """Name and unit of each cell of a table; None as in `name_and_unit`.
+
+    Columns keep the names that they have in another table, whose names are `known`.
+    """
+    heads = [name_and_unit(cell) for cell in cells]
+    names = [head[0] for head in heads if head]
+    heads = [head and _in_table(cell, head, names, known) for cell, head in zip(cells, heads, strict=True)]
+    count = Counter(head[0] for head in heads if head)
+    return [_whole_cell(cell, head[1]) if head and count[head[0]] > 1 else head
+            for cell, head in zip(cells, heads, strict=True)]  # fmt: skip
+
+
+def _in_table(cell: str, head: tuple[str, str], names: Sequence[str], known: Collection[str]) -> tuple[str, str]:
+    """Name and unit of a cell beside columns of these names."""
+    path = SLASH.fullmatch(cell) and any(name.startswith(f"{head[0]}/") for name in names)
+    if cell in known or path or f"p_{cell}" in names:
+        return cell, ""
+    name, unit = _split(head[0])
+    return (name, unit) if unit and not head[1] and (name in known or _is_unit(name, unit, names)) else head
+
+
+def _whole_cell(cell: str, unit: str) -> tuple[str, str]:
+    """Name and unit of a cell whose name repeats: the brackets of `x (raw)` hold no unit, and `x_deg` is a name."""
+    return (cell.strip(), "" if cell.endswith(")") else unit) if not cell.endswith("]") else (cell.split("[")[0], unit)
+
+
+def _split(text: str) -> tuple[str, str]:
+    """Name and unit of a name that ends with what may be its unit; the whole name and "" if it does not."""
+    for match in filter(None, (end.fullmatch(text) for end in ENDS)):
+        name, *parts = match.groups()
+        unit = (" " if parts[-1] == "m" else "/").join(parts)
+        unit = unit.lower() if CASELESS.fullmatch(unit) else unit
+        if _may_have(name, unit):
+            return name, unit
+    return text, ""
+
+
+def _is_timed(name: str) -> bool:
+    """Whether a name is that of a time."""
+    return is_time(name, "") or is_timed(words_of(name))
+
+
+def _may_have(name: str, unit: str) -> bool:
+    """Whether a column of this name may be in this unit: see the head of this module."""
+    kind, part = kind_of(unit), kind_of(base := re.split("[/ ]", unit)[0])
+    if not kind or (base != unit and part != "position" and not PARTS.fullmatch(base)):
+        return False
+    timed = _is_timed(name)
+    length = part == "position" and not ANGLES.fullmatch(base)
+    letter = len(unit) == 1 and unit.isalpha() and not AMBIGUOUS.fullmatch(unit)
+    # x_in is the input beside x_out, x_lb the lower bound, and left_feet are feet.
+    word = base in ("in", "feet", "lb")
+    if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or word:
+        return False
+    return role_of(name, unit).role not in ("action", "momentum", "counter")
+
+
+def _is_unit(name: str, unit: str, names: Sequence[str]) -> bool:
+    """Whether an ambiguous end of a name is its unit, among columns of these names."""
+    others = [other.removeprefix(f"{name}_") for other in names if other.startswith(f"{name}_")]
+    if any(INDEX.fullmatch(other) and not _may_have(name, other) for other in others):
+        return False
+    symbol = re.fullmatch(rf"{SYMBOL}\d*", name.rsplit("_")[-1].casefold()) and not words_of(name) & WORDS["position"]
+    told = role_of(name, "", names)
+    if told.role != "q" or symbol:
+        return told == role_of(name, unit, names)
+    # A coordinate of one letter has a usual one: i_m may be the current of a motor.
+    return len(name) > 1 or kind_of(unit) != "position"

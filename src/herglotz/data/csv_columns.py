@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from herglotz.data.column_roles import (
     READING,
     ROLES,
     Guess,
+    heads_of,
     is_of_others,
     is_recorded_effort,
     is_set_point,
@@ -22,7 +23,6 @@ from herglotz.data.column_roles import (
     role_of,
     words_of,
 )
-from herglotz.data.header_cells import heads_of
 from herglotz.errors import InputError, refuse
 
 # Fields of `Wanted` that give columns a role, and the role.
@@ -127,6 +127,11 @@ class Columns:
         """Columns whose cells are parsed as numbers: time, coordinates, s, momenta, inputs."""
         return (self.time, *self.q, *(() if self.s is None else (self.s,)), *self.p, *self.u)
 
+    def without(self, numbers: Collection[int]) -> Columns:
+        """The columns with these coordinates and inputs left aside."""
+        q, u = (tuple(i for i in own if i not in numbers) for own in (self.q, self.u))
+        return replace(self, q=q, u=u)
+
     def roles(self) -> tuple[tuple[str, str, str], ...]:
         """Name, role and unit of every column, in the order of the header."""
         named = {self.time: "time", self.trajectory: "trajectory", self.s: "action s"}
@@ -137,11 +142,18 @@ class Columns:
         return tuple((name, named.get(i, "left aside"), unit) for i, (name, unit) in rows)
 
 
-def assign(cells: Sequence[str], where: str, wanted: Wanted = HEADER_DECIDES) -> Columns:
+def assign(
+    cells: Sequence[str],
+    where: str,
+    wanted: Wanted = HEADER_DECIDES,
+    is_constant: Callable[[int], bool] | None = None,
+) -> Columns:
     """Give every column of a header its role; the cells are `name` or `name[unit]`.
 
-    Raise InputError, which begins with `where` (file and row), if a cell cannot be read, a name comes twice, time or
-    all coordinates are missing, or a named column is absent.
+    Of several columns with the name of a group, those that are the same in every row (`is_constant`) are left aside;
+    without `is_constant` the first is taken. Raise InputError, which begins with `where` (file and row), if a cell
+    cannot be read, a name comes twice, time or all coordinates are missing, a named column is absent, or several
+    columns group the rows.
     """
     names, units = _parse(cells, where, wanted)
     place = {name: i for i, name in enumerate(names)}
@@ -161,16 +173,34 @@ def assign(cells: Sequence[str], where: str, wanted: Wanted = HEADER_DECIDES) ->
     else:
         q = tuple(place[x] for x in as_names(wanted.coordinates))
     q = q or (() if wanted.motion else u[:1])
-    both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
         f"{where}: no coordinate column, only {every}; {_remedy(names, roles)}": not q,
-        f"{where}: both a column {both}; keep one: --group NAME (group= in Python)": len(roles["trajectory"]) > 1,
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
-    trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
+    groups, same = _varying(where, names, roles["trajectory"], is_constant)
+    trajectory, action = (next(iter(own), None) for own in (groups, roles["action"]))
     found = Columns(names, units, clock, q, trajectory, action, p, u, wanted.hold)
-    return replace(found, notes=_warnings(found, guesses, wanted))
+    return replace(found, notes=(*_warnings(found, guesses, wanted), *same))
+
+
+def _varying(
+    where: str, names: Sequence[str], groups: Sequence[int], is_constant: Callable[[int], bool] | None
+) -> tuple[Sequence[int], list[str]]:
+    """The column that groups the rows, of those with the name of a group, and a note on those that never change."""
+    if is_constant is None or len(groups) < 2:
+        return groups, []
+    same = [i for i in groups if is_constant(i)]
+    varying = [i for i in groups if i not in same] or groups
+    both = " and a column ".join(names[i] for i in varying)
+    refuse({f"{where}: both a column {both}; keep one: --group NAME (group= in Python)": len(varying) > 1})
+    return varying, [same_everywhere([names[i] for i in same])]
+
+
+def same_everywhere(names: Sequence[str]) -> str:
+    """The note on columns whose cells are all alike."""
+    is_are = "is" if len(names) == 1 else "are"
+    return f"{', '.join(names)} {is_are} the same in every row, and {is_are} left aside"
 
 
 def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:

@@ -7,25 +7,21 @@ their rows are first written with commas between columns and with decimal points
 from __future__ import annotations
 
 import csv
-import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from herglotz.data.checks import EXACT, MISSING, number, quote
-from herglotz.data.column_roles import is_time, kind_of
-from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
+from herglotz.data.checks import MISSING, number, quote
+from herglotz.data.column_roles import is_time, kind_of, name_and_unit
+from herglotz.data.csv_columns import HEADER_DECIDES, Wanted, assign, is_number
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.header_cells import name_and_unit
-from herglotz.data.sensors import calibrated
-from herglotz.data.table import from_table, group_by_values, grouped_by_guess, in_dates, moment, with_units
+from herglotz.data.sheet import Sheet, from_sheet
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 
@@ -39,48 +35,46 @@ EXCEL = "sep=(.|tab)?"
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
 # 1,250 is 1250 or 1.25; 0,250 is 0.25 alone.
 THOUSANDS_OR_DECIMALS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
-# Row of the file, from 1, and its text.
-Rows = list[tuple[int, str]]
-Cells = Iterable[tuple[int, list[str]]]
+# Rows of the file, from 1: their text, and their cells.
+Lines = list[tuple[int, str]]
+Rows = list[tuple[int, Sequence[str]]]
 
 
 def cells_of(line: str, separator: str = ",") -> list[str]:
     """The cells of a line, without the quotes and spaces around them; a separator between quotes is part of a cell."""
     parts = line.split() if separator == " " else line.split(separator)
-    if '"' in line and separator != " ":
+    if '"' not in line:
+        return [cell.strip() for cell in parts]
+    if separator != " ":
         # The csv module refuses a cell of more than 131 072 characters.
         with suppress(csv.Error):
             parts = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
     return [cell.strip().strip('"').strip() for cell in parts]
 
 
-def in_commas(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
-    """Rows of a file's table, header first, with commas between columns and decimal points; notes on the changes.
+def table_of(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
+    """The cells of a file's table, header first, with decimal points; notes on the text.
 
     Lines without a value and comments are left out. A comment may be the header: the last comment before rows of
     numbers alone, with as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points
     in others, or commas that may separate thousands.
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
-    rows, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
-    rows, above = _without_titles(rows)
+    lines_of, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
+    lines_of, above = _without_titles(lines_of)
     notes += above
-    separator = (_separator(rows[0][1], rows[1][1]) if len(rows) > 1 else None) or ","
+    separator = (_separator(lines_of[0][1], lines_of[1][1]) if len(lines_of) > 1 else None) or ","
     if separator != ",":
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
-    elif not any('"' in line for _, line in rows):
-        return _without_empty_ends(rows), tuple(notes)
-
-    def table() -> Iterator[tuple[int, list[str]]]:
-        return ((i, cells_of(line, separator)) for i, line in rows[1:])
-
-    if any("," in cell for _, cells in table() for cell in cells):
-        _check_decimals(path, table, separator)
+    rows: Rows = [(i, tuple(cells_of(line, separator))) for i, line in lines_of]
+    may_have_commas = separator != "," or any('"' in line for _, line in lines_of)
+    if may_have_commas and any("," in cell for _, cells in rows[1:] for cell in cells):
+        _check_decimals(path, rows[1:], separator)
         notes = [f"{notes[-1]}, and decimals by commas"] if separator != "," else ["decimals are written with commas"]
+        rows[1:] = [(i, [cell.replace(",", ".") for cell in cells]) for i, cells in rows[1:]]
     # A comma in a header's cell stands between several names.
-    names = ",".join(cell.replace(",", "") for cell in cells_of(rows[0][1], separator))
-    points = ((i, ",".join(cell.replace(",", ".") for cell in cells)) for i, cells in table())
-    return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes)
+    rows[:1] = [(i, [cell.replace(",", "") for cell in cells]) for i, cells in rows[:1]]
+    return _without_empty_ends(rows), tuple(notes)
 
 
 def _all_numbers(cells: Sequence[str]) -> bool:
@@ -90,14 +84,14 @@ def _all_numbers(cells: Sequence[str]) -> bool:
 
 def _without_empty_ends(rows: Rows) -> Rows:
     """The rows without the empty columns that spreadsheets write at the end of rows."""
-    if not any(line.rstrip().endswith(",") for _, line in rows):
+    if all(cells[-1] for _, cells in rows):
         return rows
-    filled = [line.rstrip(", \t").count(",") + 1 for _, line in rows]
-    width = min(rows[0][1].count(",") + 1, max(filled))
-    return [(i, ",".join(line.split(",")[: max(width, own)])) for (i, line), own in zip(rows, filled, strict=True)]
+    filled = [max((k for k, cell in enumerate(cells, 1) if cell), default=1) for _, cells in rows]
+    width = min(len(rows[0][1]), max(filled))
+    return [(i, cells[: max(width, own)]) for (i, cells), own in zip(rows, filled, strict=True)]
 
 
-def _with_header(written: Rows) -> tuple[Rows, list[str]]:
+def _with_header(written: Lines) -> tuple[Lines, list[str]]:
     """The rows without comments, except for a comment that is the header; and the note on that header."""
     rows = [(i, line) for i, line in written if not line.lstrip().startswith("#")]
     before = [(i, line.lstrip("# ")) for i, line in written if rows and i < rows[0][0]]
@@ -106,7 +100,7 @@ def _with_header(written: Rows) -> tuple[Rows, list[str]]:
     return rows, []
 
 
-def _without_titles(rows: Rows) -> tuple[Rows, list[str]]:
+def _without_titles(rows: Lines) -> tuple[Lines, list[str]]:
     """The rows from the header on, without title lines above the table; and the note on these lines."""
     first = enumerate(rows[:MAX_TITLE_LINES])
     at = next((k for k, (_, line) in first if any(_has_time(line, mark) for mark in SEPARATORS)), 0)
@@ -122,7 +116,7 @@ def _has_time(line: str, separator: str) -> bool:
     return len(heads) > 1 and any(head is not None and is_time(*head) for head in heads)
 
 
-def _is_header(rows: Rows) -> bool:
+def _is_header(rows: Lines) -> bool:
     """Whether the first of these rows is followed by numbers in as many columns, or by units and then numbers."""
     if len(rows) < 2 or (separator := _separator(rows[0][1], rows[1][1])) is None:
         return False
@@ -143,20 +137,20 @@ def _separator(header: str, row: str) -> str | None:
     return None
 
 
-def _check_decimals(path: Path, table: Callable[[], Cells], separator: str) -> None:
+def _check_decimals(path: Path, table: Rows, separator: str) -> None:
     """Raise if a comma may separate thousands, or 1,5 and 2.5 stand in the same table.
 
     Programs that write commas between columns often write commas between thousands, too: in their tables at least one
     comma has to be a decimal sign for certain.
     """
-    rows = table() if separator == "," else ()
+    rows = table if separator == "," else ()
     numbers = [(i, cell) for i, cells in rows for cell in cells if "," in cell and is_number(cell.replace(",", "."))]
     if numbers and all(THOUSANDS_OR_DECIMALS.fullmatch(cell) for _, cell in numbers):
         i, cell = numbers[0]
         both = f"{cell.replace(',', '')} or {cell.replace(',', '.')}"
         raise InputError(f"{path}, row {i}: {cell!r} may be {both}; write numbers without separators of thousands")
     first: dict[str, tuple[int, str]] = {}
-    for i, cells in table():
+    for i, cells in table:
         for cell in cells:
             sign = "," if "," in cell else "."
             if sign == "," and THOUSANDS.fullmatch(cell):
@@ -180,7 +174,7 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
 
     **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
     The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
-    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.header_cells` says where the end of
+    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says where the end of
     a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
     of their own below the header. Other lines that start with # and blank lines are skipped, except for these comments:
     `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples, `# delay: 0.004` and `# lag: 0.02`
@@ -190,15 +184,17 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time.
     Times may be dates in ISO 8601, which become seconds since the first row. `trajectory`, `trial`, `run`,
     `experiment`, `Versuch`, `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a
-    warning, a column that changes wherever time starts anew, and nowhere else, does. `s` is the action, `p`/`p_*` are
-    momenta. Of other columns the unit decides before the name
-    (`herglotz.data.column_roles`): rad, deg, m, mm, px are positions; N, Nm, A, V, % inputs; m/s, rad/s, rpm rates;
-    rates are left aside, and so are °C, Pa, W. A set value of a motion is an input in any unit: goal, target, set
-    point, desired, reference, command, soll; so is what shakes a mechanism: road, ground, excitation, Erregung. Without
-    a unit `u`, `u1`, `u_*`, `F`, force, torque, tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`,
-    `qd1` rates; errors, temperatures, batteries, counters (`index`, `frame`, a first column without a name) and
-    filtered copies of another column (`theta_filt`) are left aside; every other column is a coordinate. A coordinate in
-    rad is taken for an angle. A warning names every role that is a guess.
+    warning, a column that changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or
+    text. Beside it text, and numbers without a unit and a usual name, that are the same in every row are left aside.
+    `s` is the action, `p`/`p_*` are momenta. Of other columns the unit decides before the name
+    (`herglotz.data.column_roles`): rad, deg, m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs; m/s, rad/s, rpm
+    rates; rates are left aside, and so are °C, Pa, W, and, unless no other column is a coordinate, Wb, T, H and F. A
+    set value of a motion is an input in any unit: goal, target, set point, desired, reference, command, soll; so is
+    what shakes a mechanism: road, ground, excitation, Erregung. Without a unit `u`, `u1`, `u_*`, `F`, force, torque,
+    tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors, temperatures, batteries,
+    counters (`index`, `frame`, a first column without a name) and filtered copies of another column (`theta_filt`) are
+    left aside; every other column is a coordinate. A coordinate in rad is taken for an angle. A warning names every
+    role that is a guess.
 
     **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row
     without any coordinate, or without s or a momentum, is left out; the step over that row has the mean of the inputs.
@@ -215,128 +211,40 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     """
     path = Path(path)
     lines = read_lines(path)
-    columns, rows, notes = _header(path, lines, wanted)
-    _check_kinds(path, columns, rows)
-    comments = [line for line in lines if line.lstrip().startswith("#")]
-    values = _plain_numbers(columns, rows)
-    values = _parse_rows(path, columns, rows) if values is None else values
-    if group := group_by_values(columns, wanted, values, lambda i: [cells_of(line)[i] for _, line in rows]):
-        return grouped_by_guess(read_csv(path, replace(wanted, group=group)), group)
-    labels, at = _labels(path, columns, rows), [i for i, _ in rows]
-    found = from_table(path, columns, at, labels, values, lambda found: _with_settings(found, comments))
-    if rows and not is_number(cells_of(rows[0][1])[columns.time]):
-        found = in_dates(found)
-    return replace(found, notes=(*notes, *found.notes))
-
-
-def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[Columns, Rows, tuple[str, ...]]:
-    """The columns of a table, its rows below the header and a row of units, and notes on its text."""
-    rows, notes = in_commas(path, lines)
+    rows, notes = table_of(path, lines)
     if not rows:
         raise InputError(f"{path}: there is no header; add a first line such as t[s],q[rad]")
-    at, header = rows[0]
-    cells, where = cells_of(header), f"{path}, row {at}"
-    is_title = len(cells) == 1 and any(mark in line for _, line in rows[1:] for mark in ",;\t")
-    refuse({f"{where}: {quote(header)} is no header; delete the lines above the table, or begin them with #": is_title})
-    if len(rows) > 1 and (named := with_units(cells, cells_of(rows[1][1]), where, wanted)):
-        cells, notes = named, (*notes, f"units stand in row {rows.pop(1)[0]}")
-    return assign(cells, where, wanted), rows[1:], notes
+    (at, heads), *rows = rows
+    where, below = f"{path}, row {at}", any(mark in line for line in lines[at:] for mark in ",;\t")
+    title = f"{where}: {quote(lines[at - 1])} is no header; delete the lines above the table, or begin them with #"
+    refuse({title: len(heads) == 1 and below})
+
+    @cache
+    def columns() -> list[np.ndarray]:
+        for row, cells in rows:
+            if len(cells) != len(heads):
+                counts = f"{len(cells)} cells where the header has {len(heads)}"
+                raise InputError(f"{path}, row {row}: {counts}; correct or delete the row")
+        return [np.array([cells[i] for _, cells in rows], dtype=object) for i in range(len(heads))]
+
+    sheet = Sheet(
+        path, where, heads, rows[0][1] if rows else [], [row for row, _ in rows], lambda i: columns()[i],
+        notes=notes, settings=_settings(path, lines),
+    )  # fmt: skip
+    return from_sheet(sheet, wanted)
 
 
-def _plain_numbers(columns: Columns, rows: Rows) -> np.ndarray | None:
-    """The numeric columns of all rows, (N, k), NaN in empty cells; None for a table with any other cell.
-
-    numpy's parser takes a fifth of the time of `_parse_rows`, which names the row of a mistake.
-    """
-    width = len(columns.names)
-    if not rows or any(line.count(",") + 1 != width for _, line in rows):
-        return None
-    lines = (_with_nan(line) for _, line in rows)
-    try:
-        table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2, usecols=columns.numeric)
-    except ValueError:
-        return None
-    # NaN compares as False, and so does a time that is missing.
-    exact = (np.abs(table) < EXACT) | np.isnan(table)
-    return table if exact.all() and not np.isnan(table[:, 0]).any() else None
-
-
-def _with_nan(line: str) -> str:
-    """The row with "nan" in its empty cells."""
-    if ",," in line or line[0] == "," or line[-1] == ",":
-        return ",".join(cell or "nan" for cell in line.split(","))
-    return line
-
-
-def _labels(path: Path, columns: Columns, rows: Rows) -> list[str]:
-    """The label of the trajectory of each row; raise if some rows have a label and others have not."""
-    if columns.trajectory is None:
-        return [""] * len(rows)
-    labels = [cells_of(line)[columns.trajectory] for _, line in rows]
-    if any(labels) and not all(labels):
-        where = f"{path}, row {rows[labels.index('')][0]}, column 'trajectory'"
-        raise InputError(f"{where}: blank, but other rows name a trajectory; fill it in")
-    return labels
-
-
-def _parse_rows(path: Path, columns: Columns, rows: Rows) -> list[list[float]]:
-    """The numbers of every row, cell by cell: dates become seconds, and an error names row and column."""
-    width, values = len(columns.names), []
-    # The date of the first row, where times are dates.
-    first = None
-    for at, line in rows:
-        cells = cells_of(line)
-        if len(cells) != width:
-            raise InputError(
-                f"{path}, row {at}: {len(cells)} cells where the header has {width}; correct or delete the row"
-            )
-        date = moment(cells[columns.time]) if first is not None or not values else None
-        if date is not None and not is_number(cells[columns.time]):
-            first = first or date
-            cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
-        missing = {i for i in columns.numeric if i != columns.time and cells[i].casefold() in MISSING}
-        where = {i: f"{path}, row {at}, column '{columns.names[i]}'" for i in columns.numeric}
-        values.append([math.nan if i in missing else number(cells[i], where[i]) for i in columns.numeric])
-    return values
-
-
-def _check_kinds(path: Path, columns: Columns, rows: Rows) -> None:
-    """Raise if a column of text would be read as numbers: neither of its first two cells is a number."""
-    two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
-    for i in columns.numeric if len(two) == 2 else ():
-        name, pair = columns.names[i], [cells[i] for cells in two]
-        remedy = (
-            f"write numbers, leave the column out with --drop {name} (drop= in Python), or group the rows by it with "
-            f"--group {name} (group= in Python)"
-        )
-        is_date = i == columns.time and any(map(moment, pair))
-        if i == columns.time:
-            remedy = "write numbers, or dates such as 2026-03-01 12:00:00.25"
-        if not is_date and not any(is_number(x) or x.casefold() in MISSING for x in pair):
-            raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(pair[0])} is not a number; {remedy}")
-
-
-def _since(first: datetime, date: datetime, where: str) -> float:
-    """Seconds from the first date to this date."""
-    if (first.tzinfo is None) != (date.tzinfo is None):
-        raise InputError(f"{where}: {date} and the first date {first} differ in having a time zone; write it in all")
-    return (date - first).total_seconds()
-
-
-def _with_settings(found: Trajectories, comments: Iterable[str]) -> Trajectories:
-    """The set with hold, delay, lag, zeros and scales from the first comment of each kind."""
-    arrival: dict[str, Any] = {}
-    sensors: dict[str, list[float]] = {}
-    for match in filter(None, (SETTING.fullmatch(line.strip()) for line in comments)):
+def _settings(path: Path, lines: Iterable[str]) -> dict[str, Any]:
+    """Hold, delay, lag, zeros and scales from the first comment of each kind."""
+    found: dict[str, Any] = {}
+    for match in filter(None, (SETTING.fullmatch(line.strip()) for line in lines)):
         name, text = match.groups()
-        where = f"{found.source}, comment '# {name}: {text}'"
+        where = f"{path.name}, comment '# {name}: {text}'"
         if name in ("zero", "scale"):
-            sensors.setdefault(name, [number(x, where) for x in text.replace(",", " ").split()])
+            found.setdefault(name, [number(x, where) for x in text.replace(",", " ").split()])
         else:
-            arrival.setdefault(name, text if name == "hold" else number(text, where))
-    # The user's hold overrules the file's.
-    arrival |= {"hold": found.hold} if found.hold else {}
-    return replace(calibrated(found, sensors.get("zero", ()), sensors.get("scale", ())), **arrival)
+            found.setdefault(name, text if name == "hold" else number(text, where))
+    return found
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:

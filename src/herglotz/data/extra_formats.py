@@ -12,7 +12,7 @@ import numpy as np
 
 from herglotz.data.csv_columns import Wanted
 from herglotz.data.files import PathLike
-from herglotz.data.table import from_frame
+from herglotz.data.sheet import from_frame
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 

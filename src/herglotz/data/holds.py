@@ -19,11 +19,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from herglotz.choices import HOLDS
 from herglotz.errors import InputError
 
 # Samples through which each hold draws its polynomial.
-SAMPLES = {"zero": 1, "first": 2, "smooth": 8}
-HOLDS = tuple(SAMPLES)
+SAMPLES: dict[str, int] = dict(zip(HOLDS, (1, 2, 8), strict=True))
 
 
 class Arrival(NamedTuple):

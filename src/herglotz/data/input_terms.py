@@ -19,10 +19,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from herglotz.data.column_table import INPUT_TERM
 from herglotz.data.csv_columns import is_number
 from herglotz.data.smoothing import slopes
-from herglotz.data.trajectories import Trajectories
+from herglotz.data.trajectories import INPUT_TERM, Trajectories
 from herglotz.errors import InputError, refuse
 
 FORMS = ("{}^2", "|{}|", "{}'")

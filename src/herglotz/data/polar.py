@@ -14,10 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.data.column_roles import kind_of
+from herglotz.data.column_roles import kind_of, name_and_unit
 from herglotz.data.csv_columns import is_number
 from herglotz.data.gaps import complete
-from herglotz.data.header_cells import name_and_unit
 from herglotz.data.noise import AT_THE_NOISE, precision
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import check_coordinates, refuse

@@ -70,7 +70,8 @@ def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
     even, counts = t.mean() + h * steps, (t - t[0]) / count
     whole = bool((np.abs(counts - counts.round()) <= COUNT_TOLERANCE).all()) and bool((np.abs(even - t) <= count).all())
     twice = d == 0
-    same = _written_twice(one.values[1:][twice], one.values[:-1][twice])
+    # Whether each of these rows is that before it, written twice.
+    same = np.array_equal(one.values[1:][twice], one.values[:-1][twice], equal_nan=True)
     if whole and int(twice.sum()) >= MIN_SAMPLES and not same:
         values = np.column_stack([even, one.values[:, 1:]])
         size, step = (f"{x:.4g}" + ("" if unit == "1" else f" {unit}") for x in (count, h))
@@ -80,11 +81,6 @@ def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
     some = "a row is" if len(rows) == 1 else f"{len(rows)} rows are"
     note = f"warning: {some} left out, with the stamp of the row before: the first is row {rows[0]}"
     return Recording(one.label, one.at[kept], one.values[kept]), note
-
-
-def _written_twice(rows: np.ndarray, before: np.ndarray) -> bool:
-    """Whether each of these rows equals the row before."""
-    return bool(((rows == before) | (np.isnan(rows) & np.isnan(before))).all())
 
 
 def completed(

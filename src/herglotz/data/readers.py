@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import Unusable, check_alike
-from herglotz.data.column_table import of_file
 from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.extra_formats import read_packed
@@ -28,7 +27,7 @@ from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import calibrated
 from herglotz.data.table import usable
-from herglotz.data.trajectories import GAP, Trajectories, made_alike
+from herglotz.data.trajectories import GAP, Trajectories, made_alike, of_file
 from herglotz.data.units import in_degrees, in_radians_and_seconds, with_angles_in_degrees
 from herglotz.errors import InputError, refuse, tell
 

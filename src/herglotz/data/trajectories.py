@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
-from herglotz.data.column_table import INPUT_TERM, column_table, summary_of
+from herglotz.data.column_roles import is_angular
 from herglotz.data.holds import Arrival, check_arrival, interpolated, interpolated_input, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
@@ -26,6 +27,10 @@ DEGREES = ("deg", "°", "degree", "degrees", "Grad", "degrés", "grados", "gradi
 GAP = 1.5
 # Standard deviation of the steps over their median: the clocks of loggers stay below 0.02.
 IRREGULAR = 0.05
+# Role of a column of u that was computed from a recorded input.
+INPUT_TERM = "input term"
+# Begins a note that is printed outside of the table, too.
+WARNING = "warning: "
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -342,12 +347,29 @@ class Trajectories:
         return sha.hexdigest()
 
     def summary(self) -> str:
-        """Return a line for people."""
-        return summary_of(self)
+        """Return a line for people: coordinates and inputs, the number of samples, and the steps."""
+        coordinates = ", ".join(f"{name} [{unit}]" for name, unit in zip(self.names, self.units, strict=True))
+        known = "".join(f", {name}" for name in "sp" if getattr(self, name) is not None)
+        known += "".join(f", input {name}" + (f" [{unit}]" if unit else "") for name, unit in self.input_labels)
+        plural, unit = "y" if len(self) == 1 else "ies", "" if self.time_unit == "1" else f" {self.time_unit}"
+        gaps = f", {self.gaps} gap{'' if self.gaps == 1 else 's'}" if self.gaps else ""
+        h = self.steps().h
+        irregular = f"irregular steps, {float(h.min()):.3g} to {float(h.max()):.3g}{unit}"
+        step = irregular if self.irregular else f"step {self.typical_step:.4g}{unit}{gaps}"
+        return (
+            f"{self.source or 'trajectories'}: {len(self)} trajector{plural}, {self.samples} samples of "
+            f"{coordinates}{known}; {step}"
+        )
 
     def table(self) -> str:
-        """Return the role of every column of the table that was read, a line each, for people."""
-        return column_table(self)
+        """Return a line for each column of the table that was read: role, unit, and its conversion; then the notes."""
+        rows = [("column", "is taken for", "unit"), *column_rows(self)]
+        widths = [max(len(row[k]) for row in rows) for k in range(2)]
+        lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
+        source = self.source or "table"
+        notes = [f"  {note}" for note in self.notes if not note.startswith(WARNING)]
+        warnings = [f"{WARNING}{source}: {note[len(WARNING) :]}" for note in self.notes if note.startswith(WARNING)]
+        return "\n".join([f"{source}:", *lines, *notes, *warnings])
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}
@@ -368,13 +390,40 @@ def made_alike(sets: Sequence[Trajectories]) -> list[Trajectories]:
     if any(one.observed is not None for one in sets):
         sets = [replace(one, observed=torch.ones_like(one.q)) if one.observed is None else one for one in sets]
     if any(one.hold == "zero" for one in sets):
-        sets = [_of_steps(one) if one.hold else one for one in sets]
+        note = "warning: inputs with hold {} are means of steps, because a recording beside them has hold zero"
+        sets = [
+            replace(one, u=one.inputs_of_steps(), hold="zero", notes=(*one.notes, note.format(one.hold)))
+            if one.hold not in ("", "zero") else one
+            for one in sets
+        ]  # fmt: skip
     return list(sets)
 
 
-def _of_steps(one: Trajectories) -> Trajectories:
-    """The set with inputs that are means of its steps, and a note where they were not."""
-    if one.hold == "zero":
-        return one
-    note = f"warning: inputs with hold {one.hold} are means of steps, because a recording beside them has hold zero"
-    return replace(one, u=one.inputs_of_steps(), hold="zero", notes=(*one.notes, note))
+def of_file(name: str, note: str) -> str:
+    """A note on a single file of several."""
+    return f"{WARNING}{name}: {note[len(WARNING) :]}" if note.startswith(WARNING) else f"{name}: {note}"
+
+
+def column_rows(data: Trajectories) -> list[tuple[str, str, str]]:
+    """Name, final role and final unit of each column of `Trajectories`, in words."""
+    now = dict(zip(data.names, zip(data.units, data.angles, strict=True), strict=True))
+    rows = []
+    for name, role, unit in data.columns:
+        if role == "coordinate" and name in now:
+            role = "angle" if now[name][1] else role
+            unit = _converted(unit, now[name][0])
+            if role == "coordinate" and not unit and is_angular(name):
+                far = float(data.q[:, data.names.index(name)].abs().max()) > 2 * math.pi
+                unit = f"- (an angle in {'deg? --degrees' if far else 'rad? --angles'} {name})"
+        elif role == "polar":
+            role, unit = "angle", "rad"
+        elif role == "time":
+            unit = _converted(unit, data.time_unit) if unit else f"- (taken for {data.time_unit})"
+        rows.append((name, role, unit or "-"))
+    return rows
+
+
+def _converted(unit: str, now: str) -> str:
+    """The unit of a column, and the unit after conversion; for a column without a unit the assigned unit."""
+    given = "" if now == "1" else now
+    return unit if unit == now else f"{unit}, converted to {now}" if unit else given

@@ -10,9 +10,9 @@ from typing import Any, Literal, TypedDict
 import torch
 
 import herglotz
-from herglotz.data.column_table import INPUT_TERM
 from herglotz.data.files import PathLike
 from herglotz.data.holds import Arrival, check_arrival
+from herglotz.data.trajectories import INPUT_TERM
 from herglotz.errors import InputError, refuse
 from herglotz.models import ContactLagrangian, OwnLagrangian
 from herglotz.schema import check_entries

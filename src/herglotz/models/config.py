@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from herglotz.choices import LEVELS as LEVELS
 from herglotz.errors import InputError, refuse
 from herglotz.models.drag import parse_drag
 from herglotz.models.features import expand, parse
@@ -13,7 +14,6 @@ from herglotz.models.term import check_terms
 from herglotz.models.translations import check_translations
 from herglotz.schema import from_plain
 
-LEVELS = ("conservative", "linear", "affine", "full", "forced")
 # Powers of s that L may have beside −γ s, by name.
 POWERS = {"s^2": 2, "s^3": 3}
 

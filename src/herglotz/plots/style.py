@@ -18,6 +18,7 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from matplotlib.ticker import LogFormatter, MaxNLocator
 from PIL import Image
 
+from herglotz.choices import FIGURES
 from herglotz.data import Trajectories
 from herglotz.data.files import PathLike, folder_at, write_atomically
 from herglotz.errors import InputError
@@ -30,7 +31,6 @@ INK, MODEL, UNSEEN, ACCENT, MUTED = "#222222", "#0072B2", "#D55E00", "#009E73", 
 SERIES = (MODEL, UNSEEN, ACCENT, "#CC79A7", "#E69F00", "#56B4E9")
 # Backgrounds: of samples outside training, and of the range of the data.
 SHADE, SUPPORT = "#FBEDE3", "#EAF2F8"
-FORMATS = ("png", "svg", "pdf")
 
 STYLE: Any = {
     "font.size": 9.5,
@@ -83,8 +83,8 @@ def save_figure(figure: Figure, path: PathLike) -> None:
     Raise InputError if the name has another extension, or the file cannot be written.
     """
     form = Path(path).suffix.lower().removeprefix(".")
-    if form not in FORMATS:
-        raise InputError(f"{path}: a figure's name must end in .{', .'.join(FORMATS)}")
+    if form not in FIGURES:
+        raise InputError(f"{path}: a figure's name must end in .{', .'.join(FIGURES)}")
     write_atomically(path, image(figure, form))
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.data import Trajectories
-from herglotz.data.column_table import column_rows
 from herglotz.data.files import folder_at, write_atomically
+from herglotz.data.trajectories import column_rows
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.errors import InputError
 from herglotz.models import refuse_own

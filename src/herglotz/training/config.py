@@ -8,17 +8,13 @@ from typing import Any
 
 import torch
 
+from herglotz.choices import LEVELS, OBJECTIVES, OPTIMISERS, ROBUST, SUPERVISION
 from herglotz.data import Trajectories
 from herglotz.errors import InputError, refuse
-from herglotz.models import LEVELS
 from herglotz.models.network import ACTIVATIONS
 from herglotz.models.term import TERMS
 from herglotz.schema import from_plain
 
-OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
-OPTIMISERS = ("lm", "adam", "adamw")
-SUPERVISION = ("q", "qs", "qps")
-ROBUST = ("auto", "on", "off")
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 CHOICES = {
     "level": ("auto", *LEVELS), "objective": OBJECTIVES, "optimiser": OPTIMISERS, "robust": ROBUST,

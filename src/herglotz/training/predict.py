@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from herglotz.choices import WARMUP
 from herglotz.data import Trajectories
 from herglotz.data.driving import acting
 from herglotz.data.input_terms import input_terms_of, with_input_terms, with_waves
@@ -32,9 +33,6 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import fit_states
 from herglotz.training.verdict import STATE_ITERATIONS
-
-# Leading samples that the state is estimated from.
-WARMUP = 20
 
 
 @dataclass(frozen=True, repr=False)

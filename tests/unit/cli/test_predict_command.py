@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 
 from herglotz.cli import main
-from herglotz.cli.predict import WARMUP
-from herglotz.training import load_run, predict, save_run
+from herglotz.training import load_run, save_run
 
 
 @pytest.fixture(scope="module")
@@ -16,11 +15,6 @@ def other_csv(tmp_path_factory):
     arguments = ["--trajectories", "2", "--steps", "60", "--h", "0.2", "--noise", "0.005", "--seed", "8"]
     assert main(["simulate", "damped_pendulum", "--out", str(path), *arguments]) == 0
     return path
-
-
-def test_the_copy_of_the_default():
-    # fails if the help promises another warm-up than the function takes
-    assert predict.WARMUP == WARMUP
 
 
 def test_json_has_the_promised_numbers(tiny_run, other_csv, capsys):

@@ -8,7 +8,7 @@ from herglotz.errors import InputError
 
 
 def written(folder, header, rows, name="a.csv"):
-    text = "\n".join(",".join("" if x != x else repr(x) for x in row) for row in rows)
+    text = "\n".join(",".join("" if x != x else x if isinstance(x, str) else repr(x) for x in row) for row in rows)
     (folder / name).write_text(f"{header}\n{text}\n")
     return folder / name
 
@@ -219,3 +219,81 @@ def test_a_column_that_numbers_the_recordings_is_named(tmp_path):
     # One row out of order is no second recording.
     with pytest.raises(InputError, match="sort the rows, delete one, or number the trajectories"):
         load(written(tmp_path, "t,x,y", [[0.0, 1.0, 1.0], [0.2, 1.0, 2.0], [0.1, 2.0, 3.0], [0.3, 2.0, 4.0]]))
+
+
+def cells(*columns):
+    """The rows of these columns."""
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+CLOCK = [0.1 * (k % 4) for k in range(12)]
+MOTION = [(k + 1) ** 1.5 for k in range(12)]
+
+
+@pytest.mark.parametrize(
+    ("labels", "names"),
+    [
+        (["a"] * 4 + ["b"] * 4 + ["c"] * 4, ["a", "b", "c"]),
+        (["up"] * 4 + ["down"] * 4 + ["up"] * 4, ["up", "down", "up (2)"]),
+        (["one.csv"] * 4 + ["two.csv"] * 4 + ["3"] * 4, ["one.csv", "two.csv", "3"]),
+    ],
+    ids=["letters", "phases come again", "names of files"],
+)
+@pytest.mark.parametrize("name", ["swing", "file", "action"])
+def test_a_column_of_text_that_changes_where_time_starts_anew_groups_the_rows(tmp_path, capsys, labels, names, name):
+    # fails if text is refused as no number, two recordings of one phase become one, or a frame is read otherwise
+    rows = cells(labels, CLOCK, MOTION)
+    path = written(tmp_path, f"{name},t,x", rows)
+    frame = dict(zip((name, "t", "x"), map(np.array, zip(*rows, strict=True)), strict=True))
+    for data in (load(path), as_trajectories(frame), load(path, group=name)):
+        assert (data.lengths, data.names, data.u) == ((4, 4, 4), ("x",), None)
+        assert data.recordings == tuple(f"{name} {one}" for one in names)
+    said = f"{name} is taken for the name of the recording, but by its values alone"
+    assert capsys.readouterr().err.count(said) == 2
+
+
+@pytest.mark.parametrize(
+    ("header", "labels", "cell"),
+    [
+        ("swing,t,x", ["a"] * 5 + ["b"] * 7, "a"),
+        ("y[m],t,x", ["lost"] * 4 + ["none"] * 4 + ["found"] * 4, "lost"),
+        ("swing,t,x", ["only"] * 12, "only"),
+    ],
+    ids=["changes elsewhere", "a position", "one text, no groups"],
+)
+def test_other_text_is_refused_with_both_remedies(tmp_path, header, labels, cell):
+    # fails if text that groups no rows is left aside unsaid, or a remedy is missing
+    name = header.split(",")[0].split("[")[0]
+    with pytest.raises(InputError, match=f"row 2, column '{name}': '{cell}' is not a number; .*--drop {name} .*--group "
+                       f"{name} "):  # fmt: skip
+        load(written(tmp_path, header, cells(labels, CLOCK, MOTION)))
+    path = written(
+        tmp_path, "trial,swing,t,x", cells([k // 4 for k in range(12)], ["a"] * 5 + ["b"] * 7, CLOCK, MOTION)
+    )
+    with pytest.raises(InputError, match=r"column 'swing': 'a' is not a number; .*--drop swing .*--group swing "):
+        load(path)
+
+
+@pytest.mark.parametrize("constant", ["experiment", "trial id", "session", "place"])
+@pytest.mark.parametrize("cell", [3, "lab"])
+def test_a_column_that_is_the_same_in_every_row_is_left_aside_beside_the_groups(tmp_path, capsys, constant, cell):
+    # fails if it is refused, is a coordinate, or leaves without a word; if a group that varies does
+    run = [k // 4 for k in range(12)]
+    data = load(written(tmp_path, f"{constant},run,t,x", cells([cell] * 12, run, CLOCK, MOTION)))
+    assert (data.lengths, data.names) == ((4, 4, 4), ("x",))
+    assert dict((name, role) for name, role, _ in data.columns)[constant] == "left aside"
+    assert f"{constant} is the same in every row, and is left aside" in capsys.readouterr().err
+    with pytest.raises(InputError, match="both a column experiment and a column run; keep one"):
+        load(written(tmp_path, "experiment,run,t,x", cells(run[::-1], run, CLOCK, MOTION)))
+    # A coordinate that says what it is stays, and the fit says that it never moves.
+    assert load(written(tmp_path, "y[m],run,t,x", cells([3] * 12, run, CLOCK, MOTION))).names == ("y", "x")
+
+
+def test_a_position_numbers_no_recordings(tmp_path):
+    # fails if a height that is another in each recording leaves the coordinates
+    path = written(tmp_path, "y[m],t,x[m]", cells([k // 4 for k in range(12)], CLOCK, MOTION))
+    with pytest.raises(InputError, match=r"column 't': 0.0 does not increase .* --group y \(group= in Python\)"):
+        load(path)
+    assert load(path, group="y").lengths == (4, 4, 4)
+    index = written(tmp_path, "y[m],index,t,x", cells([3] * 12, [k // 4 for k in range(12)], CLOCK, MOTION))
+    assert (load(index).lengths, load(index).names) == ((4, 4, 4), ("y", "x"))

@@ -10,7 +10,7 @@ from herglotz.cli import main
 from herglotz.cli.flags import columns_of
 from herglotz.cli.parser import build_parser
 from herglotz.data import Trajectories, as_trajectories, load, save
-from herglotz.data.table import from_frame
+from herglotz.data.sheet import from_frame
 from herglotz.data.units import in_degrees, size
 from herglotz.errors import InputError
 from herglotz.training.run_folder import reading_in

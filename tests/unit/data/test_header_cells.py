@@ -5,8 +5,8 @@ import math
 import pytest
 
 from herglotz.data import load
+from herglotz.data.column_roles import heads_of
 from herglotz.data.csv_columns import assign
-from herglotz.data.header_cells import heads_of
 
 # Cells, and name, unit and role of each.
 UNITS = {
@@ -23,7 +23,9 @@ UNITS = {
     "omega_rad_per_s": ("omega", "rad/s", "left aside"), "housing_degC": ("housing", "degC", "left aside"),
     "pos_V": ("pos", "V", "left aside"), "flow_lpm": ("flow", "lpm", "left aside"),
     "pressure_bar": ("pressure", "bar", "left aside"), "power_W": ("power_W", "", "left aside"),
+    "flux_Wb": ("flux", "Wb", "left aside"), "gap_mil": ("gap", "mil", "coordinate"),
     # Indices and words. Roles are those of the whole names.
+    "left_feet": ("left_feet", "", "coordinate"), "x_lb": ("x_lb", "", "coordinate"),
     "theta_m": ("theta_m", "", "coordinate"), "x_A": ("x_A", "", "coordinate"), "q_s": ("q_s", "", "coordinate"),
     "x_g": ("x_g", "", "coordinate"), "x_min": ("x_min", "", "coordinate"), "phi_bar": ("phi_bar", "", "coordinate"),
     "tau_m": ("tau_m", "", "input"), "y_in": ("y_in", "", "coordinate"), "motor_cm": ("motor_cm", "", "input"),

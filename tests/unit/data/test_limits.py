@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from herglotz.data import Trajectories, csv_format, load, npz_format as npz
+from herglotz.data import Trajectories, load, npz_format as npz, sheet
 from herglotz.data.checks import check_sizes
 from herglotz.data.csv_format import read_csv
 from herglotz.data.npz_format import read_npz
@@ -92,9 +92,9 @@ def test_numbers_are_parsed_as_cell_by_cell(tmp_path, monkeypatch, name):
     path = tmp_path / "motion.csv"
     path.write_bytes(TABLES[name].encode())
     with monkeypatch.context() as patch:
-        patch.setattr(csv_format, "_parse_rows", lambda *_: pytest.fail("parses cell by cell"))
+        patch.setattr(sheet, "number", lambda *_: pytest.fail("parses cell by cell"))
         fast = read_csv(path)
-    monkeypatch.setattr(csv_format, "_plain_numbers", lambda *_: None)
+    monkeypatch.setattr(sheet, "EXACT", 0)
     careful = read_csv(path)
     assert fast.digest() == careful.digest()
     assert (fast.columns, fast.hold, fast.lengths) == (careful.columns, careful.hold, careful.lengths)

@@ -15,6 +15,12 @@ ROLES = {
     "tau[rad/s]": "left aside", "command[m]": "input", "ServoCurrent [mA]": "input", "drive[%]": "input",
     "push[lbf]": "input", "armature[A]": "input", "housing[°C]": "left aside", "oil[bar]": "left aside",
     "supply_voltage[V]": "left aside", "MotorTemp[C]": "left aside", "loop[ms]": "left aside", "power[W]": "left aside",
+    # Units of other fields, and of other countries.
+    "flux[Wb]": "left aside", "linkage[mWb]": "left aside", "field[mT]": "left aside", "coil[mH]": "left aside",
+    "plate[pF]": "left aside", "oil[kPa]": "left aside", "gap[mil]": "coordinate", "tilt[arcsec]": "coordinate",
+    "tilt[arcmin]": "coordinate", "spool[revs]": "coordinate", "stage[inches]": "coordinate", "grip[lb]": "input",
+    "wrench[ft-lb]": "input", "crank[N-m]": "input", "servo[oz-in]": "input", "pull[kN]": "input", "bearing[K]":
+    "left aside", "line[Hz]": "left aside", "spindle[turns]": "coordinate", "mill[rev/min]": "left aside",
     # What is wanted of a motion is an input.
     "q_cmd": "input", "thetaRef": "input", "Set Point [mm]": "input", "x_desired[m]": "input", "demand": "input",
     "set_position": "input", "wanted angle": "input", "Sollwinkel": "input", "x_set[m]": "input", "set": "coordinate",
@@ -146,6 +152,7 @@ GUESSES = {
     "valve[bar]": "is left aside, but it may be an input",
     "x_lp": "is left aside, but it may be more than a filtered copy of another column; if so, give --inputs x_lp or",
     "pot[V]": "is left aside, but it may be the reading of a position",
+    "flux[Wb]": "is left aside, but it may be the reading of a position; if so, give --inputs flux or",
     "motor_x": "is taken for a coordinate, but its name may be that of an input",
     "input_angle": "is taken for a coordinate, but its name may be that of an input",
     "load": "is taken for a coordinate, but no unit and no usual name says so; else give --inputs load or --drop load",
@@ -212,7 +219,7 @@ def test_two_times_are_asked_for(tmp_path):  # fails if one of two is chosen uns
     assert read(tmp_path, table("t,loop_time,x[m]")).names == ("x",)
 
 
-@pytest.mark.parametrize("head", ["y[V]", "pot[mV]", "x1[%]", "theta[V]"])
+@pytest.mark.parametrize("head", ["y[V]", "pot[mV]", "x1[%]", "theta[V]", "flux[Wb]", "flux(mWb)", "hall[T]"])
 def test_volts_of_a_sensor_are_a_coordinate_where_nothing_else_is(head):
     # fails if a circuit that is a mechanism's analogue is refused, or volts are a second coordinate beside metres
     alone = assign(["t[s]", head, "u[V]"], "header")
