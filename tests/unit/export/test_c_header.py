@@ -52,19 +52,6 @@ def eager_rollout(model, states, **options):
 
 
 @needs_compiler
-def test_irregular_steps_and_single_steps():
-    # fails if the guess extrapolates over unequal steps, e^(-γh) is kept when h changes, or step differs from rollout
-    model, states = damped(2, "correction"), states_of(2, 3)
-    h = torch.tensor([[0.1, 0.3, 0.1, 0.1, 0.2], [0.2] * 5, [0.05, 0.1, 0.1, 0.1, 0.1]], dtype=torch.float64)
-    compiled = compile_c(model)
-    ours, eager = compiled.rollout(*states, h=h), eager_rollout(model, states, h=h)
-    assert relative(ours.q, eager.q) <= 1e-13
-    step = compiled.step(states, h[:, 0])
-    assert relative(step.state.p, eager.p[:, 1]) <= 1e-13
-    assert relative(step.c, eager.sigma[:, 1]) <= 1e-14
-
-
-@needs_compiler
 def test_a_plain_network_agrees_with_the_eager_stepper():
     # fails if the model without a baseline gets a kinetic term, or a failure is not reported as the eager one does
     model, states = damped(1, "alone"), states_of(1, 20)
