@@ -103,6 +103,15 @@ def test_degrees_are_reported_and_written_back(tmp_path):
     assert [size(0.1, "rad", True), size(0.1, "rad"), size(2.0, "1")] == ["0.1 rad = 5.73 deg", "0.1 rad", "2"]
 
 
+def test_dates(tmp_path):  # fails if a date is refused, or its fractions of a second are lost
+    text = "timestamp,x\n2026-03-01 23:59:59.50,1\n2026-03-01T23:59:59.75,2\n2026-03-02 00:00:01,3\n"
+    data = read(tmp_path, text)
+    assert (data.t.tolist(), data.time_unit) == ([0, 0.25, 1.5], "s")
+    assert "date, converted to s" in data.table()
+    with pytest.raises(InputError, match=r"row 3: .* differ in having a time zone"):
+        read(tmp_path, "time,x\n2026-03-01T10:00:00Z,1\n2026-03-01T10:00:01,2\n2026-03-01T10:00:02,2\n")
+
+
 def test_the_users_word_counts(tmp_path):  # fails if a column keeps the role of its name against the user's word
     text = "clock,t,run,a,b,u,F\n" + rows([0, 1, 2], [9, 9, 9], list("zzz"), [1, 2, 3], [4, 5, 6], [7, 8, 9], [1, 1, 1])
     data = read(tmp_path, text, time="clock", group="run", inputs="b", drop="a", coordinates=["u"])

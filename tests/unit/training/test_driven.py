@@ -113,6 +113,14 @@ def test_noisy_data_with_gaps():
     assert 0.7 < float(bands.inside(run.data.q).double().mean()) <= 1.0
 
 
+def test_a_given_map_is_kept():
+    # fails if the given map is trained
+    run = fit(driven_data(), FitConfig(objective="residual", iterations=5, input_map=(GAIN,)), progress=False)
+    friction: Any = run.model.friction
+    assert not friction.input_map.requires_grad
+    assert friction.input_map.item() == GAIN
+
+
 def test_saved_runs_and_the_c_stepper_are_driven(exact_run, tmp_path):
     # fails if the file forgets the map or the inputs' zero, or verify steps without u
     save_run(exact_run, tmp_path / "run")
