@@ -43,17 +43,6 @@ def test_the_parachute_up_to_its_pole(distance):
         torch.testing.assert_close(step.state.q, exact, rtol=1e-12, atol=100 * 10 * 2.2e-16 / distance)
 
 
-def test_both_sides_of_the_separatrix():
-    # fails if the pendulum turns over, or does not, on the wrong side of the energy 2
-    model = build(level="conservative", potential_width=0)
-    with torch.no_grad():
-        out = Stepper(model).rollout(*state([[0.0], [0.0]], [[2.0 - 1e-2], [2.0 + 1e-2]]), h=0.05, steps=400)
-    assert bool(out.ok.all())
-    assert (out.q.amax((1, 2)) > math.pi).tolist() == [False, True]
-    energy = out.p[..., 0] ** 2 / 2 + 1 - torch.cos(out.q[..., 0])
-    assert float((energy - energy[:, :1]).abs().max()) < 1.5e-3  # h²/2: order 2, and bounded
-
-
 @pytest.mark.parametrize("settings", [{}, {"correction_width": 4}], ids=["explicit", "newton"])
 def test_on_the_separatrix(settings):
     # fails if a motion that may stay at the top for ever, or fall to either side, is not finite, drifts in energy

@@ -5,7 +5,7 @@ import torch
 from extreme_cases import LEVELS, TOLD, assert_nothing_silent, build, starts
 
 import herglotz
-from herglotz.stepping import StepError, Stepper, explain_step
+from herglotz.stepping import Stepper
 from tests.compilers import needs_compiler
 
 WILD = {
@@ -13,34 +13,11 @@ WILD = {
     "forced": (100.0, {"level": "forced", "coulomb": True, "correction_width": 8}),
     "correction": (30.0, {"correction_width": 8}),  # at 100 eager Newton solves none of these
 }
-FEW = 5  # iterations of Newton where a failure is wanted: its explanation tries some 60 shorter steps with as many each
 
 
 def wild(name):
     noise, settings = WILD[name]
     return build(noise, draw=1, **settings)
-
-
-def test_the_first_failed_sample_is_named():
-    # fails if a step that fails names another sample, or no reason
-    model, start = wild("forced"), starts(16)
-    with torch.no_grad():
-        ok = Stepper(model, max_iterations=FEW).rollout(*start, h=0.5, steps=1).ok
-    first = int((~ok).nonzero()[0])
-    assert first > 0
-    with pytest.raises(StepError, match=rf"step failed at sample \({first},\): [A-Z_]+, residual"), torch.no_grad():
-        Stepper(model, max_iterations=FEW, throw=True).step(start, 0.5)
-
-
-def test_explain_names_every_failed_sample():
-    # fails if a sample that Newton gave up has no line
-    model, start = wild("mass"), starts(3)
-    with torch.no_grad():
-        failed = ~Stepper(model, max_iterations=FEW).rollout(*start, h=0.5, steps=1).ok
-    assert bool(failed.all())
-    lines = explain_step(model, start, 0.5, max_iterations=FEW)
-    for i in failed.nonzero()[:, 0].tolist():
-        assert any(line.startswith(f"sample ({i},), h = 0.5: ") for line in lines)
 
 
 @pytest.mark.parametrize("h", [1e-3, 0.5])

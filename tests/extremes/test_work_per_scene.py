@@ -182,43 +182,6 @@ def test_the_action_flow_is_evaluated_at_the_full_level_only(monkeypatch):
         assert bool(calls) == (name == "damping by s")
 
 
-def test_the_levels_cost_what_they_say():
-    # fails if a level that says less is dearer than one that says more
-    cost = [sum(operations({"level": level}).values()) for level in ("conservative", "linear", "affine", "full")]
-    assert cost == sorted(cost)
-    assert cost[2] > 3 * cost[1]  # no longer explicit
-    without, with_network = (sum(operations({"potential_width": w}).values()) for w in (0, 8))
-    assert without < with_network
-
-
-def test_what_a_step_evaluates(monkeypatch):
-    # fails if a step asks for more than its level needs: one slope of the potential where it is explicit, one value of
-    # each network an iteration where it is not, and no s-derivative where s enters linearly or not at all
-    counts = {}
-    for name, settings in {
-        "linear": {},
-        "linear, correction": {"correction_width": 4},
-        "affine": {"level": "affine", "damping_width": 4},
-        "affine, no drag network": {"level": "affine", "damping_width": 0},
-    }.items():
-        model = build(0.05, **settings)
-        calls = count_calls(monkeypatch, (Network, "forward"))
-        state, solved = starts(1), 0
-        with torch.no_grad():
-            for _ in range(4):
-                step = Stepper(model).step(state, 0.1)
-                state, solved = step.state, solved + step.iterations
-            zero = model.partials(*starts(1)[:2], starts(1).s, 0.1, 2)
-        counts[name] = (calls["forward"], solved)
-        if name.startswith("linear"):
-            assert not bool(zero.D13.any() | zero.D23.any() | zero.D33.any())
-        else:
-            assert bool(zero.D13.any())
-    assert counts["linear"][1] == 4  # one linear solve a step, by formula
-    assert counts["linear, correction"][1] > 4
-    assert counts["affine, no drag network"][0] < counts["affine"][0]
-
-
 def test_features_are_evaluated_as_often_as_they_must(monkeypatch):
     # fails if an explicit step takes a jet of its features or asks for them twice, features of speed are evaluated
     # without a new position, or those of one term stand for those of the other

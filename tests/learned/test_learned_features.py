@@ -66,27 +66,3 @@ def test_samples_far_apart_are_crossed_in_model_steps():
         torch.testing.assert_close(laplace(run).bands().q, run.prediction, rtol=0, atol=1e-8)
     assert max(found[4]) < 5e-5
     assert min(found[1]) > 10 * max(found[4])
-
-
-@pytest.mark.slow
-def test_a_chain_of_thirty_two():
-    # fails if the cost of a fit, or the rounding of a step, grows too fast with the number of coordinates
-    of = scene("chain", masses=32)
-    data = simulate(of, trajectories=2, steps=20, h=0.1, seed=0)
-    settings = FitConfig(
-        level="linear", objective="residual", train_fraction=1.0, features=("chain",), alike=True, order=4
-    )
-    run = fit(data, settings, progress=False)
-    assert run.metrics["rate"] == pytest.approx(0.1, abs=1e-5)
-    assert free_run(run.model, of, 0.1, 20) < 1e-4
-
-
-@pytest.mark.slow
-def test_two_links_are_learned_from_six_numbers():
-    # fails if the mass that depends on position is not found, or its part of the rule's error is wrong
-    of = scene("double_pendulum")
-    data = simulate(of, trajectories=10, steps=30, h=0.02, seed=0)
-    settings = FitConfig(level="linear", objective="residual", train_fraction=1.0, features=("pendulums",), order=4)
-    run = fit(data, settings, progress=False)
-    assert run.metrics["rate"] == pytest.approx(0.1, abs=1e-4)
-    assert free_run(run.model, of, 0.02, 50) < 1e-4

@@ -15,16 +15,6 @@ from herglotz.verify.subject import subject
 from tests.lagrangians import nonlinear, states
 
 H = 0.1
-OSCILLATOR = scene("damped_oscillator").L_d
-
-
-@pytest.mark.parametrize(("L_d", "n"), [(OSCILLATOR, 1), (nonlinear, 2)])
-def test_the_left_rows_pass(L_d, n):
-    # fails if the left formalism is not that of this L_d
-    report = verify((L_d, states(n)), h=H, steps=3)
-    assert report["left_equations"].value < 1e-13
-    assert report["left_hamilton_jacobi"].value < 1e-14
-    assert report.passed, report.table()
 
 
 @pytest.mark.parametrize("wrong", ["scaled", "shifted", "slope"])

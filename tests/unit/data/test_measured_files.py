@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from herglotz.data import load, read_csv, read_schmidt_lipson
+from herglotz.data import load, read_csv
 
 SHARED = Path(__file__).parents[3] / "../shared/data"
 pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no measured data in {SHARED}")
@@ -29,16 +29,6 @@ def test_real_pendulum():  # fails if a row is lost, gaps are closed up, or v is
     train, test = data.split_time(2 / 3)
     assert (train.samples, test.samples) == (371, 185)
     assert train.t[-1] < test.t[0]
-
-
-def test_velocity_column_is_not_the_derivative():  # fails if the reason for leaving v aside no longer holds
-    path = SHARED / "schmidt_lipson_2009/real_pend_h_1.txt"
-    data, v = read_schmidt_lipson(path), np.loadtxt(path, comments="%")[:, 3]
-    triples = data.triples(0.2)
-    slope = ((triples.q2 - triples.q0) / (triples.h0 + triples.h1))[:, 0].numpy()
-    sinc = np.sin(1.16 / 6) / (1.16 / 6)  # what a central difference loses at the pendulum's frequency
-    v = v[triples.index.numpy() + 1]
-    assert v @ slope / (slope @ slope) * sinc == pytest.approx(0.954, abs=0.02)
 
 
 def test_real_air_track():  # fails if pixels are unwrapped as angles

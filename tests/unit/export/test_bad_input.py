@@ -49,6 +49,8 @@ def test_other_arguments_are_refused(stepper):
     if "h_range" in stepper.metadata and stepper.metadata["h_range"] is not None:
         with pytest.raises(InputError, match="h must lie in"):
             stepper.step(State(q, p, s), 0.6)
+    with pytest.raises(InputError, match="match the batch"):
+        stepper.step(State(q, p, s), torch.full((2,), 0.1, dtype=torch.float64))
     with pytest.raises(InputError, match="takes no inputs"):
         stepper.rollout(q, p, s, h=0.1, steps=2, inputs=torch.zeros(3, 2, 1, dtype=torch.float64))
     for steps in (0, None):

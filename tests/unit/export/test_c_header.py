@@ -20,8 +20,8 @@ from tests.lagrangians import even_model, random_model, states as normal_states
 
 CXX = next((c for c in ("c++", "g++", "clang++") if shutil.which(c)), None)
 BOX = {"q_low": [-1.0], "q_high": [1.0], "p_low": [-1.0], "p_high": [1.0], "s_low": [-5.0], "s_high": [5.0]}
-KINDS = {"linear": ("linear", 0, True), "affine": ("affine", 0, True), "correction": ("linear", 6, True)}
-KINDS |= {"both": ("affine", 3, True), "alone": ("linear", 6, False)}
+KINDS = {"linear": ("linear", 0, True), "affine": ("affine", 0, True), "both": ("affine", 3, True)}
+KINDS |= {"alone": ("linear", 6, False)}
 
 
 def damped(n, kind, dtype=torch.float64):
@@ -49,19 +49,6 @@ def eager_rollout(model, states, **options):
     tol = 4e-16 if states.q.dtype == torch.float64 else None
     with torch.no_grad():
         return Stepper(model, tol=tol).rollout(*states, **options)
-
-
-@needs_compiler
-def test_irregular_steps_and_single_steps():
-    # fails if the guess extrapolates over unequal steps, e^(-γh) is kept when h changes, or step differs from rollout
-    model, states = damped(2, "correction"), states_of(2, 3)
-    h = torch.tensor([[0.1, 0.3, 0.1, 0.1, 0.2], [0.2] * 5, [0.05, 0.1, 0.1, 0.1, 0.1]], dtype=torch.float64)
-    compiled = compile_c(model)
-    ours, eager = compiled.rollout(*states, h=h), eager_rollout(model, states, h=h)
-    assert relative(ours.q, eager.q) <= 1e-13
-    step = compiled.step(states, h[:, 0])
-    assert relative(step.state.p, eager.p[:, 1]) <= 1e-13
-    assert relative(step.c, eager.sigma[:, 1]) <= 1e-14
 
 
 @needs_compiler
@@ -102,7 +89,7 @@ def test_no_compiler_warnings(tmp_path, dtype):
         tools.append([CXX, "-x", "c++", "-fsyntax-only"])
     source = tmp_path / "use.c"
     source.write_text('#include "stepper.h"\nint main(void) { return 0; }\n')
-    models = {kind: damped(2, kind) for kind in (["both", "alone"] if dtype == "float64" else ["linear", "correction"])}
+    models = {kind: damped(2, kind) for kind in (["both"] if dtype == "float64" else ["alone"])}
     options: dict[str, Any] = {"angles": (True, False), "potential_width": 3, "correction_width": 3}
     options |= dict.fromkeys(("scale", "speed", "stiffness", "tilt"), (1.0, 1.0))
     if dtype == "float64":

@@ -19,7 +19,7 @@ from herglotz.export.metadata import FORMAT
 from herglotz.export.step import StepGraphs, status_of, unfinished
 from herglotz.mechanics import flow_derivative, partials, step_derivative
 from herglotz.models import ModelConfig
-from herglotz.stepping import State, Status, Stepper
+from herglotz.stepping import State, Stepper
 
 
 @pytest.fixture(scope="module")
@@ -134,24 +134,6 @@ def test_a_file_names_no_local_path(written):
     assert b"src/herglotz" not in content
 
 
-def test_a_failed_sample_is_nan_and_leaves_its_neighbours_alone(written):
-    # fails if a status is lost or a failure spreads
-    exported = written[2]
-    q, p, s = states_of(2, 4)
-    p = p.clone()
-    p[2] = 1e200
-    with torch.no_grad():
-        step = exported.step(State(q, p, s), 0.1)
-        alone = exported.step(State(q[:1], p[:1], s[:1]), 0.1)
-        whole = exported.rollout(q, p, s, h=0.1, steps=3)
-    assert step.status.dtype == torch.uint8
-    assert (step.status == Status.CONVERGED).tolist() == [True, True, False, True]
-    for x in (*step.state, step.c, whole.q[:, -1], whole.sigma[:, -1]):
-        assert torch.isnan(x.reshape(4, -1)[:, 0]).tolist() == [False, False, True, False]
-    assert whole.ok.tolist() == [True, True, False, True]
-    torch.testing.assert_close(step.state.q[:1], alone.state.q)
-
-
 def newton(model, iterations, q, p, s, h):
     """The loop of the exported graphs, turned by hand."""
     graphs, h = StepGraphs(model), torch.full_like(s, h)
@@ -174,41 +156,6 @@ def test_the_loop_solves_what_the_eager_stepper_solves(n):
     assert (status == 0).float().mean() > 0.9
     both = (status == 0) & (eager.status == 0)
     torch.testing.assert_close(q1[both], eager.state.q[both], rtol=1e-9, atol=1e-9)
-
-
-def test_too_few_iterations_are_reported():
-    # fails if the status says converged whatever the residual is
-    model = model_of(1, "affine", correction=4)
-    q, p, s = states_of(1, 8)
-    with torch.no_grad():
-        _, status, residual = newton(model, 2, q, 5 * p, s, 0.5)
-    assert (status == Status.MAX_ITERATIONS).any()
-    assert (residual[status == Status.MAX_ITERATIONS] > 1e-12).all()
-
-
-def test_wrong_states_are_refused(written):
-    # fails if a wrong dtype or shape reaches the graph, which does not check
-    exported = written[2]
-    q, p, s = states_of(2, 4)
-    with pytest.raises(InputError, match=r"h must lie in \[0.01, 0.5\]"):
-        exported.step(State(q, p, s), 0.6)
-    with pytest.raises(InputError, match="takes no inputs"):
-        exported.step(State(q, p, s), 0.1, u=q)
-    with pytest.raises(InputError, match=r"q must be torch.float64, as the model is, got torch.float32"):
-        exported.step(State(q.float(), p.float(), s.float()), 0.1)
-    with pytest.raises(InputError, match="need shapes"):
-        exported.step(State(q, p[:3], s), 0.1)
-    with pytest.raises(InputError, match="no samples"):
-        exported.step(State(q[:0], p[:0], s[:0]), 0.1)
-    with pytest.raises(InputError, match="match the batch"):
-        exported.step(State(q, p, s), torch.full((3,), 0.1, dtype=torch.float64))
-    for h in (0.0, -0.1, float("nan"), float("inf")):
-        with pytest.raises(InputError, match="h must be"):
-            exported.step(State(q, p, s), h)
-    with pytest.raises(InputError, match="scalar h needs steps"):
-        exported.rollout(q, p, s, h=0.1)
-    with pytest.raises(InputError, match="lists 2 steps but steps=3"):
-        exported.rollout(q, p, s, h=torch.tensor([0.1, 0.1]), steps=3)
 
 
 def test_files_of_others_are_refused(tmp_path):

@@ -125,33 +125,6 @@ def test_backtracking_with_a_kept_jacobian():
         assert float(F.abs().max()) < 1e-13
 
 
-def bent(q0, q1, s0, h):
-    """A step equation of n coordinates, F = q0-gradient, with J singular at q1 = 0, flat and steep stretches."""
-    first = (-q0 * (q1**3 + torch.tanh(20 * (q1 - 1)) / 10)).sum(-1)
-    return first - 0.3 * (q0[..., 0] * q1[..., -1] ** 2) + 0 * s0 * h
-
-
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_one_sample_alone_takes_the_way_that_it_takes_in_a_batch(n, order):
-    # fails if the loop in plain numbers decides otherwise: line search, kept Jacobian, floor, NaN, singular J, limit
-    make = torch.Generator().manual_seed(5)
-    q = torch.zeros(12, n, dtype=torch.float64)
-    p, guess = (torch.randn(12, n, generator=make, dtype=torch.float64) for _ in range(2))
-    guess[0], p[1], p[2, 0], p[3], guess[4] = 0.0, torch.nan, torch.inf, 0.0, 1e6
-    s, h = torch.zeros(12, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
-    statuses = set()
-    for limit in (5, 40):
-        whole = solved(bent, State(q, p, s), h, guess, limit, order)
-        for i in range(12):
-            alone = solved(bent, State(q[i], p[i], s[i]), h, guess[i], limit, order)
-            assert int(alone.status) == int(whole.status[i]), i
-            statuses.add(int(alone.status))
-            torch.testing.assert_close(alone.q1, whole.q1[i], rtol=1e-12, atol=1e-12, equal_nan=True)
-            assert alone.iterations <= whole.iterations
-    assert statuses == {Status.CONVERGED, Status.MAX_ITERATIONS, Status.SINGULAR, Status.DIVERGED}
-
-
 def test_the_solution_of_two_equations():
     # fails if the elimination for n = 2 lacks its row exchange, or hides a singular matrix
     make = torch.Generator().manual_seed(6)
@@ -202,15 +175,6 @@ def test_gradient_of_a_small_float32_step():
     pairs = zip(gradient(model, start), gradient(twin, [x.double() for x in start]), strict=True)
     for a, b in pairs:
         torch.testing.assert_close(a.double(), b, rtol=2e-4, atol=2e-5)
-
-
-def test_gradients_with_respect_to_h_and_the_state():
-    # fails if h, q, p or s is cut off from the solved step
-    model = random_model(LEVELS["affine"])
-    q, p, s = states(1, batch=2)
-    h = torch.tensor([0.2, 0.3], dtype=torch.float64)
-    step = lambda q, p, s, h: tuple(Stepper(model).step(State(q, p, s), h).state)  # noqa: E731
-    assert torch.autograd.gradcheck(step, [x.requires_grad_() for x in (q, p, s, h)], atol=1e-8)
 
 
 def test_sharp_friction_misleads_no_old_jacobian():

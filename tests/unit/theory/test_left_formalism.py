@@ -123,7 +123,8 @@ def test_both_sets_of_equations_on_the_flow(name):
         close(value, expected, 1e-12)
 
 
-@pytest.mark.parametrize("name", CASES)
+# The numerically exact L_d, whose values are integrals, takes thirty times as long as the others.
+@pytest.mark.parametrize("name", [name for name in CASES if name != "numerically exact"])
 def test_steps_by_right_and_by_left_equations(name):
     # fails if three ways to the same map, Newton on FL⁻, right and left equations, differ
     L_d, h, start, end, _ = solved(name)

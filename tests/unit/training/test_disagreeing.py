@@ -139,17 +139,14 @@ def test_a_recording_that_differs_little_is_left_out():
 
 
 @pytest.mark.parametrize(
-    ("damping", "scale", "starts"),
-    [
-        (0.36, 1.0, ((0.8, 0.5), (-1.5, -0.6), (1.0, 0.9), (-1.9, 0.3), (1.3, -0.8))),
-        (0.3, 1.06, ((0.8, 0.5), (-1.5, -0.6), (1.0, 0.9), (-1.9, 0.3), (1.3, -0.8))),
-    ],
+    ("damping", "scale"),
+    [(0.36, 1.0), pytest.param(0.3, 1.06, marks=pytest.mark.slow)],  # slow: 8 s, by the same comparison
 )
-def test_a_recording_that_short_segments_do_not_tell_is_left_out(damping, scale, starts):
+def test_a_recording_that_short_segments_do_not_tell_is_left_out(damping, scale):
     # fails if recordings are followed over 20 steps alone: a fifth more damping, or 6 % of scale, bent the model, and
     # the verdict was that the force depends on the past
     of, t, q = torch.Generator().manual_seed(1), 0.04 * torch.arange(200).double(), []
-    x = torch.tensor(starts, dtype=torch.float64).T
+    x = torch.tensor([(0.8, -1.5, 1.0, -1.9, 1.3), (0.5, -0.6, 0.9, 0.3, -0.8)], dtype=torch.float64)
     c, factor = torch.tensor([[0.3, 1.0]] * 2 + [[damping, scale]] + [[0.3, 1.0]] * 2, dtype=torch.float64).T
     for _ in range(len(t)):
         q.append(x[0] * factor)

@@ -22,7 +22,6 @@ from herglotz.training import (
     laplace,
     load_run,
     save_run,
-    select,
 )
 from herglotz.training.problems.grid import segment_grid, step_inputs
 from herglotz.verify import verify
@@ -112,17 +111,6 @@ def test_noisy_data_with_gaps():
     assert friction.input_map.item() == pytest.approx(GAIN, rel=0.05)
     bands = laplace(run).bands()
     assert 0.7 < float(bands.inside(run.data.q).double().mean()) <= 1.0
-
-
-def test_select_compares_what_fit_does():
-    # fails if select fits driven data without the dry friction that fit gives them
-    data, settings = driven_data(), FitConfig(objective="residual", iterations=3, correction_width=0)
-    found = select(data, seeds=1, config=settings, progress=False)
-    plain, auto = found.candidates
-    assert (plain.level, auto.level) == ("forced", "auto")
-    assert auto.best.decided == fit(data, settings, progress=False).decided
-    assert auto.best.decided.coulomb
-    assert not plain.best.decided.coulomb
 
 
 def test_a_given_map_is_kept():

@@ -3,7 +3,6 @@
 from dataclasses import fields, replace
 from typing import Any
 
-import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
@@ -91,46 +90,6 @@ def test_forced_level_recovers_the_friction_of_each_joint():
     _, linear = one_step_fit(data, level="linear", potential_width=0)
     assert float((found - b).abs().max()) < 1e-3
     assert rms(error) < 1e-3 * rms(linear)
-
-
-@pytest.mark.slow
-def test_dry_friction_is_found():
-    # fails if Coulomb's force cannot grow from its start at 0
-    sizes = {"angles": (True,), "scale": (1.2,), "speed": (1.5,)}
-    truth = build(ModelConfig(**sizes, level="forced", coulomb=True, rate=0.05, potential_width=0))
-    with torch.no_grad():
-        truth.friction.coulomb.fill_(0.1)
-        truth.friction.log_smooth.fill_(-1.5)
-        out = Stepper(truth).rollout(*starts(6, 1), h=0.1, steps=60)
-    t = (torch.arange(61, dtype=torch.float64) * 0.1).repeat(6)
-    data = Trajectories.of(t, out.q.flatten(0, 1), (61,) * 6, angles=(True,))
-    model, _ = one_step_fit(data, level="forced", coulomb=True, potential_width=0, iterations=150)
-    v = torch.linspace(-1.0, 1.0, 21, dtype=torch.float64)[:, None]
-    with torch.no_grad():
-        f = [m.friction.value_and_slope(v, None)[0] - m.damping.rate * v for m in (model, truth)]
-    assert float((f[0] - f[1]).abs().max()) < 1e-3
-
-
-@pytest.mark.slow
-def test_damping_that_affine_networks_learned_is_the_true_one():
-    # fails if ∂g/∂q is missing from the fit, or g stands in for V: of a rate between 0.4 and 0.5 over the data 5e-4 is
-    # missed at most. V is not compared: s + b(q) in the place of s has the same motion and c, and another V.
-
-    def field(q, p, s):
-        rate = (0.3 + 0.2 * torch.cos(q))[..., 0]
-        V, slope = (1 - torch.cos(q) + q * q / 4)[..., 0], torch.sin(q) + q / 2
-        force = -slope + 0.2 * torch.sin(q) * s[..., None] - rate[..., None] * p
-        return p, force, (p * p / 2)[..., 0] - V - rate * s
-
-    q, p, s = starts(12, 1)
-    data = recorded(field, q, p, 2 * s, 0.1, 20)
-    widths = {"potential_width": 6, "correction_width": 4, "damping_width": 6}
-    model, _ = one_step_fit(data, iterations=60, level="affine", s0=2 * s, **widths)
-    low, high = (float(data.q.quantile(x)) for x in (0.02, 0.98))
-    x, h = torch.linspace(low, high, 41).double()[:, None], torch.full((41,), 1e-3).double()
-    with torch.no_grad():
-        rate = -model.partials(x, x, torch.zeros_like(h), h).c.log() / h
-    assert float((rate - (0.3 + 0.2 * torch.cos(x[:, 0]))).abs().max()) < 2e-3
 
 
 def test_a_mass_that_depends_on_position_is_found():

@@ -57,6 +57,13 @@ def test_the_equation_is_printed_with_deviations(duffing):
     assert str(Equation.from_dict(stored)) == text
 
 
+def test_the_final_fit_takes_no_longer_segments_than_the_search(duffing):
+    # fails if whole trajectories are fitted of a motion that a search could follow over segments alone
+    plan = replace(Plan.from_dict(duffing.metrics["plan"]), longest=40)
+    assert duffing.metrics["segment_steps"] > 130 * plan.substeps
+    assert fit(duffing.data, plan=plan, progress=False).metrics["segment_steps"] < 50 * plan.substeps
+
+
 def test_the_equation_has_the_names_of_the_file():
     # fails if a force is called u where its column has a name, its unit is lost, or degrees are not told
     one = (1.0,)

@@ -1,7 +1,6 @@
 """An L_d of one's own: its losses, its fit, and the files that it is written to."""
 
 import math
-import shutil
 from typing import Any
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 from torch import nn
 
 import herglotz as hz
-from herglotz.export import compare, compile_c, export_pt2
+from herglotz.export import export_pt2
 from herglotz.mechanics import autograd_partials
 from herglotz.models import OwnLagrangian
 from herglotz.stepping import Stepper
@@ -174,16 +173,6 @@ def test_starts_of_another_length_are_refused():  # fails if segments are cut el
         hz.losses.shooting(Spring(), q, H, hz.losses.starts(q, 10), length=5)
 
 
-def test_gradients_go_through_a_rollout_to_parameters_and_start():  # fails if the solve is cut off from the graph
-    L_d = Spring(bend=0.3)
-    q = torch.tensor([0.7], dtype=torch.float64, requires_grad=True)
-    end = lambda: Stepper(L_d).rollout(q, 0 * q.detach(), h=H, steps=20).q[-1, 0]  # noqa: E731
-    end().backward()
-    for x in (q, *L_d.parameters()):
-        assert x.grad is not None
-        assert float(x.grad) == pytest.approx(least(end, x), rel=1e-6)
-
-
 def test_functional_derivatives_are_those_of_autograd():  # fails if a block is transposed or takes another row
     L_d, make = Spring(bend=0.3), torch.Generator().manual_seed(0)
     mixed = lambda q0, q1, s0, h: L_d(q0, q1, s0, h) + (q0[..., 0] * q1[..., 1] ** 2) * s0  # noqa: E731
@@ -223,14 +212,6 @@ def test_a_run_says_what_it_cannot_do_with_a_module(fitted, tmp_path):  # fails 
     with pytest.raises(hz.InputError, match="no plan"):
         run.plot("plan")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
-def test_a_module_is_written_as_c(fitted):  # fails if C has another potential, or rounds its derivative
-    net, run = fitted
-    found = compare(compile_c(OwnLagrangian(net, 1), h=H), run.stepper, batches=(1, 7), steps=100, h=H)
-    assert found["failed"] == found["status"] == 0
-    assert max(found[x] for x in "qpsc") < 1e-12
 
 
 def test_what_cannot_be_fitted_says_so():  # fails if the message names a setting that the user did not give
