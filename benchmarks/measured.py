@@ -1,11 +1,10 @@
-"""Noise, outliers, motors, bands and measured data, seed by seed: `python benchmarks/measured.py [--seeds 5]`.
+"""Outliers, unknown forces, a motor, bands and measured data: `python benchmarks/measured.py [--seeds 5]`.
 
 Writes results/measured.json and .md, and coverage.png. Settings are the defaults unless a set says otherwise
-(measured_sets.py says what each is). Sets that are absent are skipped
+(measured_sets.py says what each is). Further sets are rows of the judge. Sets that are absent are skipped
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
-run alone. Seconds of one core for each seed: noise 1, one_trajectory 1, outliers 2, disturbed 25, real_pendulum 4,
-real_pendulum_network 4, air_track 2, driven_pendulum 65, coverage_simulated 27, coverage_real about 90, motor_axis 55
-(two fits), duffing_circuit 28, two_joints 120, two_motors 800. `cpu_seconds` in the table says what it took.
+run alone. Seconds of one core for each seed: outliers 2, disturbed 25, real_pendulum 4, real_pendulum_network 4,
+air_track 2, driven_pendulum 65, coverage_simulated 27, coverage_real about 90.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +24,12 @@ from herglotz.plots import style
 
 COVERED = (0.80, 0.97)  # share of samples inside a band of nominal 0.9 that counts as kept
 TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest value that meets it
-    ("noise", "rms_100_steps"): (0.0, 0.01),
     ("outliers", "over_clean"): (0.0, 2.0),
     ("real_pendulum", "extrapolation_rms"): (0.0, 0.013),
     ("real_pendulum_network", "extrapolation_rms"): (0.0, 0.013),
     ("air_track", "extrapolation_rms"): (0.0, 0.50),
     ("driven_pendulum", "over_authors_1.0s"): (0.0, 1.0),
     ("driven_pendulum", "over_authors_2.0s"): (0.0, 1.0),
-    ("motor_axis", "rms"): (0.0, 0.005),
-    ("motor_axis", "same_part_rms"): (0.0, 0.005),
-    ("duffing_circuit", "rms"): (0.0, 0.4e-3),
-    ("two_joints", "rms"): (0.0, 0.0072),
-    ("two_motors", "rms_0.5s"): (0.0, 0.8 * 0.024),  # 0.024 and 0.029 rad: the authors' identified model
-    ("two_motors", "rms_1s"): (0.0, 0.8 * 0.029),
     ("coverage_simulated", "laplace_measured"): COVERED,
     ("coverage_simulated", "ensemble_measured"): COVERED,
     ("coverage_real", "laplace_measured"): COVERED,
@@ -46,18 +37,12 @@ TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest va
 }
 # A set: its files, and what measures it.
 ROWS: dict[str, tuple[tuple[str, ...], Callable[..., dict[str, Any]]]] = {
-    "noise": ((), sets.noise),
-    "one_trajectory": ((), partial(sets.noise, trajectories=1)),
     "outliers": ((), sets.outliers),
     "disturbed": ((), sets.disturbed),
     "real_pendulum": ((recorded.PENDULUM,), sets.extrapolation(recorded.PENDULUM)),
     "real_pendulum_network": ((recorded.PENDULUM,), sets.extrapolation(recorded.PENDULUM, "trajectory")),
     "air_track": ((recorded.AIR_TRACK,), sets.extrapolation(recorded.AIR_TRACK)),
     "driven_pendulum": (recorded.ONE_MOTOR, sets.driven_pendulum),
-    "motor_axis": ((recorded.MOTOR_AXIS,), sets.motor_axis),
-    "duffing_circuit": ((recorded.DUFFING_CIRCUIT,), sets.duffing_circuit),
-    "two_joints": ((recorded.TWO_JOINTS,), sets.two_joints),
-    "two_motors": (recorded.TWO_MOTORS, sets.two_motors),
     "coverage_simulated": ((), sets.coverage_simulated),
     "coverage_real": ((recorded.PENDULUM,), sets.coverage_real),
 }
@@ -84,7 +69,7 @@ def table(stored: dict[str, Any]) -> str:
             span, median = f"{min(values):.4g} … {max(values):.4g}", f"{statistics.median(values):.4g}"
             rows.append([name, row["commit"], key, len(values), median, span, target])
     head = ("set", "commit", "figure", "seeds", "median", "min … max", "target")
-    return "\n".join(["# Noise, outliers, motors, bands and measured data", "", *harness.table(head, rows)])
+    return "\n".join(["# Outliers, unknown forces, a motor, bands and measured data", "", *harness.table(head, rows)])
 
 
 def draw(rows: dict[str, Any], path: Path) -> None:

@@ -1,9 +1,8 @@
 """What `measured.py` measures, one function a set: each fits with one seed and returns figures by name.
 
-* noise: the simulated damped pendulum, 40 × 41 positions, h = 0.2, noise 0.01 rad (1 % of 1 rad); RMS over 100-step
-  rollouts from 20 exact unseen starts against the noiseless truth. `one_trajectory`: the same from one of 41 samples.
-* outliers: 6 × 61 of these positions with 2 % of them off by 0.5 … 1.5 rad, beside the same fit without outliers, and
-  with outliers but without the robust loss; 60-step rollouts.
+* outliers: 6 × 61 positions of the damped pendulum, h = 0.2, noise 0.01 rad (1 % of 1 rad), with 2 % of them off by
+  0.5 … 1.5 rad, beside the same fit without outliers, and with outliers but without the robust loss; RMS over 60-step
+  rollouts from 20 exact unseen starts against the noiseless truth.
 * disturbed: 10 × 101 noisy positions of the pendulum under a random force (velocity kicks of 0.02 at every sample), by
   multiple shooting and by joint smoothing; 100-step rollouts without the force, and the noise found over the true one.
 * real_pendulum, air_track: first two thirds → free run over the last third.
@@ -14,16 +13,8 @@
   starts, each of which shows its first 20 samples and is predicted for 100 more. `measured`: noisy samples inside the
   band of a measurement; `true`: noiseless positions inside the narrower band of the model.
 * coverage_real: the measured pendulum, first two thirds → the samples of the last third.
-* motor_axis: every fifth sample of the EMPS axis, 25 s: the first two thirds train, `Run.predict` scores the free run
-  over the last third; then all of it trains, and is predicted from its own first samples. A seed is another fifth.
-* duffing_circuit: 10 000 samples of the Silverbox train, the next 10 000 are predicted. A seed is another start.
-* two_joints: 21 windows of the UW double pendulum train, five are predicted. A seed is another five.
-* two_motors: every fourth sample of two runs of the DFKI double pendulum train, windows of the third are predicted. A
-  seed is another fourth of the samples. The authors' identified model errs by 0.013, 0.024 and 0.029 rad over these
-  windows of 0.25, 0.5 and 1 s.
 
-Every seed is another data set (simulated), another draw of the weights or, of machines with encoders, another part of
-the recording: their models, of named terms, start from a linear problem and do not depend on the seed of a fit.
+Every seed is another data set (simulated) or another draw of the weights.
 """
 
 from __future__ import annotations
@@ -36,17 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.judging.recorded import (
-    DUFFING_CIRCUIT,
-    MOTOR_AXIS,
-    ONE_MOTOR,
-    PENDULUM,
-    TWO_JOINTS,
-    TWO_MOTORS,
-    WINDOWS,
-    parted_windows,
-    rows,
-)
+from benchmarks.judging.recorded import ONE_MOTOR, PENDULUM
 from benchmarks.judging.simulated import with_outliers
 from benchmarks.peers.rollouts import rk4
 from herglotz.data import Trajectories, load, simulate
@@ -66,24 +47,14 @@ TRAINED, STEPS, HELD_OUT, SEEN, AHEAD = 12, 60, 20, 20, 100
 MEMBERS = 3  # fits of an ensemble: the fewest with a spread that is not one difference
 
 
-def rollout_rms(model: ContactLagrangian, steps: int, seed: int, reach: float | None = None) -> float:
-    """RMS over free runs of the damped pendulum from 20 unseen exact starts, h = 0.2; starts within `reach` (rad)."""
-    settings: dict[str, Any] = {"trajectories": 20, "steps": steps, "h": 0.2, "seed": seed + 500, "keep_state": True}
-    if reach is not None:
-        settings |= {"q_range": (-0.7 * reach, 0.7 * reach), "v_range": (-0.3 * reach, 0.3 * reach)}
-    test = simulate(scene("damped_pendulum"), **settings)
+def rollout_rms(model: ContactLagrangian, steps: int, seed: int) -> float:
+    """RMS over free runs of the damped pendulum from 20 unseen exact starts, h = 0.2."""
+    test = simulate(scene("damped_pendulum"), trajectories=20, steps=steps, h=0.2, seed=seed + 500, keep_state=True)
     assert test.p is not None
     q, p = (x.reshape(20, steps + 1, 1) for x in (test.q, test.p))
     with torch.no_grad():
         out = Stepper(model).rollout(q[:, 0], p[:, 0], h=0.2, steps=steps)
     return float((out.q - q).square().mean().sqrt())
-
-
-def noise(seed: int, _folder: Path, trajectories: int = 40) -> dict[str, float]:
-    data = simulate(scene("damped_pendulum"), trajectories=trajectories, steps=40, h=0.2, noise=0.01, seed=seed)
-    run = fit(data, FitConfig(train_fraction=1.0, seed=seed), progress=False)
-    reach = float(data.q.abs().max()) if trajectories == 1 else None
-    return {"rms_100_steps": rollout_rms(run.model, 100, seed, reach), "train_rms": run.metrics["train_rms"]}
 
 
 def outliers(seed: int, _folder: Path) -> dict[str, float]:
@@ -246,44 +217,3 @@ def coverage_real(seed: int, folder: Path) -> dict[str, Any]:
             "ensemble_measured": shares(ensemble_bands(members(run)), q, rows),
         }
     )
-
-
-AXIS_EVERY, MOTORS_EVERY = 5, 4
-PART, APART = 10_000, 8_000  # samples of the circuit that train; between the starts of two seeds
-HORIZONS = (0.25, 0.5, 1.0)  # of the motors, s
-
-
-def fitted(data: Trajectories) -> Run:
-    return fit(data, FitConfig(train_fraction=1.0), progress=False)
-
-
-def scored(run: Run, test: Trajectories, name: str = "rms", **windows: Any) -> dict[str, Any]:
-    found = run.predict(test, **windows)
-    return {name: found.rms, f"{name}_failed_steps": found.failed_steps}
-
-
-def motor_axis(seed: int, folder: Path) -> dict[str, Any]:
-    every = slice(seed % AXIS_EVERY, None, AXIS_EVERY)
-    data = rows(folder / MOTOR_AXIS, every)
-    train, test = data.split_time(2 / 3)
-    return scored(fitted(train), test) | scored(fitted(data), data, "same_part_rms")
-
-
-def duffing_circuit(seed: int, folder: Path) -> dict[str, Any]:
-    first = APART * seed
-    train, test = (rows(folder / DUFFING_CIRCUIT, slice(start, start + PART)) for start in (first, first + PART))
-    return scored(fitted(train), test)
-
-
-def two_joints(seed: int, folder: Path) -> dict[str, Any]:
-    train, test = parted_windows(load(folder / TWO_JOINTS, show=False), seed)
-    return scored(fitted(train), test)
-
-
-def two_motors(seed: int, folder: Path) -> dict[str, Any]:
-    every = slice(seed % MOTORS_EVERY, None, MOTORS_EVERY)
-    *train, test = (rows(folder / name, every) for name in TWO_MOTORS)
-    run, found = fitted(Trajectories.cat(train)), {}
-    for horizon in HORIZONS:
-        found |= scored(run, test, f"rms_{horizon:g}s", windows=WINDOWS, horizon=horizon)
-    return found

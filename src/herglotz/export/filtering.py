@@ -37,7 +37,7 @@ from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.smoother import process_noise
 
 # The scale of the noise is learned from about the last 50 samples. Windows of the measured UW double pendulum then have
-# a mean surprise of 1.2 to 2.7, where 2 is right, and of 0.6 to 3.4 with a fixed scale (`benchmarks/filter.py`).
+# a mean surprise of 1.2 to 2.7, where 2 is right, and of 0.6 to 3.4 with a fixed scale (docs/c.md, measured).
 ADAPTATION = 0.02
 
 

@@ -87,19 +87,19 @@ def test_the_command_writes_every_row_itself(tmp_path, monkeypatch):
     example = {"t": list(range(120)), **{name: [0.01] * 120 for name in ("q", "model", "std")}, "sigma": 0.01}
     covered = measured_sets.curves_row({"laplace_measured": curve, "ensemble_measured": curve}) | {"example": example}
     fake = {
-        "noise": ((), lambda seed, _: {"rms_100_steps": 0.001 * (1 + seed)}),
+        "outliers": ((), lambda seed, _: {"over_clean": 0.5 + 0.5 * seed}),
         "coverage_simulated": ((), lambda *_: covered),
         "air_track": (("absent.txt",), lambda *_: pytest.fail("run without its data")),
     }
     monkeypatch.setattr(measured, "ROWS", fake)
     out = tmp_path / "measured.json"
-    for only in ("noise", "coverage_simulated,air_track"):
+    for only in ("outliers", "coverage_simulated,air_track"):
         measured.main(["--seeds", "3", "--only", only, "--out", str(out), "--data", str(tmp_path)])
     rows = json.loads(out.read_text())["rows"]
-    assert list(rows) == ["noise", "coverage_simulated"]
-    assert [seed["rms_100_steps"] for seed in rows["noise"]["seeds"]] == [0.001, 0.002, 0.003]
+    assert list(rows) == ["outliers", "coverage_simulated"]
+    assert [seed["over_clean"] for seed in rows["outliers"]["seeds"]] == [0.5, 1.0, 1.5]
     text = out.with_suffix(".md").read_text()
-    assert "| rms_100_steps | 3 | 0.002 | 0.001 … 0.003 | ≤ 0.01 |" in text
+    assert "| over_clean | 3 | 1 | 0.5 … 1.5 | ≤ 2 |" in text
     assert "| laplace_measured | 3 | 0.9 | 0.9 … 0.9 | 0.8 … 0.97 |" in text
     assert "curves" not in text
     assert (tmp_path / "coverage.png").stat().st_size > 10000
