@@ -21,15 +21,14 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
-from herglotz.data import Trajectories, simulate
+from herglotz.data import simulate
 from herglotz.models import ContactLagrangian
-from herglotz.plots.parachute import landing
 from herglotz.scenes import scene
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.scene import Scene
-from herglotz.stepping import Event, State, Stepper
+from herglotz.stepping import State, Stepper
 from herglotz.theory import boundary_value
-from herglotz.training import FitConfig, Run, fit
+from herglotz.training import FitConfig, fit
 
 HINGES = torch.tensor([[0.2, -0.1], [-0.1, 0.1]]).double()  # two viscous hinges 0.1, angles from the vertical
 
@@ -104,13 +103,6 @@ ROWS = [
 ]  # fmt: skip
 
 
-def fitted(data: Trajectories, settings: FitConfig) -> tuple[Run, dict[str, float]]:
-    """A fit, with what every row tells of it: its processor time and the numbers of its model."""
-    began = time.process_time()
-    run = fit(data, settings, progress=False)
-    return run, {"cpu_s": time.process_time() - began, "parameters": run.metrics["parameters"]}
-
-
 def free_run(model: ContactLagrangian, row: Row, of: Scene, seed: int) -> tuple[float, float]:
     """RMS and median of |error| over a free run from 10 unseen starts."""
     n, m = of.dof, row.told.substeps
@@ -128,72 +120,32 @@ def free_run(model: ContactLagrangian, row: Row, of: Scene, seed: int) -> tuple[
     return float(error.square().mean().sqrt()), float(error.abs().median())
 
 
-def motion(row: Row, seed: int) -> dict:
-    """One fit of one row."""
+def motion(row: Row, seed: int) -> dict[str, float]:
+    """One fit of one row, with its processor time and the numbers of its model."""
     of = row.make()
     data = simulate(of, trajectories=row.trajectories, steps=row.steps, h=row.h, seed=seed)
-    run, cost = fitted(data, replace(row.told, seed=seed))
+    began = time.process_time()
+    run = fit(data, replace(row.told, seed=seed), progress=False)
+    cost = {"cpu_s": time.process_time() - began, "parameters": run.metrics["parameters"]}
     rms, median = free_run(run.model, row, of, seed)
     return {"rms": rms, "median": median, "one_step": run.metrics["one_step_rms"], **cost}
 
 
-def falling(seed: int) -> dict:
-    """The parachute at the affine level: terminal speed and landing time, relative errors."""
-    of, h = scene("parachute"), 0.05
-    data = simulate(of, trajectories=10, steps=120, h=h, seed=seed)
-    settings = told(level="affine", features=("1",), alike=True, damping_width=0, correction_width=0, seed=seed)
-    run, cost = fitted(data, settings)
-    q, v, s = torch.tensor([[100.0]]).double(), torch.tensor([[-5.0]]).double(), torch.zeros(1).double()
-    p = of.momentum(q, v, s)
-    stepper = Stepper(run.model)
-    start = stepper.init(q, of.flow(q, p, s, h)[0], None, h)
-    with torch.no_grad():
-        speed = stepper.rollout(*start, h=h, steps=800).q.diff(dim=1)[0, -1, 0] / h
-        landed = float(stepper.rollout(*start, h=h, steps=400, events=(Event(lambda x: x.q[..., 0]),)).events[0].t) + h
-    exact, lands = -((of.parameters["g"] / of.parameters["lam"]) ** 0.5), landing(float(q), float(v))[0]
-    return {"terminal": abs(float(speed) / exact - 1), "landing": abs(landed / lands - 1), **cost}
-
-
-def braking(seed: int) -> dict:
-    """Quadratic drag alone at the affine level: the coefficient λ and the position after 200 steps, relative errors.
-
-    The fitted coefficient is that of the rule of order 2, apart from λ by O(h²). A second fit to every other sample
-    tells how much: (4 λ(h) − λ(2h)) / 3 is λ at h → 0 (Richardson).
-    """
-    of, h = scene("quadratic_drag"), 0.05
-    data = simulate(of, trajectories=10, steps=120, h=h, seed=seed)
-    settings = told(level="affine", alike=True, damping_width=0, correction_width=0, seed=seed)
-    (run, cost), (coarse, more) = (fitted(data.thinned(every), settings) for every in (1, 2))
-    row = Row("", scene, h, 0, 0, PLAIN, 200, True)  # type: ignore[arg-type]
-    drag, double = (float(r.model.get_parameter("damping.drag").detach()[0]) / 2 for r in (run, coarse))
-    wanted = of.parameters["lam"]
-    return {"coefficient": abs(drag / wanted - 1), "coefficient, h → 0": abs((4 * drag - double) / 3 / wanted - 1),
-            "rms": free_run(run.model, row, of, seed)[0], **cost, "cpu_s": cost["cpu_s"] + more["cpu_s"]}  # fmt: skip
-
-
 TARGET = 1e-4  # of the RMS of a motion, relative where its row says so
-# A row: its h, the target of each figure, and what measures it with a seed.
-JOBS: dict[str, tuple[float, dict[str, float], Callable[[int], dict]]] = {
-    **{row.name: (row.h, {"rms": TARGET}, partial(motion, row)) for row in ROWS},
-    "parachute, falling": (0.05, {"terminal": 1e-5, "landing": 1e-5}, falling),
-    "quadratic drag": (0.05, {"coefficient": 1e-5, "coefficient, h → 0": 1e-5, "rms": 1e-5}, braking),
-}
+JOBS = {row.name: partial(motion, row) for row in ROWS}
 
 
-def table(stored: dict) -> str:
-    """One line a figure: median, range over the seeds, target."""
-    head = ("case", "h", "figure", "median", "min … max", "seeds", "parameters", "fit, CPU s")
-    rows = []
+def table(stored: dict[str, Any]) -> str:
+    """One line a row: median of the RMS, range over the seeds, target."""
+    head = ("case", "h", "RMS error", "min … max", "seeds", "parameters", "fit, CPU s", "target", "met", "commit")
+    steps, rows = {row.name: row.h for row in ROWS}, []
     for name, row in stored.items():
-        h, figures, _ = JOBS[name]
-        cpu, parameters = statistics.median(x["cpu_s"] for x in row["seeds"]), row["seeds"][0]["parameters"]
-        for figure, target in figures.items():
-            values = [x[figure] for x in row["seeds"]]
-            middle, span = statistics.median(values), f"{min(values):.1e} … {max(values):.1e}"
-            met = "yes" if middle <= target else "**no**"
-            rows.append([name, h, figure, f"{middle:.1e}", span, len(values), parameters, f"{cpu:.0f}",
-                         f"{target:g}", met, row["commit"]])  # fmt: skip
-    return "\n".join(harness.table((*head, "target", "met", "commit"), rows))
+        values, cpu = ([x[key] for x in row["seeds"]] for key in ("rms", "cpu_s"))
+        middle, span = statistics.median(values), f"{min(values):.1e} … {max(values):.1e}"
+        met = "yes" if middle <= TARGET else "**no**"
+        rows.append([name, steps[name], f"{middle:.1e}", span, len(values), row["seeds"][0]["parameters"],
+                     f"{statistics.median(cpu):.0f}", f"{TARGET:g}", met, row["commit"]])  # fmt: skip
+    return "\n".join(harness.table(head, rows))
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -202,8 +154,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--only", nargs="*", default=[""], help="rows whose names contain one of these words")
     arguments = parser.parse_args(argv)
     names = [name for name in JOBS if any(word in name for word in arguments.only)]
-    jobs = {name: run for name, (_, _, run) in JOBS.items()}
-    harness.by_seed(harness.json_file(arguments, "many_dof"), jobs, names, arguments.seeds, table)
+    harness.by_seed(harness.json_file(arguments, "many_dof"), JOBS, names, arguments.seeds, table)
 
 
 if __name__ == "__main__":
