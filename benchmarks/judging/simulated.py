@@ -101,7 +101,7 @@ def many_dof(folder: Path, name: str, seed: int) -> Job:
 
 
 def one_rate(folder: Path, name: str, seed: int) -> Job:
-    """The parachute and quadratic drag of many_dof.py, at the affine level."""
+    """The parachute and quadratic drag, at the affine level."""
     features = ("1",) if name == "parachute" else ()
     told = FitConfig(level="affine", features=features, alike=True, damping_width=0, correction_width=0, seed=seed,
                      train_fraction=1.0, objective="residual")  # fmt: skip

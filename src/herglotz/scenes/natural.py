@@ -22,7 +22,7 @@ from torch import Tensor
 from herglotz.mechanics import DiscreteLagrangian, Forced
 from herglotz.scenes.exact import exact_discrete_lagrangian
 from herglotz.scenes.reference import constant_rate, herglotz_motion, reference_flow
-from herglotz.scenes.rules import RULES, all_rules, strang
+from herglotz.scenes.rules import all_rules, strang
 from herglotz.scenes.scene import Scene, State, StateFunction
 from herglotz.scenes.special import as_step
 
@@ -107,14 +107,12 @@ def scene_without_closed_form(
     fields
         The other fields of `Scene`.
     """
-    general, rate = all_rules(lagrangian), rate if callable(rate) else constant_rate(rate)
-    if external is None:
-        motion = herglotz_motion(lagrangian, momentum, velocity, force, rate)
-    else:
-        general = {name: ForcedRule(rule, external) for name, rule in general.items()}
+    offered: Mapping[str, DiscreteLagrangian] = {**all_rules(lagrangian), **(rules or {})}
+    total, rate = force, rate if callable(rate) else constant_rate(rate)
+    if external is not None:
+        offered = {name: ForcedRule(rule, external) for name, rule in offered.items()}
         total = lambda q, v, s: force(q, v, s) + external(q, v)  # noqa: E731
-        motion = herglotz_motion(lagrangian, momentum, velocity, total, rate)
-    offered = {**general, **(rules or {})}
+    motion = herglotz_motion(lagrangian, momentum, velocity, total, rate)
 
     def energy(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         v = velocity(q, p, s)
@@ -140,11 +138,9 @@ def natural_scene(
     slope: Callable[[Tensor], Tensor],
     gamma: float,
     m: float = 1.0,
-    *,
-    rules: Mapping[str, DiscreteLagrangian] | None = None,
     **fields: Any,
 ) -> Scene:
-    """The scene of L = m|v|²/2 − V(q) − γs.
+    """The scene of L = m|v|²/2 − V(q) − γs, with the composition `strang` among its rules.
 
     Parameters
     ----------
@@ -152,8 +148,6 @@ def natural_scene(
         V(q), (...), and its gradient, (..., n).
     gamma, m
         Damping rate, and mass.
-    rules
-        Discretisations in addition to those of `rules.py`; by default the composition `strang`.
     fields
         The other fields of `Scene`.
     """
@@ -162,7 +156,7 @@ def natural_scene(
         **system.functions(),
         force=lambda q, v, s: -slope(q),  # noqa: ARG005
         rate=-gamma,
-        rules={"strang": strang(potential, m, gamma)} if rules is None else rules,
+        rules={"strang": strang(potential, m, gamma)},
         **fields,
     )
 
@@ -189,25 +183,6 @@ class DrivenRule:
     def at(self, u: Tensor) -> DiscreteLagrangian:
         """The discrete Lagrangian of a step whose input is u, (..., 1)."""
         return self.rule(u[..., 0])
-
-
-def _rules(
-    system_at: Callable[[Tensor | float], Natural], amplitude: float, external: External | None
-) -> dict[str, DiscreteLagrangian]:
-    """The rules of the system at each input, with the external force."""
-
-    def forced(rule: DiscreteLagrangian) -> DiscreteLagrangian:
-        return rule if external is None else ForcedRule(rule, external)
-
-    def composed(u: Tensor | float) -> DiscreteLagrangian:
-        system = system_at(u)
-        return forced(strang(system.potential, system.m, system.gamma))
-
-    rules: dict[str, DiscreteLagrangian] = {
-        name: DrivenRule(lambda u, r=rule: forced(r(system_at(u).lagrangian)), amplitude)
-        for name, rule in RULES.items()
-    }
-    return rules | {"strang": DrivenRule(composed, amplitude)}
 
 
 def driven_scene(
@@ -244,29 +219,31 @@ def driven_scene(
         The other fields of `Scene`.
     """
 
-    def potential_at(u: Tensor | float) -> Callable[[Tensor], Tensor]:
-        return lambda q: potential(q) - u * q[..., 0]
-
-    def system_at(u: Tensor | float) -> Natural:
-        return Natural(potential_at(u), gamma, m)
-
-    def drive(t: Tensor) -> Tensor:
-        return amplitude * torch.cos(frequency * t)[..., None]
-
-    rules = _rules(system_at, amplitude, external)
-
-    def scene_at(u: Tensor | float) -> Scene:
-        made = natural_scene(
-            potential_at(u),
+    def held(u: Tensor | float) -> Scene:
+        """The scene under a constant force."""
+        return natural_scene(
+            lambda q: potential(q) - u * q[..., 0],
             lambda q: slope(q) - (u[..., None] if isinstance(u, Tensor) else u),
             gamma,
             m,
-            rules=rules,
-            at=lambda u: scene_at(u[..., 0]),
-            drive=drive,
             external=external,
             **fields,
         )
-        return made if flow is None else replace(made, flow=partial(flow, u))
+
+    def rule(name: str) -> DrivenRule:
+        return DrivenRule(lambda u: held(u).L_d_rules[name], amplitude)
+
+    rules = {name: rule(name) for name in held(amplitude).L_d_rules}
+
+    def scene_at(u: Tensor | float) -> Scene:
+        made = held(u)
+        return replace(
+            made,
+            flow=made.flow if flow is None else partial(flow, u),
+            L_d=rules["midpoint_heun"],
+            L_d_rules=rules,
+            at=lambda u: scene_at(u[..., 0]),
+            drive=lambda t: amplitude * torch.cos(frequency * t)[..., None],
+        )
 
     return scene_at(amplitude)

@@ -28,7 +28,6 @@ def van_der_pol(mu: float = 1.0) -> Scene:
         lambda q: 0.5 * q[..., 0] ** 2,
         lambda q: q,
         0.0,
-        rules={},
         name="van_der_pol",
         description="self-excited oscillator, ẍ = μ(1 − x²)ẋ − x; reference flow to about 1e-13",
         coordinates=("x",),
