@@ -40,10 +40,6 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
         potential = 2.0 * m * g * length * torch.sin(0.5 * q[..., 1]) ** 2
         return kinetic - potential - gamma * s
 
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        (vx, vt), between = v.unbind(-1), second(q)
-        return torch.stack([first * vx + between * vt, between * vx + third * vt], -1)
-
     def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         (px, pt), between = p.unbind(-1), second(q)
         determinant = first * third - between * between
@@ -60,7 +56,6 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
         units=("m", "rad"),
         parameters={"cart": cart, "m": m, "length": length, "g": g, "gamma": gamma},
         lagrangian=lagrangian,
-        momentum=momentum,
         velocity=velocity,
         force=force,
         rate=-gamma,

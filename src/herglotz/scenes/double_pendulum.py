@@ -35,10 +35,6 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
         kinetic = v1**2 + 0.5 * v2**2 + v1 * v2 * torch.cos(q[..., 0] - q[..., 1])
         return kinetic - potential(q) - gamma * s
 
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        (v1, v2), C = v.unbind(-1), torch.cos(q[..., 0] - q[..., 1])
-        return torch.stack([2 * v1 + C * v2, C * v1 + v2], -1)
-
     def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         (p1, p2), C = p.unbind(-1), torch.cos(q[..., 0] - q[..., 1])
         return torch.stack([p1 - C * p2, 2 * p2 - C * p1], -1) / (2 - C * C)[..., None]
@@ -55,7 +51,6 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
         units=("rad", "rad"),
         parameters={"g": g, "gamma": gamma},
         lagrangian=lagrangian,
-        momentum=momentum,
         velocity=velocity,
         force=force,
         rate=-gamma,

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian, Forced
+from herglotz.mechanics.partials import derivatives
 from herglotz.scenes.exact import exact_discrete_lagrangian
 from herglotz.scenes.reference import constant_rate, herglotz_motion, reference_flow
 from herglotz.scenes.rules import all_rules, strang
@@ -82,10 +83,10 @@ class Natural:
 def scene_without_closed_form(
     *,
     lagrangian: StateFunction,
-    momentum: StateFunction,
     velocity: StateFunction,
     force: StateFunction,
     rate: StateFunction | float,
+    momentum: StateFunction | None = None,
     hamiltonian: StateFunction | None = None,
     rules: Mapping[str, DiscreteLagrangian] | None = None,
     external: External | None = None,
@@ -98,8 +99,8 @@ def scene_without_closed_form(
     force, rate
         L_q(q, v, s), (..., n), and L_s(q, v, s), (...), or its constant value: written out, so that the flow is fast
         and differentiable. The tests compare them with `contact_vector_field` of the Hamiltonian.
-    hamiltonian
-        H(q, p, s); by default p·v − L(q, v, s) at v = `velocity`(q, p, s).
+    momentum, hamiltonian
+        L_v(q, v, s), by default by autograd, and H(q, p, s), by default p·v − L(q, v, s) at v = `velocity`(q, p, s).
     rules
         Discretisations in addition to those of `rules.py`, which rules of the same name replace.
     external
@@ -107,6 +108,7 @@ def scene_without_closed_form(
     fields
         The other fields of `Scene`.
     """
+    momentum = momentum or (lambda q, v, s: derivatives(lagrangian, q, v, s).D2)
     offered: Mapping[str, DiscreteLagrangian] = {**all_rules(lagrangian), **(rules or {})}
     total, rate = force, rate if callable(rate) else constant_rate(rate)
     if external is not None:

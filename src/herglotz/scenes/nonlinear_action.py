@@ -31,10 +31,6 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
     def dissipation(q2: Tensor, s: Tensor) -> Tensor:
         return damping * (0.3 * s + 0.1 * torch.sin(s) * (1 + 0.2 * q2))
 
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        v1, v2 = v.unbind(-1)
-        return torch.stack([(1 + 0.3 * torch.sin(q[..., 0])) * v1 + 0.2 * v2 - drag * s, 0.2 * v1 + 1.2 * v2], -1)
-
     def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         p1, p2, m = p[..., 0] + drag * s, p[..., 1], 1 + 0.3 * torch.sin(q[..., 0])
         return torch.stack([1.2 * p1 - 0.2 * p2, m * p2 - 0.2 * p1], -1) / (1.2 * m - 0.04)[..., None]
@@ -56,7 +52,6 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
         time_unit="1",
         parameters={"damping": damping},
         lagrangian=lagrangian,
-        momentum=momentum,
         velocity=velocity,
         force=force,
         rate=rate,

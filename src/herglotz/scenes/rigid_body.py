@@ -39,11 +39,6 @@ class FreeBody:
         """The moments, (3,)."""
         return torch.tensor((self.J1, self.J2, self.J3), dtype=like.dtype, device=like.device)
 
-    def momentum(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG002
-        """Wᵀ JΩ."""
-        (sr, cr, sp, cp), (M1, M2, M3) = self.sines(q), (self.inertia(v) * self.body_velocity(q, v)).unbind(-1)
-        return torch.stack([M1, cr * M2 - sr * M3, cp * (sr * M2 + cr * M3) - sp * M1], -1)
-
     def body_momentum(self, q: Tensor, p: Tensor) -> Tensor:
         """M = JΩ = W⁻ᵀ p, (..., 3)."""
         (sr, cr, sp, cp), (p1, p2, p3) = self.sines(q), p.unbind(-1)
@@ -101,7 +96,6 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
         units=("rad", "rad", "rad"),
         parameters={"J1": J1, "J2": J2, "J3": J3, "gamma": gamma},
         lagrangian=body.lagrangian,
-        momentum=body.momentum,
         velocity=body.velocity,
         force=body.force,
         rate=-gamma,
