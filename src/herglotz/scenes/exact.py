@@ -7,6 +7,7 @@ iteration solves for all nodes of all samples, and one more linear equation give
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
@@ -276,31 +277,33 @@ class NumericallyExact:
         with torch.no_grad():
             q0, q1 = (x.double().expand(*shape, n).reshape(-1, n) for x in (q0, q1))
             s0, h = (x.double().expand(shape).reshape(-1) for x in (s0, as_step(h, q0)))
-            left, guess = torch.arange(len(s0), device=q0.device), None
-            solved: list[tuple[Tensor, ...]] = []
-            for count in NODES:
-                problem = Collocation(self.motion, count, q0[left], q1[left], s0[left], h[left])
-                x, converged = problem.nodes(guess, self.max_iterations)
-                finer = Collocation(self.motion, 2 * count - 1, q0[left], q1[left], s0[left], h[left])
-                guess = lobatto(count)[2].to(x) @ x
-                if not bool(converged.all()):
-                    guess = torch.where(converged[:, None, None], guess, finer.start())
-                end, error = finer.end(guess)
-                error = torch.maximum(error, (problem.log_c(x) - end.c.log()).abs())
-                done = (converged & (error <= self.tolerance)) | (2 * count > self.max_nodes)
-                reason = torch.where(error <= self.tolerance, int(Reason.NONE), int(Reason.UNRESOLVED))
-                reason = torch.where(end.opened, reason, int(Reason.CONJUGATE))
-                reason = torch.where(converged, reason, int(Reason.NOT_CONVERGED)).to(torch.uint8)
-                solved.append((left[done], reason[done], *(x[done] for x in end)))
-                left, guess = left[~done], guess[~done]
-                if not len(left):
-                    break
-            rows, *found = (torch.cat(x) for x in zip(*solved, strict=True))
-            reason, *ends = (x[rows.argsort()].reshape(shape + x.shape[1:]) for x in found)
+            reason, *ends = (x.reshape(shape + x.shape[1:]) for x in self._solved((q0, q1, s0, h), NODES))
             P = _second(End(*ends))
             nan = torch.where(reason == Reason.NONE, 0.0, torch.nan)
             P = P.map(lambda x: x + nan.reshape(shape + (1,) * (x.ndim - len(shape))))
         return Shot(P, reason)
+
+    def _solved(
+        self, given: tuple[Tensor, ...], counts: Sequence[int], guess: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
+        """The reason and the `End` of samples `given` as (q0, q1, s0, h), by the first count of nodes that suffices."""
+        count, *more = counts
+        problem, finer = (Collocation(self.motion, k, *given) for k in (count, 2 * count - 1))
+        x, converged = problem.nodes(guess, self.max_iterations)
+        guess = lobatto(count)[2].to(x) @ x
+        if not bool(converged.all()):
+            guess = torch.where(converged[:, None, None], guess, finer.start())
+        end, error = finer.end(guess)
+        error = torch.maximum(error, (problem.log_c(x) - end.c.log()).abs())
+        reason = torch.where(error <= self.tolerance, int(Reason.NONE), int(Reason.UNRESOLVED))
+        reason = torch.where(end.opened, reason, int(Reason.CONJUGATE))
+        reason = torch.where(converged, reason, int(Reason.NOT_CONVERGED)).to(torch.uint8)
+        found, left = (reason, *end), ~(converged & (error <= self.tolerance))
+        if more and 2 * count <= self.max_nodes and bool(left.any()):
+            better = self._solved(tuple(x[left] for x in given), more, guess[left])
+            for own, x in zip(found, better, strict=True):
+                own[left] = x
+        return found
 
 
 def exact_discrete_lagrangian(system: Motion | StateFunction, **options: Any) -> NumericallyExact:

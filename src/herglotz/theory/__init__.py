@@ -4,7 +4,7 @@
     Continuous dynamics                continuous
     Discrete Lagrangian dynamics       lagrangian_dynamics
     Discrete Hamiltonian dynamics      hamiltonian_dynamics
-    Discrete Hamilton–Jacobi theory    hamilton_jacobi, hopf_lax
+    Discrete Hamilton–Jacobi theory    hamilton_jacobi
     The conclusions                    evolution, hj_on_qxr, degenerate, explicit_time
     Beyond the paper                   noether, symmetries, constrained, rigid_body
 
@@ -69,7 +69,9 @@ from herglotz.theory.explicit_time import (
 )
 from herglotz.theory.hamilton_jacobi import (
     GeneratingFunction as GeneratingFunction,
+    HopfLax as HopfLax,
     PointSource as PointSource,
+    Propagated as Propagated,
     Quadratic as Quadratic,
     TheoremCheck as TheoremCheck,
     check as check,
@@ -77,6 +79,7 @@ from herglotz.theory.hamilton_jacobi import (
     generating_function as generating_function,
     generating_functions as generating_functions,
     hamilton_jacobi_residual as hamilton_jacobi_residual,
+    hopf_lax as hopf_lax,
     left_generating_function as left_generating_function,
     left_hamilton_jacobi_residual as left_hamilton_jacobi_residual,
     projected_flow as projected_flow,
@@ -100,7 +103,6 @@ from herglotz.theory.hj_on_qxr import (
     section_relatedness_defect as section_relatedness_defect,
     transport_section as transport_section,
 )
-from herglotz.theory.hopf_lax import HopfLax as HopfLax, Propagated as Propagated, hopf_lax as hopf_lax
 from herglotz.theory.lagrangian_dynamics import (
     Action as Action,
     Curve as Curve,

@@ -37,8 +37,8 @@ def contact_vector_field(
 
     Source: contact Hamilton equations of the paper.
     """
-    q_dot, p_dot, heat, H_value = _evolution(H, q, p, s)
-    return q_dot, p_dot, heat - H_value
+    q_dot, p_dot, heat = evolution_vector_field(H, q, p, s)
+    return q_dot, p_dot, heat - H(q, p, s)
 
 
 def evolution_vector_field(
@@ -51,7 +51,8 @@ def evolution_vector_field(
 
     Source: erratum E2; Theorem 1 of the paper holds as printed for E_H.
     """
-    return _evolution(H, q, p, s)[:3]
+    P = derivatives(H, q, p, s)
+    return P.D2, -(P.D1 + p * P.D3[..., None]), (p * P.D2).sum(-1)
 
 
 def herglotz_acceleration(
@@ -72,13 +73,6 @@ def herglotz_acceleration(
         sample = tuple(int(i) for i in (info != 0).nonzero()[0])
         raise InputError(f"L_vv is singular at sample {sample}: L gives no acceleration there; check its kinetic term")
     return a[..., 0]
-
-
-def _evolution(H: Hamiltonian, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The three components of E_H, and H."""
-    P = derivatives(H, q, p, s)
-    H_q, H_p, H_s = P.D1, P.D2, P.D3
-    return H_p, -(H_q + p * H_s[..., None]), (p * H_p).sum(-1), P.L
 
 
 def fiber_derivative(

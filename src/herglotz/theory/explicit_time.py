@@ -74,7 +74,9 @@ def energies(
     h: Tensor | float,
 ) -> tuple[Tensor, Tensor]:
     """E⁻ at t0 and E⁺ at t0 + h of one step, (...) each, in units of p·v."""
-    rate_t, rate_h = _time_slopes(L_d, q0, q1, s0, t0, h)
+    t, size = (torch.as_tensor(x, dtype=q0.dtype, device=q0.device).expand(s0.shape) for x in (t0, h))
+    _, slope, _ = gradient(lambda x: L_d(q0, q1, s0, x[..., 0], x[..., 1]), torch.stack([t, size], -1))
+    rate_t, rate_h = slope.unbind(-1)
     c = partials(TimeDependent(L_d, t0), q0, q1, s0, h).c
     return (rate_t - rate_h) / c, -rate_h
 
@@ -102,12 +104,3 @@ def time_defect(
     before, after = energies(L_d, state.q, q1, state.s, time, h)
     slopes = D[..., -1, :] - (P.D2[..., None, :] @ D[..., :-1, :])[..., 0, :]
     return (slopes[..., 0] + after - P.c * before).detach(), (slopes[..., 1] + after).detach()
-
-
-def _time_slopes(
-    L_d: TimeLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, t0: Tensor | float, h: Tensor | float
-) -> tuple[Tensor, Tensor]:
-    """∂_t L_d and ∂_h L_d, (...) each."""
-    t, size = (torch.as_tensor(x, dtype=q0.dtype, device=q0.device).expand(s0.shape) for x in (t0, h))
-    _, slope, _ = gradient(lambda x: L_d(q0, q1, s0, x[..., 0], x[..., 1]), torch.stack([t, size], -1))
-    return slope[..., 0], slope[..., 1]

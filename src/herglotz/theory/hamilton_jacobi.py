@@ -10,7 +10,8 @@ The left generating function has s_k, the value of s at the other end, as its ar
 
 The functions below compute S from the flow and never from these identities, so that the identities can be checked.
 
-S is the paper's S_d^k = ŝ0 + S^k(q̂0, ·, ŝ0): the values of S are values of s.
+S is the paper's S_d^k = ŝ0 + S^k(q̂0, ·, ŝ0): the values of S are values of s. `hopf_lax` takes S from step to step, by
+the form of the equation that is well-posed (erratum E7).
 
 `check` says whether S^{k+1} follows S^k on an open set of q_k, by Theorem 3. Three residuals are measured at q_{k+1} =
 Φ̃^γ(q_k). None is computed from another:
@@ -37,8 +38,10 @@ from herglotz.mechanics.legendre import least_singular_value
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.stepping import State, Stepper
-from herglotz.theory.contact_manifolds import Function, germ, prolongation
+from herglotz.stepping.state import Status, step_sizes
+from herglotz.theory.contact_manifolds import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.hamiltonian_dynamics import LeftHamiltonian, RightHamiltonian
+from herglotz.theory.lagrangian_dynamics import Curve, checked, stationary_curve
 
 
 @dataclass(frozen=True)
@@ -229,6 +232,90 @@ def riccati_step(P: Partials, S: Quadratic) -> Quadratic:
         -c[..., None] * (P.D12.mT @ pivot_beta[..., None])[..., 0],
         c * S.delta - 0.5 * c**2 * (S.beta * pivot_beta).sum(-1),
     )
+
+
+@dataclass(frozen=True)
+class HopfLax:
+    """S^{k+N}(y) and its derivatives; NaN where the status is not CONVERGED.
+
+    `x` is the stationary point q_k and `curve` the characteristic from x to y; `curve.opening` measures the distance
+    from a caustic. The status is SINGULAR at a caustic and beyond.
+    """
+
+    S: Tensor  # (...)
+    dS: Tensor  # (..., n)
+    d2S: Tensor  # (..., n, n)
+    x: Tensor  # (..., n)
+    status: Tensor  # (...)
+    curve: Curve
+
+
+def hopf_lax(
+    L_d: DiscreteLagrangian,
+    S: Function,
+    y: Tensor,  # (..., n)
+    *,
+    h: Tensor | float,
+    steps: int | None = 1,
+    beyond: bool = False,
+    throw: bool = False,
+) -> HopfLax:
+    """S^{k+1}(y) = ext_x [S^k(x) + L_d(x, y, S^k(x))], N times over.
+
+    The extremum satisfies D1L_d + c dS^k(x) = 0. All N extremals are solved together, as one discrete curve that ends
+    in y and starts with p_0 = dS(x), s_0 = S(x). By the envelope theorem dS^{k+N}(y) = p_N; d2S is the slope of the
+    family.
+
+    M may be singular: only the pivot W = ∂²/∂x² [S + L_d] must be regular. For a degenerate L_d, whose step is a
+    relation and not a map, this is the implicit Hamilton–Jacobi equation. A crossed caustic is detected where M is
+    regular, or where the inertia of W changes from step to step.
+
+    Parameters
+    ----------
+    S
+        S^k: a callable on (..., n) whose values are values of s, e.g. `Quadratic` or `PointSource`.
+    h, steps
+        A scalar h with a count N, or (N,) or (..., N) steps.
+    beyond
+        Accept a solution that has crossed a caustic, beyond which S is no longer a function on all of Q.
+    throw
+        Raise `StepError` if a sample fails.
+
+    Returns
+    -------
+    HopfLax
+        Status SINGULAR where the second derivative in x is singular (A + cα = 0 for a quadratic S), or where the
+        inertia of W shows a crossed caustic (`theory.lagrangian_dynamics`).
+
+    Source: erratum E7.
+    """
+    sizes = torch.as_tensor(h, dtype=y.dtype, device=y.device)
+    sizes = step_sizes(sizes, steps if sizes.ndim == 0 else None)
+    y = y.detach().expand(*torch.broadcast_shapes(y.shape[:-1], sizes.shape[:-1]), y.shape[-1])
+    # Newton's iteration starts with all points q_k … q_{k+N−1} at y.
+    start = y[..., None, :].expand(*y.shape[:-1], sizes.shape[-1], y.shape[-1])
+    curve = checked(stationary_curve(L_d, start, [y], S, sizes, beyond), throw)
+    slope = torch.where((curve.status == Status.CONVERGED)[..., None, None], curve.opening.slope, torch.nan)
+    return HopfLax(curve.s[..., -1], curve.p[..., -1, :], slope, curve.q[..., 0, :], curve.status, curve)
+
+
+@dataclass(frozen=True)
+class Propagated:
+    """S^{k+N} as a function on Q: each evaluation solves the Hopf–Lax problem; NaN at and beyond caustics."""
+
+    L_d: DiscreteLagrangian
+    S: Function
+    h: Tensor | float
+    steps: int = 1
+
+    def __call__(self, y: Tensor) -> Tensor:
+        """S^{k+N}(y), shape (...)."""
+        return self.germ(y).S
+
+    def germ(self, y: Tensor) -> FunctionGerm:
+        """Value and derivatives."""
+        out = hopf_lax(self.L_d, self.S, y, h=self.h, steps=self.steps)
+        return FunctionGerm(out.S, out.dS, out.d2S)
 
 
 # Largest residual that passes, relative to the terms of its equation. A pair that solves the equations leaves 1e-16 to

@@ -271,21 +271,7 @@ def boundary_value(
     first, last = (q.detach().expand(*batch, q.shape[-1]) for q in (q_start, q_end))
     s = s0.detach().expand(batch)
     interior = straight_line(first, last, h_all)[..., 1:-1, :]
-    return checked(_critical(L_d, interior, [first, last], s, h_all, beyond=True), throw)
-
-
-def family_value(
-    L_d: DiscreteLagrangian,
-    S: Function,
-    y: Tensor,  # (..., n) q_N
-    h: Tensor,  # (N,) or (..., N)
-    beyond: bool,
-) -> Curve:
-    """The curve to y with p_0 = dS(q_0) and s_0 = S(q_0), on which S(q_0) + Σ L_d is stationary in q_0 too.
-
-    Newton's iteration starts with all points q_0 … q_{N−1} at y.
-    """
-    return _critical(L_d, y[..., None, :].expand(*y.shape[:-1], h.shape[-1], y.shape[-1]), [y], S, h, beyond)
+    return checked(stationary_curve(L_d, interior, [first, last], s, h_all, beyond=True), throw)
 
 
 def checked(curve: Curve, throw: bool) -> Curve:
@@ -324,7 +310,7 @@ def straight_line(q_start: Tensor, q_end: Tensor, h: Tensor) -> Tensor:
     return (1 - t) * q_start[..., None, :] + t * q_end[..., None, :]
 
 
-def _critical(
+def stationary_curve(
     L_d: DiscreteLagrangian,
     guess: Tensor,  # (..., K, n)
     ends: list[Tensor],
@@ -334,8 +320,8 @@ def _critical(
 ) -> Curve:
     """The stationary curve through K unknown points.
 
-    `ends` is [q_0, q_N] with `source` s_0, or [q_N] with `source` a function S, for which s_0 = S(q_0). Unless
-    `beyond`, a curve that has crossed a caustic is SINGULAR.
+    `ends` is [q_0, q_N] with `source` s_0, or [q_N] with `source` a function S: then p_0 = dS(q_0), s_0 = S(q_0), and
+    S(q_0) + Σ L_d is stationary in q_0 too. Unless `beyond`, a curve that has crossed a caustic is SINGULAR.
     """
 
     def curve(x: Tensor) -> tuple[Tensor, Tensor, Partials, FunctionGerm | None]:
