@@ -57,6 +57,110 @@ TERMS = {
 }
 
 
+<<<<<<< HEAD
+=======
+def _others(*names: str, **more: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    return {name: more.get(name.replace(" ", "_"), OTHERS[name]) for name in names}
+
+
+SETUPS = {
+    s.name: s
+    for s in (
+        Setup("damped_oscillator", 0.5, 12.0, "K, V quadratic, γ, correction",
+              {"potential_width": 0, "correction_width": 8},
+              _others("no damping", "drag besides, with its network", "potential network", "no correction")),
+        Setup("damped_pendulum", 0.5, 12.0, "K, V network, γ, correction", {"correction_width": 16, "iterations": 300},
+              _others("no damping", "drag besides, with its network", "no correction"), 40, 40),
+        Setup("double_pendulum", 0.05, 2.4, "K(q) network, V network, γ, correction",
+              {"correction_width": 16, "mass_width": 8, "iterations": 120},
+              _others("no damping", "constant mass", "no correction", "structure told")),
+        Setup("parachute", 0.1, 2.4, "K, V, γ, λ, drag network, correction", {"level": "affine"},
+              _others("no damping", "one rate, no drag", "no correction")),
+        Setup("kepler", 0.1, 4.8, "K, V of r, γ, correction",
+              {"features": ("central",), "alike": True, "correction_width": 16},
+              _others("no damping", "potential network", "no correction",
+                      potential_network={"features": (), "alike": False})),
+        Setup("chain", 0.2, 4.8, "K, V of stretches, γ",
+              {"features": ("chain",), "alike": True, "correction_width": 0},
+              _others("no damping", "linear springs"), 12, 20),
+        Setup("driven_pendulum", 0.25, 12.0, "K, V network, γ, friction, input, correction",
+              {"level": "forced", "correction_width": 12},
+              _others("no input", "no correction", "correction 6 × 2")),
+        Setup("rigid_body", 0.1, 4.8, "K(q) network, V network, γ, correction",
+              {"correction_width": 12, "mass_width": 8},
+              _others("constant mass", "no damping", "no correction"), 20, 24),
+    )
+}  # fmt: skip
+
+
+def starts_of(system: Any, count: int, seed: int) -> State:
+    """States uniform in the scene's ranges, s = 0."""
+    make = torch.Generator().manual_seed(seed)
+    q, v = (uniform(name, getattr(system, name), (count, system.dof), make) for name in ("q_range", "v_range"))
+    return State(q, system.momentum(q, v, torch.zeros_like(q[..., 0])), torch.zeros(count, dtype=torch.float64))
+
+
+def exact_motion(setup: Setup, start: State) -> Tensor:
+    """Positions (B, K + 1, n) up to T, by the scene's own flow in steps h."""
+    system, u, states = setup.scene, setup.inputs(), [start]
+    for k in range(round(setup.T / setup.h)):
+        now = system if u is None else system.at(u[k])
+        states.append(State(*now.flow(*states[-1], setup.h)))
+    return torch.stack([state.q for state in states], 1)
+
+
+def errors_of(q: Tensor, truth: Tensor) -> dict[str, float | None]:
+    """Of the largest |q − truth| of each motion: the median, and what 95 % keep; None where a step failed."""
+    e = (q - truth).abs().flatten(1).amax(1).nan_to_num(nan=math.inf)
+    found = {"median": float(e.median()), "q95": float(e.quantile(0.95, interpolation="higher"))}
+    return {k: v if math.isfinite(v) else None for k, v in found.items()}
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Motions from unseen starts, which a model enters from two positions, as a user must."""
+
+    setup: Setup
+    first: Tensor  # (B, n) position a step before the start
+    truth: Tensor  # (B, K + 1, n)
+
+    @classmethod
+    def of(cls, setup: Setup) -> Judge:
+        """Motions of a scene."""
+        system, u = setup.scene, setup.inputs()
+        first = starts_of(system, COUNT, 1000)
+        before = system if u is None else system.at(u[0])
+        return cls(setup, first.q, exact_motion(setup, State(*before.flow(*first, setup.h))))
+
+    def measured(self, run: Run, kind: str) -> tuple[dict[str, Any], Timed]:
+        """A row of the table, without its cost, and how the fitted model is timed: as C at the step of the data."""
+        h, u = self.setup.h, self.setup.inputs() if run.model.inputs else None
+        first: dict[str, Any] = {} if u is None else {"u": u[0]}
+        stepper, steps = compile_c(run.model, h=h), self.truth.shape[1] - 1
+        with torch.no_grad():
+            entry = run.stepper.init(self.first, self.truth[:, 0], None, h, **first)
+            entry = State(*(x.detach().contiguous() for x in entry))
+            q = stepper.rollout(*entry, h=h, steps=steps, inputs=u).q
+        at = torch.arange(1, CHECKS + 1) * (steps // CHECKS)
+        row = {"kind": kind, "h": h, "dtype": "float64", "artefact": "C", **errors_of(q[:, at], self.truth[:, at])}
+        return row, timed_stepping(stepper, entry, h, steps)
+
+
+def measure(setup: Setup) -> list[dict[str, Any]]:
+    """The scene's own model, and the same data with a term less, or with one that the scene does not need."""
+    judge = Judge.of(setup)
+    data = simulate(setup.scene, trajectories=setup.trajectories, steps=setup.steps, h=setup.h, seed=0)
+    kinds = {"own model": {}, **setup.other}
+    rows, timed = zip(*(judge.measured(setup.fitted(data, **change), kind) for kind, change in kinds.items()),
+                      strict=True)  # fmt: skip
+    costs = measure_costs(timed, ROUNDS)
+    return [
+        {**row, "us_per_time": cost.step_us / setup.h, "spread": cost.spread_us / setup.h}
+        for row, cost in zip(rows, costs, strict=True)
+    ]
+
+
+>>>>>>> 72126768 (Types of the benchmark of terms)
 def markdown(result: dict[str, Any]) -> str:
     """The results file."""
     measured = f"Commit {result['commit']}, {result['machine']['cores']} cores, one thread."
