@@ -28,7 +28,6 @@ def test_the_equations_in_c_are_those_of_the_scene(name):
         assert abs(math.log2(error("leapfrog", 512) / error("leapfrog", 1024)) - 2) < 0.2
 
 
-<<<<<<< HEAD
 def test_dop853_in_c_is_dop853():
     # fails if a coefficient is lost on the way into C: the error must follow the tolerance, at order 8's price
     library = rivals.Native("damped_pendulum", "float64", fast=False)
@@ -122,18 +121,6 @@ def test_the_learned_equation_is_that_of_the_model():
     plain = rivals.Native("double_pendulum", "float64", dof=2)
     other, _ = rivals.Motions(plain, torch.cat([q, v], -1), 0.1, 1, "RK4", 100).made()
     assert float((other - wanted).abs().max()) > 1e-3
-=======
-def test_a_model_is_entered_from_two_positions_of_the_motion():
-    # fails if the truth is not a motion of the scene, or the position before the start is not a step h before it
-    setup = work_precision.SETUPS["driven_pendulum"]
-    judge, u, h = work_precision.Judge.of(setup), setup.inputs(), setup.h
-    assert u is not None
-    first = work_precision.starts_of(setup.scene, work_precision.COUNT, 1000)
-    after = State(*setup.scene.at(u[0]).flow(*first, h))
-    torch.testing.assert_close(judge.first, first.q)
-    torch.testing.assert_close(judge.truth[:, 0], after.q)
-    torch.testing.assert_close(judge.truth[:, 1], setup.scene.at(u[0]).flow(*after, h)[0])
->>>>>>> 72126768 (Types of the benchmark of terms)
 
 
 def test_the_page_holds_what_the_results_hold():

@@ -95,6 +95,7 @@ def test_the_normal_equations_of_zeros_are_the_derivatives_of_the_cost(drifting)
         change = (target.normal_equations(x + step)[2] - target.normal_equations(x - step)[2])[zero] / 2e-5
         assert float(change) == pytest.approx(float(A[i, zero]), rel=1e-4, abs=1e-4 * float(A[zero, zero]))
     covariance = matrix.covariance()
+    assert covariance is not None
     assert torch.allclose(covariance, torch.linalg.inv(A)[:first, :first], rtol=1e-6, atol=0)
 
 
