@@ -26,7 +26,6 @@ from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, c_source, read_metadata, runtime
 from herglotz.export.c_wrappers import header_in
 from herglotz.export.exported import ExportedStepper, Program
-from herglotz.export.lower.c_parameters import without_parameters
 from herglotz.export.metadata import AOTI, KEY, METADATA, from_json, weights_digest
 from herglotz.export.parameters import checked_values
 from herglotz.export.programs import quiet
@@ -245,9 +244,7 @@ def _session_program(session: Any) -> Program:
 
 def library_of(metadata: Mapping[str, Any]) -> str:
     """The C source of the loops over samples around a header with this metadata."""
-    text = runtime("library.c")
-    text = text if metadata.get("parameters") else without_parameters(text)
-    return re.sub(r"\bhz_", f"{metadata['name']}_", text)
+    return re.sub(r"\bhz_", f"{metadata['name']}_", runtime("library.c"))
 
 
 class CLibrary:

@@ -307,8 +307,9 @@ def source_of(model: ContactLagrangian) -> str:
     parts += [step.function("finish", "end"), step.function("derive", "end", "A", "*c", "G")]
     values = {"N": n, "M": m, "P": P, "D": functions.d, "STICKS": int(sticks)}
     sizes = "".join(f"#define hz_{name} {value}\n" for name, value in values.items())
-    head, *loops = ((RUNTIME / name).read_text() for name in ("mathematics.h", "sweep.c", "tridiagonal.c"))
-    return "\n".join([sizes, head, *parts, prepared.function(), OPTIMISED, *loops])
+    names = ("mathematics.h", "inverse.h", "sweep.c", "tridiagonal.c")
+    head, inverse, *loops = ((RUNTIME / name).read_text() for name in names)
+    return "\n".join([sizes, head, inverse, *parts, prepared.function(), OPTIMISED, *loops])
 
 
 OPTIMISED = """

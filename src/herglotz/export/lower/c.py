@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from types import MethodType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ from herglotz.export.equation import Equations, example, field_like
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian, OwnLagrangian
+from herglotz.models.friction import Friction
 from herglotz.models.jet import Jet
 from herglotz.models.terms import FeatureKinetic, PositionKinetic, Potential
 from herglotz.stepping import State
@@ -51,19 +53,22 @@ def step_parts(equations: Equations) -> Graph:
     return equations.traced(StepParts(equations.model), (q, p, s, h, *more, *u))
 
 
-def pushed(model: ContactLagrangian) -> ContactLagrangian:
-    """The model with generalised forces as inputs: G becomes the unit matrix, u₀ becomes 0. Changed in place.
+def with_zero_as_input(model: ContactLagrangian) -> ContactLagrangian:
+    """The model with a last input, 1 where inputs act and 0 where none does, as the factor of u₀. Changed in place.
 
-    Where inputs act through the position, they stand before the forces.
+    Inputs that are all 0 then exert no force. A model without u₀ stays as it is.
     """
-    friction, n = model.friction, model.config.dof
-    if model.config.inputs and friction is not None:
-        m = model.config.inputs if model.capabilities.inputs_by_position else 0
-        model.config = replace(model.config, inputs=m + n, input_map=())
-        friction.inputs, friction.input_zero = m + n, None
-        del friction.input_map
-        friction.register_buffer("input_map", torch.eye(m + n).to(friction.viscous)[m:])
+    friction = model.friction
+    if friction is not None and friction.input_zero is not None:
+        model.config = replace(model.config, inputs=model.config.inputs + 1, input_map=())
+        friction.applied = MethodType(_applied, friction)
     return model
+
+
+def _applied(friction: Friction, u: Tensor) -> Tensor:
+    """G (u − a u₀), where a is the last input."""
+    assert friction.input_zero is not None
+    return (u[..., :-1] - u[..., -1:] * friction.input_zero) @ friction.input_map.T
 
 
 class GivenPotential(nn.Module):
@@ -202,7 +207,7 @@ class StepInC:
         self.n, self.m = n, m = equations.model.dof, equations.model.inputs
         # The sizes of the arguments of traced functions; 0 is a scalar.
         self.start = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0}
-        self.more = {name: size for name, size in (("P->push", m), ("P->theta", len(equations.numbers or ()))) if size}
+        self.more = {name: size for name, size in (("P->u", m), ("P->theta", len(equations.numbers or ()))) if size}
         field = {"P->V0.value": 0, "P->V0.slope": n, "t->move": n, "x": n, "V1->value": 0, "V1->slope": n}
         given = {name: self.program.given(name, size) for name, size in (self.start | field | self.more).items()}
         arrays = interpret(self.program, step_parts(equations), list(given.values()))
@@ -315,10 +320,10 @@ def model_source(
     step: StepInC, equations: Equations, derivatives: bool, velocities: bool = True, adjoint: bool = False
 ) -> Emitted:
     """The emitted parts of a header, with constants as `R(0.5)`."""
-    push = "  REAL push[hz_INPUTS];\n" if step.m else ""
-    push += "  REAL theta[hz_P];\n" if equations.numbers else ""
-    push += "  REAL bound[hz_N]; /* dry friction holds moves up to this */\n" if step.sticks else ""
-    types = TYPES.format(push=push, problem=step.members("P"), terms=step.members("t"))
+    arguments = "  REAL u[hz_INPUTS];\n" if step.m else ""
+    arguments += "  REAL theta[hz_P];\n" if equations.numbers else ""
+    arguments += "  REAL bound[hz_N]; /* dry friction holds moves up to this */\n" if step.sticks else ""
+    types = TYPES.format(arguments=arguments, problem=step.members("P"), terms=step.members("t"))
     texts = types + _potential_source(equations, step) + step.source()
     slopes = _slopes_source(equations, step) if derivatives else ""
     slopes += _pull_source(equations, step) if adjoint else ""
@@ -339,7 +344,7 @@ typedef struct {{
 /* The start of a step, and numbers that do not change while it is solved. */
 typedef struct {{
   REAL q0[hz_N], p0[hz_N], s0, h;
-{push}  FN_potential_t V0;
+{arguments}  FN_potential_t V0;
 {problem}}} FN_problem;
 
 /* The step equation at one q1 = q0 + move. After the solve, q1 = q0 + move + rest with the last, tiny correction. */
@@ -380,7 +385,7 @@ def _slopes_source(equations: Equations, step: StepInC) -> str:
     """The derivative of a solved step as a C function."""
     sizes = step.start | {"move": step.n} | step.more
     program, (slopes,) = interpreted(equations.jacobian, sizes, step.program.tables)
-    head = "\n/* d(q, p, s)' / d(q, p, s, h, push) at the solution q1 = q0 + move, row by row. */\n"
+    head = "\n/* d(q, p, s)' / d(q, p, s, h, u, theta) at the solution q1 = q0 + move, row by row. */\n"
     head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
     return whole(program, head, {"slopes": list(slopes.ravel())})
 
@@ -402,6 +407,6 @@ def _pull_source(equations: Equations, step: StepInC) -> str:
     """The derivative of a solved step, transposed and times a vector, as a C function."""
     sizes = step.start | {"move": step.n, "of": 2 * step.n + 1} | step.more
     program, rows = interpreted(equations.pull, sizes, step.program.tables)
-    head = "\n/* The derivatives by (q, p, s, h, push) before a solved step from those `of` (q, p, s)' after it. */\n"
+    head = "\n/* The derivatives before a solved step, by (q, p, s, h, u, theta), from those `of` the state after. */\n"
     head += "static inline void FN_pull(const FN_problem *P, const REAL move[hz_N], const REAL *of, REAL *pulled)"
     return whole(program, head, {"pulled": [x for row in rows for x in row.ravel()]})

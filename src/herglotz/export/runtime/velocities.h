@@ -10,7 +10,7 @@ static inline void FN_velocity(const FN_state *x, hz_real h, hz_TAKES_THETA REAL
 #if hz_P
   REAL values[hz_P];
   for (i = 0; i < hz_P; i++) values[i] = SPREAD(theta->value[i]);
-#endif /* hz_P */
+#endif
   for (i = 0; i < hz_N; i++) v[i] = SPREAD(hz_R(0.0));
   for (iteration = 0; left && iteration < 8; iteration++) {
     FN_momentum(x->q, v, x->s, SPREAD(h), hz_WITH_THETA(values) p, by_v);
@@ -36,18 +36,12 @@ static inline int hz_velocity_some(const hz_state *states, long count, hz_real h
   const int some = count < hz_SIDE ? (int)count : hz_SIDE;
   int w, found[hz_SIDE] = {0};
 #if defined(hz_BATCHED) && !hz_STICKING
-#if hz_P
-  const hz_parameters *values = theta ? theta : &hz_defaults;
-  const int possible = hz_in_bounds(values);
-#else
-  const int possible = 1;
-#endif /* hz_P */
-  if (some > 1 && possible && hz_finite(h) && h > hz_R(0.0)) {
+  if (some > 1 && !hz_BAD_THETA(theta) && hz_finite(h) && h > hz_R(0.0)) {
     hz_wide_state x;
     hz_lanes wide[hz_N];
     int i;
     for (w = 0; w < hz_SIDE; w++) hz_wide_set(&x, w, states + (w < some ? w : some - 1)); /* the last one is repeated */
-    hz_wide_velocity(&x, h, hz_WITH_THETA(values) wide, found);
+    hz_wide_velocity(&x, h, hz_WITH_THETA(theta ? theta : &hz_defaults) wide, found);
     for (w = 0; w < some; w++)
       for (i = 0; i < hz_N; i++) v[w][i] = hz_wide_LANE(wide[i], w);
   }

@@ -12,10 +12,10 @@ typedef struct {
 static inline void hz_legendre_at(const hz_real q[hz_N], const hz_real v[hz_N], hz_real s, hz_real h,
     hz_TAKES_THETA hz_legendre *at) {
 #if hz_STICKING
-  hz_momentum(q, v, s, h, hz_WITH_THETA(theta->value) at->p, at->by_v, at->grip, at->grip_by_v);
+  hz_momentum(q, v, s, h, hz_WITH_THETA((theta ? theta : &hz_defaults)->value) at->p, at->by_v, at->grip, at->grip_by_v);
 #else
   int i;
-  hz_momentum(q, v, s, h, hz_WITH_THETA(theta->value) at->p, at->by_v);
+  hz_momentum(q, v, s, h, hz_WITH_THETA((theta ? theta : &hz_defaults)->value) at->p, at->by_v);
   for (i = 0; i < hz_N; i++) at->grip[i] = at->grip_by_v[i] = hz_R(0.0);
 #endif
 }
@@ -45,11 +45,7 @@ static inline int hz_init_qv(const hz_real q[hz_N], const hz_real v[hz_N], hz_re
   }
   next.s = s;
   next.sigma = hz_R(1.0);
-  if (hz_before(&next, h)) return hz_BAD_INPUT;
-#if hz_P
-  if (!theta) theta = &hz_defaults;
-  if (!hz_in_bounds(theta)) return hz_BAD_INPUT;
-#endif /* hz_P */
+  if (hz_before(&next, h) || hz_BAD_THETA(theta)) return hz_BAD_INPUT;
   hz_legendre_at(q, v, s, h, hz_WITH_THETA(theta) &at);
   for (i = 0; i < hz_N; i++)
     next.p[i] = at.p[i] + (v[i] > hz_R(0.0) ? at.grip[i] : v[i] < hz_R(0.0) ? -at.grip[i] : hz_R(0.0));
@@ -69,10 +65,7 @@ static inline int hz_velocity(const hz_state *state, hz_real h, hz_TAKES_THETA h
   int i, j, sweep, iteration, better;
   const int status = hz_before(state, h);
   if (status) return status;
-#if hz_P
-  if (!theta) theta = &hz_defaults;
-  if (!hz_in_bounds(theta)) return hz_BAD_INPUT;
-#endif /* hz_P */
+  if (hz_BAD_THETA(theta)) return hz_BAD_INPUT;
   for (i = 0; i < hz_N; i++) z[i] = move[i] = base[i] = now[i] = hz_R(0.0);
   hz_legendre_at(state->q, z, state->s, h, hz_WITH_THETA(theta) &at);
   for (i = 0; i < hz_N; i++) {
