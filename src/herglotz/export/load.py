@@ -279,34 +279,33 @@ class CLibrary:
 
     def init(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(p1, s1) at q1; NaN where the step from q0 to q1 has none."""
-        p, s, status = self._empty(len(s0), self.dof), self._empty(len(s0)), self._failed(len(s0))
-        self.library.herglotz_inits(*_arguments(len(s0), q0, q1, s0, h, u, *self._theta, p, s, status))
-        return p, s
+        states = _rows(q0, q1, s0)
+        self.library.herglotz_inits(*_arguments(len(s0), h, u, *self._theta, states))
+        return states[:, self.dof : -2], states[:, -2]
 
-    def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """The momenta p of velocities, NaN where a velocity has no momentum, and statuses."""
-        p, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self.differentiates().herglotz_momenta(*_arguments(len(s), q, v, s, h, *self._theta, p, status))
-        return p, status
+    def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Tensor:
+        """The momenta p of velocities, NaN where a velocity has no momentum."""
+        states = _rows(q, v, s)
+        self.differentiates().herglotz_momenta(*_arguments(len(s), h, *self._theta, states))
+        return states[:, self.dof : -2]
 
     def velocity(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """The velocities v of momenta, NaN where a momentum has no velocity, and statuses."""
-        v, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self.differentiates().herglotz_velocities(*_arguments(len(s), q, p, s, h, *self._theta, v, status))
+        states, v, status = _rows(q, p, s), self._empty(len(s), self.dof), self._failed(len(s))
+        self.differentiates().herglotz_velocities(*_arguments(len(s), h, *self._theta, states, v, status))
         return v, status
 
     def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
         """A step and its derivative (B, 2n+1, 2n+2+m+K); NaN where the step failed."""
-        count, size = len(s), 2 * self.dof + 1
-        widths = ((self.dof,), (self.dof,), (), ())
-        *new, sigma = (self._empty(count, *width) for width in widths)
-        status, residual = self._failed(count), self._empty(count)
+        count, n, size = len(s), self.dof, 2 * self.dof + 1
+        states, status, residual = _rows(q, p, s), self._failed(count), self._empty(count)
         by_state, by_input, by_theta, by_h = slopes = [
             self._empty(count, size, width) for width in (size, self.inputs, len(self.parameters), 1)
         ]
         written = slopes if self.parameters else (by_state, by_input, by_h)
-        outputs = (*new, sigma, status, residual, *written)
-        self.differentiates().herglotz_jacobians(*_arguments(count, q, p, s, h, u, *self._theta, *outputs))
+        outputs = (states, status, residual, *written)
+        self.differentiates().herglotz_jacobians(*_arguments(count, h, u, *self._theta, *outputs))
+        *new, sigma = states[:, :n], states[:, n:-2], states[:, -2], states[:, -1]
         return *new, sigma, residual, status, torch.cat([by_state, by_h, by_input, by_theta], -1)
 
     def __call__(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> Track:
@@ -327,7 +326,7 @@ class CLibrary:
             self._empty(count, steps + 1), self._failed(count, steps), self._empty(count, steps),
         )  # fmt: skip
         u_stride = 0 if u is None else u.stride(0)
-        keep = (*(x.contiguous() for x in (q, p, s)), h, *h.stride(), u, u_stride, *self._theta, *outputs)
+        keep = (_rows(q, p, s), h, *h.stride(), u, u_stride, *self._theta, *outputs)
         arguments = _arguments(count, steps, *keep)
         function = self.library.herglotz_rollouts
         # `keep` keeps the tensors alive as long as the call.
@@ -350,6 +349,11 @@ class CLibrary:
 
     def _failed(self, *shape: int) -> Tensor:
         return torch.full(shape, int(Status.DIVERGED), dtype=torch.uint8)
+
+
+def _rows(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    """States of C as rows (q, p, s, σ), (B, 2n + 2), with σ = 1."""
+    return torch.cat([q, p, s[:, None], torch.ones_like(s)[:, None]], 1)
 
 
 def _arguments(*values: Tensor | int | None) -> list[Any]:

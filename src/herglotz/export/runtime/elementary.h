@@ -2,8 +2,8 @@
 
 /* y_w = f(x_w) by <math.h> where size_w > limit or NaN: the formula before does not hold. */
 #define FN_ELSE(size, limit, function)                         \
-  for (w = 0; w < FN_WIDTH && FN_beyond(size, limit); w++)     \
-    if (hz_beyond(FN_LANE(size, w), limit)) FN_LANE(y, w) = function(FN_LANE(x, w))
+  for (w = 0; w < FN_WIDTH && FN_above(size, limit); w++)     \
+    if (hz_above(FN_LANE(size, w), limit)) FN_LANE(y, w) = function(FN_LANE(x, w))
 
 static inline REAL FN_cut(REAL x, hz_real limit) {
   const REAL most = SPREAD(limit);

@@ -61,7 +61,7 @@
 static inline hz_real hz_choose(hz_real a, hz_real b, hz_real x, hz_real y) { return a > b ? x : y; }
 
 /* Whether x <= limit is false, as of NaN. */
-static inline int hz_beyond(hz_real x, hz_real limit) { return !(x <= limit); }
+static inline int hz_above(hz_real x, hz_real limit) { return !(x <= limit); }
 
 /* The nearest whole number, 0 of NaN, which an integer holds; 2^k. */
 typedef int hz_count;
@@ -124,7 +124,7 @@ static inline hz_lanes hz_wide_choose(hz_lanes a, hz_lanes b, hz_lanes x, hz_lan
 static inline hz_lanes hz_wide_fabs(hz_lanes x) { return hz_select((hz_masks)(x < hz_spread(hz_R(0.0))), -x, x); }
 
 /* Of any number: one sum without branches, because GCC makes a tree of a branch for each lane. */
-static inline int hz_wide_beyond(hz_lanes x, hz_real limit) {
+static inline int hz_wide_above(hz_lanes x, hz_real limit) {
   const hz_masks where = ~(hz_masks)(x <= hz_spread(limit));
   hz_signed_t any = 0;
   int w;

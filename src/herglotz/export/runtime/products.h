@@ -110,9 +110,10 @@ static inline void hz_product(int inputs, int outputs, const hz_real *w, const h
   for (; k + L <= outputs; k += L) {
     hz_part *to = (hz_part *)(y + k);
     hz_lanes sum[4] = {to[0], zero, zero, zero};
-    for (j = 0; j + 4 <= inputs; j += 4)
-      for (i = 0; i < 4; i++) sum[i] += *(const hz_part *)(w + (j + i) * outputs + k) * x[j + i];
-    for (; j < inputs; j++) sum[0] += *(const hz_part *)(w + j * outputs + k) * x[j];
+    const hz_real *from = w + k;
+    for (j = 0; j + 4 <= inputs; j += 4, from += 4 * outputs)
+      for (i = 0; i < 4; i++) sum[i] += *(const hz_part *)(from + i * outputs) * x[j + i];
+    for (; j < inputs; j++, from += outputs) sum[0] += *(const hz_part *)from * x[j];
     to[0] = (sum[0] + sum[1]) + (sum[2] + sum[3]);
   }
   if (inputs >= L) {
