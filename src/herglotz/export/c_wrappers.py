@@ -21,8 +21,7 @@ from xml.etree import ElementTree as xml
 from herglotz.codegen.c_compiler import SOURCE, compiler, portable_library
 from herglotz.data.files import PathLike, sealed_text, sealed_zip, write_trusted
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, read_metadata, runtime
-from herglotz.export.lower.c_parameters import numbers
+from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, numbers, read_metadata, runtime
 from herglotz.export.metadata import input_labels
 from herglotz.models import ContactLagrangian
 

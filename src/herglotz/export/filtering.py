@@ -19,10 +19,10 @@ from herglotz.codegen.c_compiler import build, compiler
 from herglotz.data import Trajectories
 from herglotz.data.gaps import complete
 from herglotz.errors import InputError, refuse
-from herglotz.export.c_compile import compile_c
 from herglotz.export.c_header import MAX_DERIVATIVES, runtime
 from herglotz.export.c_wrappers import header_of
 from herglotz.export.exported import ExportedStepper
+from herglotz.export.load import compile_c
 from herglotz.mechanics import legendre_minus
 from herglotz.mechanics.newton import find_root
 from herglotz.models import ContactLagrangian

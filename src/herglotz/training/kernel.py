@@ -28,10 +28,9 @@ from torch.func import functional_call, vmap
 import herglotz
 from herglotz.codegen.angles import Angles
 from herglotz.codegen.c_compiler import SOURCE, built, compiler
-from herglotz.codegen.c_function import Outputs
 from herglotz.codegen.gated import Prepared, gated
 from herglotz.codegen.interpret import interpret
-from herglotz.codegen.program import Program
+from herglotz.codegen.program import Outputs, Program
 from herglotz.codegen.trace import traced
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative

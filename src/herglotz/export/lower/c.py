@@ -22,9 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from herglotz.codegen.c_function import function, needed_by, row_of, whole
 from herglotz.codegen.interpret import interpret
-from herglotz.codegen.program import Program, Ref, literal
+from herglotz.codegen.program import Program, Ref, function, literal, needed_by, row_of, whole
 from herglotz.codegen.trace import Graph
 from herglotz.export.equation import Equations, example, field_like
 from herglotz.mechanics.legendre import soft_threshold
