@@ -22,8 +22,6 @@ from herglotz.errors import InputError
 LOOP = 8
 # Sine and cosine of a row are computed in the same loop, which compilers turn into a single call: networks read both.
 SINE_AND_COSINE = ("FN_sin({0})", "FN_cos({0})")
-# Number of inputs up to which a matrix product is a single loop over the outputs, without a call.
-FEW = 4
 # Number of nonzero weights from which a matrix product is a call of a kernel.
 DENSE = 64
 
@@ -195,23 +193,12 @@ class Program:
         if not kept:
             return start
         if not _varies([*weight.flat, *start]) and _varies(x):
-            form = None
-            if size >= self.loop and len(kept) <= FEW:
-                form = self._few_inputs
-            elif max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size):
-                form = self._call_product
-            if form is not None:
-                key = (form.__name__, tuple(x), tuple(weight.flat), tuple(start))
-                row = self._once(key, lambda: form(x, weight, start), size).statement
+            if max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size):
+                key = ("product", tuple(x), tuple(weight.flat), tuple(start))
+                row = self._once(key, lambda: self._call_product(x, weight, start), size).statement
                 return [Ref(row, i) for i in range(size)]
         return [self.sum([start[k], *(multiply(self, v, w) for v, w in zip(x, weight[:, k], strict=True))])
                 for k in range(size)]  # fmt: skip
-
-    def _few_inputs(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> str:
-        """The loop over the outputs of a matrix product, with the products of all inputs in its body."""
-        terms = [f"{self.read(v)} * {self._in_loop(list(row))}" for v, row in zip(x, weight, strict=True)]
-        terms = [self._in_loop(list(start)), *terms] if any(start) else terms
-        return f"for (k = 0; k < {len(start)}; k++) @@[k] = {' + '.join(terms)};"
 
     def _call_product(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> str:
         """The call of the kernel that adds a matrix product to the start."""

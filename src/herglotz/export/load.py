@@ -38,7 +38,7 @@ from herglotz.stepping import Status, Stepper
 from herglotz.stepping.rollout import Track
 
 # The models that can be traced.
-MODELS = (ContactLagrangian, OwnLagrangian)
+TRACEABLE = (ContactLagrangian, OwnLagrangian)
 # Names in the archive that torch writes.
 MODELS, EXTRA = "models/", f"extra/{METADATA}"
 
@@ -414,9 +414,9 @@ def compile(
     eager = source if isinstance(source, Stepper) else None
     # A run has its model as an attribute.
     run: Any = source
-    own = source if isinstance(source, MODELS) else getattr(source, "model", None)
+    own = source if isinstance(source, TRACEABLE) else getattr(source, "model", None)
     model: Any = own if eager is None else eager.L_d
-    if not isinstance(model, MODELS):
+    if not isinstance(model, TRACEABLE):
         if eager is None:
             given = type(source).__name__
             raise InputError(f"compile needs a model, a Stepper, a run or the path of a C header, got {given}")
@@ -457,7 +457,7 @@ def compile_c(
     InputError if no compiler is installed, or an argument is not usable.
     """
     given: object = model
-    if not isinstance(given, MODELS):
+    if not isinstance(given, TRACEABLE):
         raise InputError(f"compile_c takes a model, got {type(given).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     extra = {"parameters": described_parameters(model, parameters)} if parameters else {}
