@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -341,15 +341,36 @@ def function(
 ) -> str:
     """A C function of statements and outputs; `handed_on` names results that a structure holds."""
     computed = [i for i in sorted(numbers) if not program.statements[i].name]
-    sizes = {i: program.statements[i].size for i in computed if i not in handed_on}
-    lines = [f"REAL t{i}[{size}];" for i, size in sizes.items() if size]
+    rows = _rows(program, computed, handed_on, results(outputs))
+    sizes = {name: program.statements[i].size for i, name in rows.items()}
+    lines = [f"REAL {name}[{size}];" for name, size in sizes.items()]
     lines += [program.statements[i].text.removeprefix("const REAL " if i in handed_on else "") for i in computed]
-    text = named(program, [*lines, *_written(program, outputs)], handed_on)
+    text = named(program, [*lines, *_written(program, outputs)], {**handed_on, **rows})
     body = "".join(f"  {line}\n" for line in text.splitlines())
     unused = "".join(f"  (void){x};\n" for x in re.findall(r"(\w+)(?:\[\w+\])?(?=[,)])", head.rsplit("static", 1)[1])
                      if not re.search(rf"\b{x}\b", body))  # fmt: skip
     counter = "  int k;\n" if "(k = 0;" in body else ""
     return f"{head} {{\n{counter}{unused}{body}}}\n"
+
+
+def _rows(program: Program, computed: list[int], handed_on: Collection[int], kept: Collection[int]) -> dict[int, str]:
+    """The names of the rows that statements compute; a row that no later statement reads gives its place to the next.
+
+    Compilers do not share the stack in this way. Rows of `kept` statements are never given away, and those that are
+    handed on have names already.
+    """
+    last_reader = {j: i for i in computed for j in program.statements[i].reads if j not in kept}
+    names: dict[int, str] = {}
+    free: dict[int, list[str]] = {}
+    for i in computed:
+        size = program.statements[i].size
+        if size and i not in handed_on:
+            places = free.get(size)
+            names[i] = places.pop() if places else f"t{i}"
+        for j in program.statements[i].reads:
+            if j in names and last_reader.get(j) == i:
+                free.setdefault(program.statements[j].size, []).append(names[j])
+    return names
 
 
 def _written(program: Program, outputs: Outputs) -> Iterator[str]:
