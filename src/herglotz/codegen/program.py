@@ -192,11 +192,11 @@ class Program:
         start = [0.0] * size if bias is None else list(bias)
         if not kept:
             return start
-        if not _varies([*weight.flat, *start]) and _varies(x):
-            if max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size):
-                key = ("product", tuple(x), tuple(weight.flat), tuple(start))
-                row = self._once(key, lambda: self._call_product(x, weight, start), size).statement
-                return [Ref(row, i) for i in range(size)]
+        dense = max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size)
+        if dense and _varies(x) and not _varies([*weight.flat, *start]):
+            key = ("product", tuple(x), tuple(weight.flat), tuple(start))
+            row = self._once(key, lambda: self._call_product(x, weight, start), size).statement
+            return [Ref(row, i) for i in range(size)]
         return [self.sum([start[k], *(multiply(self, v, w) for v, w in zip(x, weight[:, k], strict=True))])
                 for k in range(size)]  # fmt: skip
 
