@@ -118,7 +118,8 @@ class ExportedStepper(OneStepMethod):
         s = torch.zeros_like(q[..., 0]) if s is None else s
         self._check(q, v, s, ("q", "v", "s"), finite=True)
         flat = [plain(x) for x in self._flat(State(q, v, s), h, None)[:4]]
-        p = self.programs.get("momentum", partial(momentum, self._legendre))(*flat)
+        transform: Any = self.programs.get("momentum", partial(momentum, self._legendre))
+        p = transform(*flat)
         return check_started(State(q, p.reshape(q.shape), s))
 
     def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:

@@ -171,7 +171,7 @@ def finish(model: ContactLagrangian, box: Box | None, h: Tensor, *rest: Tensor) 
         new = _solved(model, h, (state, trail, errors), rest[layout.size :])
     else:
         new = _explicit(model, h, (state, field, errors), u)
-    outputs = report(box, h, state, *new[:STATE], *new[layout.size :])
+    outputs = report(box, h, state, new[:STATE], *new[layout.size :])
     return tuple(dense(x) for x in (*new[: layout.size], *outputs))
 
 
@@ -305,13 +305,12 @@ def s_matters(metadata: Mapping[str, Any]) -> bool:
     return metadata.get("level") in ("affine", "full")
 
 
-def report(
-    box: Box | None, h: Tensor, before: Values, q1: Tensor, p1: Tensor, s1: Tensor, c: Tensor, *solved: Tensor
-) -> Values:
+def report(box: Box | None, h: Tensor, before: Values, after: Values, c: Tensor, *solved: Tensor) -> Values:
     """The outputs of a step, q1, p1, s1, c, residual, status[, outside]; the first four are NaN where the step failed.
 
-    `before` is (q, p, s) before the step, `solved` the residual and the status of steps that iterate.
+    `before` and `after` are (q, p, s), `solved` the residual and the status of steps that iterate.
     """
+    q1, p1, s1 = after
     residual, newton_status = solved or (0.0 * c, None)
     finite = torch.isfinite(residual + s1) & torch.isfinite(q1 + p1).all(-1)
     status = torch.where(finite, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
