@@ -19,7 +19,7 @@ from herglotz.data.files import PathLike, sealed_text, write_trusted
 from herglotz.data.holds import Arrival
 from herglotz.errors import InputError
 from herglotz.export.equation import Equations
-from herglotz.export.lower.c import StepInC, as_lanes, model_source, with_zero_as_input
+from herglotz.export.lower.c import StepInC, as_lanes, with_zero_as_input
 from herglotz.export.metadata import EXTRAS, check_metadata, describe, from_json, input_labels
 from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step import MAX_ITERATIONS, ROUNDING_EPSILONS
@@ -187,22 +187,20 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
     model = with_moved_numbers(model, entries)
     # In float64: numbers are rounded once, when they are written.
-    equations = Equations.of(with_zero_as_input(copy.deepcopy(model).double()), chosen)
-    step = StepInC(equations)
+    step = StepInC(Equations.of(with_zero_as_input(copy.deepcopy(model).double()), chosen))
     parameters = _parameters(entries["parameters"], entries["dtype"]) if chosen else ""
-    emitted = model_source(step, equations, derivatives, velocities, "adjoint" in entries.get("extras", ()))
     inverse = (resources.files("herglotz.codegen") / "runtime" / "inverse.h").read_text(encoding="utf-8")
     types, number_tests, of_parameters, functions, elementary, products, checks, *loops, api = map(runtime, RUNTIME)
-    one_step = emitted.step + "\n".join(loops)
+    one_step = step.source() + "\n".join(loops)
+    slopes = (step.slopes() if derivatives else "") + (step.pull() if "adjoint" in entries.get("extras", ()) else "")
+    momentum = step.momentum() if velocities else ""
     parts = [_top(model, entries, step, derivatives), types, _constants(model, entries), number_tests, parameters]
     parts += [of_parameters, functions, as_scalars(elementary), "#ifdef hz_LANE_BYTES", as_lanes(elementary), "#endif"]
-    parts += [as_scalars(inverse), products, emitted.tables, checks]
-    parts += [as_scalars(one_step)]
-    if entries["dof"] <= MAX_WIDE:
-        parts += ["#ifdef hz_BATCHED", as_lanes(one_step), "#endif"]
-    parts += [as_scalars(emitted.slopes), api]
+    parts += [as_scalars(inverse), products, step.tables(), checks, as_scalars(one_step)]
+    parts += ["#ifdef hz_BATCHED", as_lanes(one_step), "#endif"] if entries["dof"] <= MAX_WIDE else []
+    parts += [as_scalars(slopes), api]
     if velocities:
-        parts += [as_scalars(emitted.momentum), "#ifdef hz_BATCHED", as_lanes(emitted.momentum), "#endif"]
+        parts += [as_scalars(momentum), "#ifdef hz_BATCHED", as_lanes(momentum), "#endif"]
         parts += [as_lanes(runtime("velocity.h"))]
     parts += [*_extras_source(entries), "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), entries["dtype"]))
