@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from herglotz.codegen.trace import traced
-from herglotz.export.equation import Terms, dense, example, inverse, length, step_equation
+from herglotz.export.equation import dense, equation_of, example, inverse, length, step_equation
 from herglotz.export.metadata import TOLERANCE
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Status
@@ -152,7 +152,7 @@ def begin(h: Tensor, trail: Tensor) -> Values:
 
 def begin_sticking(model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
     """Newton's first carry in z, K and w/K: `herglotz.stepping.newton.StickSlip`."""
-    equation = Terms(model, State(q, p, s), h, u).equation
+    equation = equation_of(model, State(q, p, s), h, u)
     assert isinstance(equation, PartialsEquation)
     z, *bounds = at_rest(equation)
     return *first_carry(z), *(dense(x) for x in bounds)

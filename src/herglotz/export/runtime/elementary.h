@@ -1,9 +1,5 @@
-/* Elementary functions without branches, which compilers vectorise, for a number and for a register. */
-
-/* y_w = f(x_w) by <math.h> where size_w > limit or NaN: the formula before does not hold. */
-#define FN_ELSE(size, limit, function)                         \
-  for (w = 0; w < FN_WIDTH && FN_above(size, limit); w++)     \
-    if (hz_above(FN_LANE(size, w), limit)) FN_LANE(y, w) = function(FN_LANE(x, w))
+/* Elementary functions without branches, which compilers vectorise, for a number and for a register; those of <math.h>
+   where a formula does not hold. */
 
 static inline REAL FN_cut(REAL x, hz_real limit) {
   const REAL most = SPREAD(limit);
@@ -32,7 +28,8 @@ static inline REAL FN_expm1(REAL x) {
   const REAL size = FN_fabs(x);
   REAL y = FN_growth(x);
   int w;
-  FN_ELSE(size, hz_R(hz_LIMIT), hz_expm1_of);
+  for (w = 0; w < FN_WIDTH && FN_above(size, hz_R(hz_LIMIT)); w++)
+    if (hz_above(FN_LANE(size, w), hz_R(hz_LIMIT))) FN_LANE(y, w) = hz_expm1_of(FN_LANE(x, w));
   return y;
 }
 
@@ -41,7 +38,8 @@ static inline REAL FN_exp(REAL x) {
   REAL two, y = FN_reduced(FN_cut(x, hz_R(hz_FAR)), &two);
   int w;
   y = two * y + two;
-  FN_ELSE(size, hz_R(hz_FAR), hz_exp_of);
+  for (w = 0; w < FN_WIDTH && FN_above(size, hz_R(hz_FAR)); w++)
+    if (hz_above(FN_LANE(size, w), hz_R(hz_FAR))) FN_LANE(y, w) = hz_exp_of(FN_LANE(x, w));
   return y;
 }
 
@@ -63,6 +61,7 @@ static inline REAL FN_atanh(REAL x) {
   const REAL z = x * x;
   REAL y = x * hz_ARTANH_TERMS(z);
   int w;
-  FN_ELSE(z, hz_R(0.1111111111111111), hz_atanh_of);
+  for (w = 0; w < FN_WIDTH && FN_above(z, hz_R(0.1111111111111111)); w++)
+    if (hz_above(FN_LANE(z, w), hz_R(0.1111111111111111))) FN_LANE(y, w) = hz_atanh_of(FN_LANE(x, w));
   return y;
 }

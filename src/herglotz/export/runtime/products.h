@@ -28,7 +28,8 @@ static inline hz_lanes hz_wide_sin(hz_lanes x) {
   const hz_lanes size = hz_wide_fabs(x);
   hz_lanes y = hz_wide_wave(x, 0);
   int w;
-  hz_wide_ELSE(size, hz_R(hz_TURNED), hz_sin);
+  for (w = 0; w < hz_wide_WIDTH && hz_wide_above(size, hz_R(hz_TURNED)); w++)
+    if (hz_above(hz_wide_LANE(size, w), hz_R(hz_TURNED))) hz_wide_LANE(y, w) = hz_sin(hz_wide_LANE(x, w));
   return y;
 }
 
@@ -36,7 +37,8 @@ static inline hz_lanes hz_wide_cos(hz_lanes x) {
   const hz_lanes size = hz_wide_fabs(x);
   hz_lanes y = hz_wide_wave(x, 1);
   int w;
-  hz_wide_ELSE(size, hz_R(hz_TURNED), hz_cos);
+  for (w = 0; w < hz_wide_WIDTH && hz_wide_above(size, hz_R(hz_TURNED)); w++)
+    if (hz_above(hz_wide_LANE(size, w), hz_R(hz_TURNED))) hz_wide_LANE(y, w) = hz_cos(hz_wide_LANE(x, w));
   return y;
 }
 
