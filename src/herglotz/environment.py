@@ -240,7 +240,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
                 row = int((~np.isfinite(x)).reshape(count, -1).any(1).argmax())
                 raise InputError(f"reset: {name} of row {row} is NaN or inf; draw finite numbers")
         tensors = (torch.from_numpy(x) for x in (q, v, s))
-        p, _ = self._library.momentum(*tensors, h=self._h.expand(count).contiguous())
+        p = self._library.momentum(*tensors, h=self._h.expand(count).contiguous())
         states = np.concatenate([q, p.numpy(), s[:, None], np.ones((count, 1), self._model_dtype)], 1)
         observed, status = np.zeros((count, 2 * n), self._model_dtype), np.zeros(count, np.int32)
         self._call(states, np.zeros((count, self._u.shape[1]), self._model_dtype), 0, (observed, status))()

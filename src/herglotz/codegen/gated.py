@@ -14,8 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from herglotz.codegen.c_function import Outputs, named, needed_by, places
-from herglotz.codegen.program import Program, Ref
+from herglotz.codegen.program import Outputs, Program, Ref, named, needed_by, places
 
 SUMS = ("{0} + {1}", "{0} - {1}", "{0} + {1} * {2}", "{0} - {1} * {2}")
 # Operations with finite results for finite operands, each cheaper than a branch.

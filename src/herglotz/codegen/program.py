@@ -2,14 +2,15 @@
 
 A number of the traced function is an `Atom`: a Python float if the number is constant, else a `Ref` to the result of a
 statement. Constants are folded, zeros and ones dropped. A loop is written for eight or more neighbouring results whose
-operands lie in rows of memory; every other result is a scalar on a line of its own.
+operands lie in rows of memory; every other result is a scalar on a line of its own. `function` makes a C function of
+statements: locals, the statements, outputs in their places.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -21,8 +22,6 @@ from herglotz.errors import InputError
 LOOP = 8
 # Sine and cosine of a row are computed in the same loop, which compilers turn into a single call: networks read both.
 SINE_AND_COSINE = ("FN_sin({0})", "FN_cos({0})")
-# Number of inputs up to which a matrix product is a single loop over the outputs, without a call.
-FEW = 4
 # Number of nonzero weights from which a matrix product is a call of a kernel.
 DENSE = 64
 
@@ -44,6 +43,8 @@ class Compared(NamedTuple):
 # A float or a `Ref`.
 Atom = Any
 NAME = re.compile(r"@(\d+)")
+# The place written to → its number, or the list of its numbers.
+Outputs = Mapping[str, Any]
 
 
 @dataclass
@@ -191,24 +192,13 @@ class Program:
         start = [0.0] * size if bias is None else list(bias)
         if not kept:
             return start
-        if not _varies([*weight.flat, *start]) and _varies(x):
-            form = None
-            if size >= self.loop and len(kept) <= FEW:
-                form = self._few_inputs
-            elif max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size):
-                form = self._call_product
-            if form is not None:
-                key = (form.__name__, tuple(x), tuple(weight.flat), tuple(start))
-                row = self._once(key, lambda: form(x, weight, start), size).statement
-                return [Ref(row, i) for i in range(size)]
+        dense = max(len(kept), size) >= self.loop and np.count_nonzero(weight) >= min(DENSE, weight.size)
+        if dense and _varies(x) and not _varies([*weight.flat, *start]):
+            key = ("product", tuple(x), tuple(weight.flat), tuple(start))
+            row = self._once(key, lambda: self._call_product(x, weight, start), size).statement
+            return [Ref(row, i) for i in range(size)]
         return [self.sum([start[k], *(multiply(self, v, w) for v, w in zip(x, weight[:, k], strict=True))])
                 for k in range(size)]  # fmt: skip
-
-    def _few_inputs(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> str:
-        """The loop over the outputs of a matrix product, with the products of all inputs in its body."""
-        terms = [f"{self.read(v)} * {self._in_loop(list(row))}" for v, row in zip(x, weight, strict=True)]
-        terms = [self._in_loop(list(start)), *terms] if any(start) else terms
-        return f"for (k = 0; k < {len(start)}; k++) @@[k] = {' + '.join(terms)};"
 
     def _call_product(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> str:
         """The call of the kernel that adds a matrix product to the start."""
@@ -321,3 +311,92 @@ def _step(a: Atom, b: Atom, distance: int) -> int | None:
         gap = b.index - a.index
         return gap // distance if gap % distance == 0 else None
     return None if isinstance(a, Ref) or isinstance(b, Ref) else 0
+
+
+def places(outputs: Outputs) -> Iterator[tuple[str, int, str, Atom]]:
+    """Every number of the outputs: (output, index, place in C, number)."""
+    for name, row in outputs.items():
+        for i, atom in enumerate(row_of(row)):
+            yield name, i, name if row is atom else f"{name}[{i}]", atom
+
+
+def row_of(numbers: Any) -> list[Any]:
+    """The numbers of an output; a `Ref` is a single number."""
+    return numbers if type(numbers) is list else [numbers]
+
+
+def results(outputs: Outputs) -> set[int]:
+    """The statements whose results are outputs."""
+    return {atom.statement for *_, atom in places(outputs) if isinstance(atom, Ref)}
+
+
+def named(program: Program, lines: Iterable[str], names: Mapping[int, str] = {}) -> str:
+    """Lines with the names of results: of inputs, then of `names`, else the number of the statement."""
+    name = lambda i: program.statements[i].name or names.get(i) or f"t{i}"  # noqa: E731
+    return NAME.sub(lambda match: name(int(match[1])), "\n".join(lines))
+
+
+def function(
+    program: Program, head: str, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
+) -> str:
+    """A C function of statements and outputs; `handed_on` names results that a structure holds."""
+    computed = [i for i in sorted(numbers) if not program.statements[i].name]
+    rows = _rows(program, computed, handed_on, results(outputs))
+    sizes = {name: program.statements[i].size for i, name in rows.items()}
+    lines = [f"REAL {name}[{size}];" for name, size in sizes.items()]
+    lines += [program.statements[i].text.removeprefix("const REAL " if i in handed_on else "") for i in computed]
+    text = named(program, [*lines, *_written(program, outputs)], {**handed_on, **rows})
+    body = "".join(f"  {line}\n" for line in text.splitlines())
+    unused = "".join(f"  (void){x};\n" for x in re.findall(r"(\w+)(?:\[\w+\])?(?=[,)])", head.rsplit("static", 1)[1])
+                     if not re.search(rf"\b{x}\b", body))  # fmt: skip
+    counter = "  int k;\n" if "(k = 0;" in body else ""
+    return f"{head} {{\n{counter}{unused}{body}}}\n"
+
+
+def _rows(program: Program, computed: list[int], handed_on: Collection[int], kept: Collection[int]) -> dict[int, str]:
+    """The names of the rows that statements compute; a row that no later statement reads gives its place to the next.
+
+    Compilers do not share the stack in this way. Rows of `kept` statements are never given away, and those that are
+    handed on have names already.
+    """
+    last_reader = {j: i for i in computed for j in program.statements[i].reads if j not in kept}
+    names: dict[int, str] = {}
+    free: dict[int, list[str]] = {}
+    for i in computed:
+        size = program.statements[i].size
+        if size and i not in handed_on:
+            places = free.get(size)
+            names[i] = places.pop() if places else f"t{i}"
+        for j in program.statements[i].reads:
+            if j in names and last_reader.get(j) == i:
+                free.setdefault(program.statements[j].size, []).append(names[j])
+    return names
+
+
+def _written(program: Program, outputs: Outputs) -> Iterator[str]:
+    """The outputs, put in their places."""
+    for _, _, place, atom in places(outputs):
+        right = program.read(atom)
+        yield f"{place} = {right if isinstance(atom, Ref) else f'SPREAD({right})'};"
+
+
+def as_scalars(text: str) -> str:
+    """A C text of `REAL` and `FN_` as code for a single sample."""
+    return text.replace("SPREAD(", "(").replace("FN_", "hz_").replace("REAL", "hz_real")
+
+
+def whole(program: Program, head: str, outputs: Outputs) -> str:
+    """The C function of all statements that the outputs need."""
+    return function(program, head, needed_by(program, outputs), outputs, {})
+
+
+def needed_by(program: Program, outputs: Outputs) -> set[int]:
+    """The statements that outputs need, down to the inputs."""
+    todo = list(results(outputs))
+    needed: set[int] = set()
+    while todo:
+        i = todo.pop()
+        if i not in needed:
+            needed.add(i)
+            todo += program.statements[i].reads
+    return needed

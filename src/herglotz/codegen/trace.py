@@ -190,8 +190,7 @@ class Recorder(TorchDispatchMode):
             shape = [self._argument(size) for size in args[0].shape]
             return self._called(aten.expand.default, (self._moved(args[1]), shape))
         arguments, options = (map_aggregate(x, self._argument) for x in (args, kwargs))
-        new = self._finite(func, arguments) or self._gathered(func, args, arguments)
-        return new or self._called(INSTEAD.get(func) or _without_writing(func), arguments, options)
+        return self._called(INSTEAD.get(func) or _without_writing(func), arguments, options)
 
     def _called(self, operation: Any, arguments: Any, options: Any = {}) -> fx.Node:  # noqa: B006  not changed
         """The node of an operation; equal calls share a node, unless the operation draws random numbers."""
@@ -199,25 +198,6 @@ class Recorder(TorchDispatchMode):
         if key not in self.calls or torch.Tag.nondeterministic_seeded in getattr(operation, "tags", ()):
             self.calls[key] = self.graph.call_function(operation, arguments, options)
         return self.calls[key]
-
-    def _finite(self, func: Any, arguments: Any) -> fx.Node | None:
-        """`isfinite` as a single operation; torch decomposes `isfinite` into (x = x) · (|x| ≠ ∞)."""
-        if func != aten.mul.Tensor or not all(isinstance(x, fx.Node) for x in arguments):
-            return None
-        same, below = arguments
-        if (same.target, below.target) != (aten.eq.Tensor, aten.ne.Scalar) or same.args[0] is not same.args[1]:
-            return None
-        return self._called(aten.isfinite.default, same.args[:1])
-
-    def _gathered(self, func: Any, values: Any, arguments: Any) -> fx.Node | None:
-        """x[index] along the first axis as `index_select`: ONNX runs the general form at a tenth of the speed."""
-        if func != aten.index.Tensor or len(values[1]) != 1:
-            return None
-        shape = list(values[1][0].shape)
-        x, (place,) = arguments
-        flat = place if len(shape) == 1 else self._called(aten.reshape.default, (place, [-1]))
-        new = self._called(aten.index_select.default, (x, 0, flat))
-        return new if len(shape) == 1 else self._called(aten.unflatten.int, (new, 0, shape))
 
     def _same(self, func: Any, args: Any, kwargs: Any, result: Any) -> Tensor | None:
         """The argument that the result equals: views of the same shape, x + 0 and 1 x."""

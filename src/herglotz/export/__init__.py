@@ -1,6 +1,5 @@
 """Models as files that step on their own: `.pt2`, ONNX, machine code and C; loaded, and compared with eager."""
 
-from herglotz.export.c_compile import compile as compile, compile_c as compile_c
 from herglotz.export.c_header import export_c as export_c
 from herglotz.export.c_wrappers import (
     export_acados as export_acados,
@@ -11,6 +10,8 @@ from herglotz.export.compare import compare as compare
 from herglotz.export.exported import ExportedStepper as ExportedStepper
 from herglotz.export.filtering import Filtered as Filtered, filter as filter, noise_of as noise_of
 from herglotz.export.load import (
+    compile as compile,
+    compile_c as compile_c,
     load_c as load_c,
     load_exported as load_exported,
     load_onnx as load_onnx,

@@ -6,37 +6,28 @@ import copy
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from herglotz.codegen.c_function import as_scalars
+from herglotz.codegen.program import as_scalars
 from herglotz.data.files import PathLike, sealed_text, write_trusted
 from herglotz.data.holds import Arrival
 from herglotz.errors import InputError
 from herglotz.export.equation import Equations
-from herglotz.export.lower.c import StepInC, as_lanes, model_source, pushed
-from herglotz.export.lower.c_parameters import (
-    constants as parameter_constants,
-    inputs_constants,
-    inputs_source,
-    number,
-    numbers,
-    text_constant,
-    without_parameters,
-    written,
-)
+from herglotz.export.lower.c import StepInC, as_lanes, with_zero_as_input
 from herglotz.export.metadata import EXTRAS, check_metadata, describe, from_json, input_labels
 from herglotz.export.parameters import Chosen, described_parameters, moved_numbers, with_moved_numbers
 from herglotz.export.step import MAX_ITERATIONS, ROUNDING_EPSILONS
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "
-# The files of `export/runtime` of each extra.
-FILES = {"adjoint": ("adjoint",), "filter": ("filter", "smoother")}
+# A constant of an emitted function.
+CONSTANT = re.compile(r"\bR\(([^()]*)\)")
 # The prefix of the names in a header.
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,40}"
 # Newton's default tolerance in machine epsilons of q, which a step in increments reaches.
@@ -84,7 +75,8 @@ TOP = """\
 /* Sizes and kinds of the model, for the preprocessor. */
 #define hz_N {n} /* coordinates */
 #define hz_M {m} /* inputs */
-#define hz_INPUTS {inputs} /* numbers that a step takes of the inputs: these themselves, generalised forces, or both */
+#define hz_INPUTS {inputs} /* numbers that a step takes of the inputs: these, and 1 where these have a zero */
+#define hz_P {parameters} /* numbers that are set at run time */
 #define hz_SINGLE {single} /* float, not double */
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
 #define hz_STICKING {sticking} /* dry friction can hold a coordinate still */
@@ -113,7 +105,10 @@ enum {{ hz_max_iterations = {max_iterations} }};
 {box}{start}"""
 # The files of the runtime in every header; `step.h` and `run.h` are texts of `REAL` and `FN_`, like the emitted
 # functions.
-RUNTIME = ("types.h", "numbers.h", "functions.h", "products.h", "checks.h", "step.h", "run.h", "api.h")
+RUNTIME = (
+    "types.h", "numbers.h", "parameters.h", "functions.h", "elementary.h", "products.h", "checks.h", "step.h", "run.h",
+    "api.h",
+)  # fmt: skip
 
 
 def export_c(
@@ -192,24 +187,22 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     chosen = {name: value for name, (value, *_) in entries.get("parameters", {}).items()}
     model = with_moved_numbers(model, entries)
     # In float64: numbers are rounded once, when they are written.
-    equations = Equations.of(pushed(copy.deepcopy(model).double()), chosen)
-    step = StepInC(equations)
-    inputs, parameters = inputs_constants(model, entries["dtype"]), ""
-    if chosen:
-        inputs = inputs_source(copy.deepcopy(model).double(), chosen, step.program.tables)
-        parameters = parameter_constants(entries["parameters"], entries["dtype"]) + runtime("parameters.h")
-    emitted = model_source(step, equations, derivatives, velocities, "adjoint" in entries.get("extras", ()))
-    shown = (lambda text: text) if chosen else without_parameters
-    types, number_tests, functions, products, checks, one_step, run, api = (shown(runtime(x)) for x in RUNTIME)
-    parts = [_top(model, entries, step, derivatives), types, _constants(model, entries), number_tests + parameters]
-    parts += [functions, products, emitted.tables, inputs, checks, as_scalars(emitted.step + one_step + run)]
-    if entries["dof"] <= MAX_WIDE:
-        parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
-    parts += [as_scalars(emitted.slopes), api]
+    step = StepInC(Equations.of(with_zero_as_input(copy.deepcopy(model).double()), chosen))
+    parameters = _parameters(entries["parameters"], entries["dtype"]) if chosen else ""
+    inverse = (resources.files("herglotz.codegen") / "runtime" / "inverse.h").read_text(encoding="utf-8")
+    types, number_tests, of_parameters, functions, elementary, products, checks, *loops, api = map(runtime, RUNTIME)
+    one_step = step.source() + "\n".join(loops)
+    slopes = (step.slopes() if derivatives else "") + (step.pull() if "adjoint" in entries.get("extras", ()) else "")
+    momentum = step.momentum() if velocities else ""
+    parts = [_top(model, entries, step, derivatives), types, _constants(model, entries), number_tests, parameters]
+    parts += [of_parameters, functions, as_scalars(elementary), "#ifdef hz_LANE_BYTES", as_lanes(elementary), "#endif"]
+    parts += [as_scalars(inverse), products, step.tables(), checks, as_scalars(one_step)]
+    parts += ["#ifdef hz_BATCHED", as_lanes(one_step), "#endif"] if entries["dof"] <= MAX_WIDE else []
+    parts += [as_scalars(slopes), api]
     if velocities:
-        parts += [as_scalars(emitted.momentum), shown(runtime("velocity.h"))]
-        parts += ["#ifdef hz_BATCHED", as_lanes(emitted.momentum), "#endif", as_lanes(shown(runtime("velocities.h")))]
-    parts += [*_extras_source(entries, shown), "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+        parts += [as_scalars(momentum), "#ifdef hz_BATCHED", as_lanes(momentum), "#endif"]
+        parts += [as_lanes(runtime("velocity.h"))]
+    parts += [*_extras_source(entries), "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), entries["dtype"]))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     last = {
@@ -238,11 +231,11 @@ def _check_extras(extras: object, dof: int) -> None:
         )
 
 
-def _extras_source(entries: Mapping[str, Any], shown: Callable[[str], str]) -> list[str]:
-    """The texts of the extras that a header's metadata names, as `shown` changes files of the runtime."""
+def _extras_source(entries: Mapping[str, Any]) -> list[str]:
+    """The texts of the extras that a header's metadata names."""
     found = []
     for name in entries.get("extras", ()):
-        found += [shown(runtime(f"{x}.h")) for x in FILES[name]]
+        found += [runtime(f"{name}.h")]
         if name == "filter" and (noise := entries.get("noise")):
             rows = [noise["position"], noise["momentum"]]
             rows += [noise["theta"]] if entries.get("parameters") else []
@@ -335,6 +328,7 @@ def _top(model: ContactLagrangian, entries: Mapping[str, Any], step: StepInC, de
         n=entries["dof"],
         m=inputs,
         inputs=step.m,
+        parameters=len(entries.get("parameters", ())),
         single=int(entries["dtype"] == "float32"),
         explicit=int(step.explicit),
         sticking=int(step.sticks),
@@ -387,3 +381,49 @@ def _start_constant(entries: Mapping[str, Any], dtype: str) -> str:
     where = "where the fitted samples end" if start else "at rest, as no recording was given"
     values = f"{{{numbers(q, dtype)}}}, {{{numbers(p, dtype)}}}, {number(s, dtype)}, 1"
     return f"/* A state to start from: {where}. */\nstatic const hz_state hz_start = {{{values}}};\n"
+
+
+def number(value: float, dtype: str) -> str:
+    """One number as a C constant that a compiler reads back exactly."""
+    if dtype == "float64":
+        return _decimal(repr(float(value)))
+    return _decimal(f"{float(np.float32(value)):.9g}") + "f"
+
+
+def numbers(values: Iterable[float], dtype: str) -> str:
+    """A list of constants, several a line."""
+    words = [number(v, dtype) for v in values]
+    lines = [", ".join(words[k : k + 5]) for k in range(0, len(words), 5)]
+    return lines[0] if len(lines) == 1 else "\n  " + ",\n  ".join(lines)
+
+
+def written(text: str, dtype: str) -> str:
+    """The text with the constants of emitted functions, such as `R(0.5)`, written in the number type."""
+    return CONSTANT.sub(lambda m: number(float(m[1]), dtype), text)
+
+
+def text_constant(value: str) -> str:
+    """A C string constant, ASCII only."""
+    plain = {ord("\\"): "\\\\", ord('"'): '\\"', ord("?"): "\\?"}
+    escaped = (plain.get(b, chr(b) if 32 <= b < 127 else f"\\{b:03o}") for b in value.encode())
+    return '"' + "".join(escaped) + '"'
+
+
+def _decimal(digits: str) -> str:
+    return digits if any(mark in digits for mark in ".en") else digits + ".0"
+
+
+def _parameters(entries: Mapping[str, Sequence[float | None]], dtype: str) -> str:
+    """The structure of the parameters, their indices, names, defaults and bounds."""
+    largest = torch.finfo(getattr(torch, dtype)).max
+    missing = {"defaults": 0.0, "lowest": -largest, "highest": largest}
+    columns = zip(missing.items(), zip(*entries.values(), strict=True), strict=True)
+    rows = {key: [none if x is None else x for x in row] for (key, none), row in columns}
+    words = (re.sub(r"\W+", "_", name).strip("_") for name in entries)
+    indices = ", ".join(f"hz_{word} = {i}" for i, word in enumerate(words))
+    names = ", ".join(map(text_constant, entries))
+    lines = ["/* theta.value[i] is the number with index i of this list. */", f"enum {{ {indices} }};"]
+    lines += [f"typedef struct {{\n  hz_real value[{len(entries)}];\n}} hz_parameters;"]
+    lines += [f"static const hz_parameters hz_{key} = {{{{{numbers(row, dtype)}}}}};" for key, row in rows.items()]
+    lines += [f"static const char *const hz_parameter_names[hz_P] = {{{names}}};"]
+    return "\n".join(lines) + "\n"

@@ -21,8 +21,7 @@ from xml.etree import ElementTree as xml
 from herglotz.codegen.c_compiler import SOURCE, compiler, portable_library
 from herglotz.data.files import PathLike, sealed_text, sealed_zip, write_trusted
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, read_metadata, runtime
-from herglotz.export.lower.c_parameters import numbers
+from herglotz.export.c_header import MAX_DERIVATIVES, NAME, export_c, identifier, numbers, read_metadata, runtime
 from herglotz.export.metadata import input_labels
 from herglotz.models import ContactLagrangian
 
@@ -153,7 +152,7 @@ def model_description(entries: Mapping[str, Any], version: str, token: str, sour
     for name in ("logStatusWarning", "logStatusError"):
         xml.SubElement(categories, "Category", name=name)
     xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(entries["h"]))
-    (_fmi3 if new else _fmi2)(root, listed)
+    _variables(root, listed, new)
     return _written(root)
 
 
@@ -177,35 +176,26 @@ def _units(root: xml.Element, has: list[Variable]) -> None:
                 xml.SubElement(unit, "BaseUnit", {name: "1"})
 
 
-def _attributes(variable: Variable, reference: int) -> dict[str, str]:
-    """Attributes of any version; an output can be set before the first step (`initial` is exact)."""
-    found = {"name": variable.name, "valueReference": str(reference), "causality": variable.causality}
-    found |= {"variability": "continuous", "description": variable.description}
-    return found | ({"initial": "exact"} if variable.causality == "output" else {})
-
-
-def _of_value(variable: Variable) -> dict[str, str]:
-    found = {"unit": variable.unit} if variable.unit else {}
-    return found | ({} if variable.start is None else {"start": repr(float(variable.start))})
-
-
-def _fmi3(root: xml.Element, has: list[Variable]) -> None:
+def _variables(root: xml.Element, has: list[Variable], new: bool) -> None:
+    """The variables and the outputs of FMI 3.0 (`new`) or 2.0."""
     listed, structure = xml.SubElement(root, "ModelVariables"), xml.SubElement(root, "ModelStructure")
+    outputs = structure if new else xml.SubElement(structure, "Outputs")
     for reference, variable in enumerate(has):
-        xml.SubElement(listed, "Float64", _attributes(variable, reference) | _of_value(variable))
-        if variable.causality == "output":
-            xml.SubElement(structure, "Output", valueReference=str(reference), dependencies="")
-
-
-def _fmi2(root: xml.Element, has: list[Variable]) -> None:
-    listed = xml.SubElement(root, "ModelVariables")
-    outputs = xml.SubElement(xml.SubElement(root, "ModelStructure"), "Outputs")
-    for reference, variable in enumerate(has):
-        one = xml.SubElement(listed, "ScalarVariable", _attributes(variable, reference))
-        xml.SubElement(one, "Real", _of_value(variable))
-        if variable.causality == "output":
+        is_output = variable.causality == "output"
+        found = {"name": variable.name, "valueReference": str(reference), "causality": variable.causality}
+        found |= {"variability": "continuous", "description": variable.description}
+        # An output can be set before the first step.
+        found |= {"initial": "exact"} if is_output else {}
+        value = {"unit": variable.unit} if variable.unit else {}
+        value |= {} if variable.start is None else {"start": repr(float(variable.start))}
+        if new:
+            xml.SubElement(listed, "Float64", found | value)
+        else:
+            xml.SubElement(xml.SubElement(listed, "ScalarVariable", found), "Real", value)
+        if is_output:
             # FMI 2.0 counts variables from 1. Between steps an output depends on no input.
-            xml.SubElement(outputs, "Unknown", index=str(reference + 1), dependencies="")
+            place = {"valueReference": str(reference)} if new else {"index": str(reference + 1)}
+            xml.SubElement(outputs, "Output" if new else "Unknown", place, dependencies="")
 
 
 def _written(root: xml.Element) -> bytes:

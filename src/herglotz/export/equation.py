@@ -29,30 +29,27 @@ from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.velocity import legendre
 
 
-class Terms:
-    """The step equation at (q0, p0, s0, h): by terms where `model_equation` knows the model, else by jets."""
+def equation_of(
+    model: ContactLagrangian, state: State, h: Tensor, more: tuple[Tensor, ...]
+) -> StepOfModel | PartialsEquation:
+    """The step equation at (q0, p0, s0, h): by terms where `model_equation` knows the model, else by jets.
 
-    def __init__(self, model: ContactLagrangian, state: State, h: Tensor, more: tuple[Tensor, ...]):
-        maker = model_equation(model, fold=False)
-        here, inputs = (more[:2], more[2:]) if maker is not None else ((), more)
-        u = inputs[0] if inputs else None
-        self.equation: StepOfModel | PartialsEquation
-        if maker is None:
-            self.equation = PartialsEquation(driven_by(model, u), state, h, 1, increments=True)
-        else:
-            self.equation = maker.at(state, h, u, True, Field(*here))
+    `more` are V and V′ at q0 and u, as far as the model has them.
+    """
+    maker = model_equation(model, fold=False)
+    if maker is None:
+        return PartialsEquation(driven_by(model, more[0] if more else None), state, h, 1, increments=True)
+    return maker.at(state, h, more[2] if len(more) > 2 else None, True, Field(*more[:2]))
 
-    def __call__(self, x: Tensor, second: bool) -> Point:
-        """F, and J if `second`, at Δ = x."""
-        return self.equation(x, second)
 
-    def gained(self, x: Tensor, point: Point) -> End:
-        """p1, L and c at Δ = x, without the share of the potential at q1.
+def gained(equation: StepOfModel | PartialsEquation, x: Tensor, point: Point) -> End:
+    """p1, L and c at Δ = x, without the share of the potential at q1.
 
-        `point` may be the equation at a Δ very near to x; the kinetic term, which changes fastest, is evaluated at x.
-        """
-        form = self.equation
-        return form.end(x, point) if isinstance(form, PartialsEquation) else form.end_without_field(form.at(x, point))
+    `point` may be the equation at a Δ very near to x; the kinetic term, which changes fastest, is evaluated at x.
+    """
+    if isinstance(equation, PartialsEquation):
+        return equation.end(x, point)
+    return equation.end_without_field(equation.at(x, point))
 
 
 def step_equation(model: ContactLagrangian, bounds: int, *x: Tensor) -> tuple[Tensor, ...]:
@@ -61,23 +58,23 @@ def step_equation(model: ContactLagrangian, bounds: int, *x: Tensor) -> tuple[Te
     Where the arguments end with K and w/K (`bounds` is 2), Δ is the z of `herglotz.stepping.newton.StickSlip`.
     """
     (q, p, s, h, delta), more, sticking = x[:5], x[5 : len(x) - bounds], x[len(x) - bounds :]
-    form = terms = Terms(model, State(q, p, s), h, more)
+    form = equation = equation_of(model, State(q, p, s), h, more)
     if sticking:
-        assert isinstance(terms.equation, PartialsEquation)
-        form = StickSlip(terms.equation, *sticking)
+        assert isinstance(equation, PartialsEquation)
+        form = StickSlip(equation, *sticking)
     point = form(delta, True)
     assert point.J is not None
-    move, size = eliminate(point.J, torch.stack([point.F, terms.equation.push(point)], -1)).unbind(-1)
-    gained = terms.gained(delta, point)
-    return tuple(dense(y) for y in (-move, length(size), length(point.F), *gained[:3], point.J))
+    move, size = eliminate(point.J, torch.stack([point.F, equation.push(point)], -1)).unbind(-1)
+    end = gained(equation, delta, point)
+    return tuple(dense(y) for y in (-move, length(size), length(point.F), *end[:3], point.J))
 
 
 def first_order(model: ContactLagrangian, *x: Tensor) -> tuple[Tensor, ...]:
     """F, p1 (B, n), L, c (B,) of the step equation, from first derivatives of L_d alone."""
     (q, p, s, h, delta), more = x[:5], x[5:]
-    terms = Terms(model, State(q, p, s), h, more)
-    point = terms(delta, False)
-    return tuple(dense(y) for y in (point.F, *terms.gained(delta, point)[:3]))
+    equation = equation_of(model, State(q, p, s), h, more)
+    point = equation(delta, False)
+    return tuple(dense(y) for y in (point.F, *gained(equation, delta, point)[:3]))
 
 
 @dataclass(frozen=True)

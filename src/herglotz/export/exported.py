@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import torch
@@ -117,10 +118,8 @@ class ExportedStepper(OneStepMethod):
         s = torch.zeros_like(q[..., 0]) if s is None else s
         self._check(q, v, s, ("q", "v", "s"), finite=True)
         flat = [plain(x) for x in self._flat(State(q, v, s), h, None)[:4]]
-        if "momentum" in self.programs:
-            p, _ = self.programs["momentum"](*flat)
-        else:
-            p = momentum(self._legendre, *flat)
+        transform: Any = self.programs.get("momentum", partial(momentum, self._legendre))
+        p = transform(*flat)
         return check_started(State(q, p.reshape(q.shape), s))
 
     def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:

@@ -19,11 +19,10 @@ from herglotz.codegen.c_compiler import build, compiler
 from herglotz.data import Trajectories
 from herglotz.data.gaps import complete
 from herglotz.errors import InputError, refuse
-from herglotz.export.c_compile import compile_c
 from herglotz.export.c_header import MAX_DERIVATIVES, runtime
 from herglotz.export.c_wrappers import header_of
 from herglotz.export.exported import ExportedStepper
-from herglotz.export.lower.c_parameters import without_parameters
+from herglotz.export.load import compile_c
 from herglotz.mechanics import legendre_minus
 from herglotz.mechanics.newton import find_root
 from herglotz.models import ContactLagrangian
@@ -135,7 +134,7 @@ def _likelihood(run: FittedRun) -> Callable[[Tensor], float]:
     model = copy.deepcopy(run.model).double()
     data = complete(run.data).unwrapped().to(dtype=torch.float64, device="cpu")
     header = header_of(model, "noise", {"h": run.h, "extras": ["filter"]})
-    library = build(header, re.sub(r"\bhz_", "noise_", without_parameters(runtime("innovations.c"))))
+    library = build(header, re.sub(r"\bhz_", "noise_", runtime("innovations.c")))
     longest = run.h_range[1]
     parts, rows, places, steps = _parts(data, longest)
     starts, slopes = [], []

@@ -1,6 +1,6 @@
 """Readers of exported files: each gives the programs of a file, as functions of tensors, to an `ExportedStepper`.
 
-A generated header is compiled and loaded.
+A generated header is compiled and loaded; `hz.compile` and `compile_c` do this for a model.
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ import base64
 import copy
 import ctypes
 import io
+import os
 import re
+import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -20,21 +22,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.codegen.c_compiler import build
+from herglotz.codegen.c_compiler import build, compiler
 from herglotz.data.files import TEXT_SEAL, PathLike, check_seal, check_trusted, read_bytes, sealed_text
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_DERIVATIVES, c_source, read_metadata, runtime
+from herglotz.export.c_header import MAX_DERIVATIVES, c_source, described, read_metadata, runtime
 from herglotz.export.c_wrappers import header_in
 from herglotz.export.exported import ExportedStepper, Program
-from herglotz.export.lower.c_parameters import without_parameters
-from herglotz.export.metadata import AOTI, KEY, METADATA, from_json, weights_digest
-from herglotz.export.parameters import checked_values
+from herglotz.export.metadata import AOTI, KEY, METADATA, describe, from_json, weights_digest
+from herglotz.export.parameters import Chosen, checked_values, described_parameters
 from herglotz.export.programs import quiet
+from herglotz.export.step import MAX_ITERATIONS
 from herglotz.formats import FORMATS, of_ending
-from herglotz.models import ContactLagrangian
-from herglotz.stepping import Status
+from herglotz.models import ContactLagrangian, OwnLagrangian
+from herglotz.stepping import Status, Stepper
 from herglotz.stepping.rollout import Track
 
+# The models that can be traced.
+TRACEABLE = (ContactLagrangian, OwnLagrangian)
 # Names in the archive that torch writes.
 MODELS, EXTRA = "models/", f"extra/{METADATA}"
 
@@ -245,9 +249,7 @@ def _session_program(session: Any) -> Program:
 
 def library_of(metadata: Mapping[str, Any]) -> str:
     """The C source of the loops over samples around a header with this metadata."""
-    text = runtime("library.c")
-    text = text if metadata.get("parameters") else without_parameters(text)
-    return re.sub(r"\bhz_", f"{metadata['name']}_", text)
+    return re.sub(r"\bhz_", f"{metadata['name']}_", runtime("library.c"))
 
 
 class CLibrary:
@@ -282,34 +284,33 @@ class CLibrary:
 
     def init(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(p1, s1) at q1; NaN where the step from q0 to q1 has none."""
-        p, s, status = self._empty(len(s0), self.dof), self._empty(len(s0)), self._failed(len(s0))
-        self.library.herglotz_inits(*_arguments(len(s0), q0, q1, s0, h, u, *self._theta, p, s, status))
-        return p, s
+        states = _rows(q0, q1, s0)
+        self.library.herglotz_inits(*_arguments(len(s0), h, u, *self._theta, states))
+        return states[:, self.dof : -2], states[:, -2]
 
-    def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """The momenta p of velocities, NaN where a velocity has no momentum, and statuses."""
-        p, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self.differentiates().herglotz_momenta(*_arguments(len(s), q, v, s, h, *self._theta, p, status))
-        return p, status
+    def momentum(self, q: Tensor, v: Tensor, s: Tensor, h: Tensor) -> Tensor:
+        """The momenta p of velocities, NaN where a velocity has no momentum."""
+        states = _rows(q, v, s)
+        self.differentiates().herglotz_momenta(*_arguments(len(s), h, *self._theta, states))
+        return states[:, self.dof : -2]
 
     def velocity(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """The velocities v of momenta, NaN where a momentum has no velocity, and statuses."""
-        v, status = self._empty(len(s), self.dof), self._failed(len(s))
-        self.differentiates().herglotz_velocities(*_arguments(len(s), q, p, s, h, *self._theta, v, status))
+        states, v, status = _rows(q, p, s), self._empty(len(s), self.dof), self._failed(len(s))
+        self.differentiates().herglotz_velocities(*_arguments(len(s), h, *self._theta, states, v, status))
         return v, status
 
     def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
         """A step and its derivative (B, 2n+1, 2n+2+m+K); NaN where the step failed."""
-        count, size = len(s), 2 * self.dof + 1
-        widths = ((self.dof,), (self.dof,), (), ())
-        *new, sigma = (self._empty(count, *width) for width in widths)
-        status, residual = self._failed(count), self._empty(count)
+        count, n, size = len(s), self.dof, 2 * self.dof + 1
+        states, status, residual = _rows(q, p, s), self._failed(count), self._empty(count)
         by_state, by_input, by_theta, by_h = slopes = [
             self._empty(count, size, width) for width in (size, self.inputs, len(self.parameters), 1)
         ]
         written = slopes if self.parameters else (by_state, by_input, by_h)
-        outputs = (*new, sigma, status, residual, *written)
-        self.differentiates().herglotz_jacobians(*_arguments(count, q, p, s, h, u, *self._theta, *outputs))
+        outputs = (states, status, residual, *written)
+        self.differentiates().herglotz_jacobians(*_arguments(count, h, u, *self._theta, *outputs))
+        *new, sigma = states[:, :n], states[:, n:-2], states[:, -2], states[:, -1]
         return *new, sigma, residual, status, torch.cat([by_state, by_h, by_input, by_theta], -1)
 
     def __call__(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> Track:
@@ -330,7 +331,7 @@ class CLibrary:
             self._empty(count, steps + 1), self._failed(count, steps), self._empty(count, steps),
         )  # fmt: skip
         u_stride = 0 if u is None else u.stride(0)
-        keep = (*(x.contiguous() for x in (q, p, s)), h, *h.stride(), u, u_stride, *self._theta, *outputs)
+        keep = (_rows(q, p, s), h, *h.stride(), u, u_stride, *self._theta, *outputs)
         arguments = _arguments(count, steps, *keep)
         function = self.library.herglotz_rollouts
         # `keep` keeps the tensors alive as long as the call.
@@ -355,6 +356,11 @@ class CLibrary:
         return torch.full(shape, int(Status.DIVERGED), dtype=torch.uint8)
 
 
+def _rows(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    """States of C as rows (q, p, s, σ), (B, 2n + 2), with σ = 1."""
+    return torch.cat([q, p, s[:, None], torch.ones_like(s)[:, None]], 1)
+
+
 def _arguments(*values: Tensor | int | None) -> list[Any]:
     """Numbers and addresses of tensors as arguments of a C function."""
     return [
@@ -376,3 +382,88 @@ def stepper_of(library: CLibrary, path: str, velocities: bool) -> ExportedSteppe
         programs |= {"momentum": library.momentum, "velocity": library.velocity}
     again = lambda values: stepper_of(library.with_values(values), path, velocities)  # noqa: E731
     return ExportedStepper(programs, library.metadata, path, "c", library, again)
+
+
+def compile(
+    source: Stepper | ContactLagrangian | PathLike | Any, *, trust_code: bool = False
+) -> ExportedStepper | Stepper:
+    """A stepper with the interface of `Stepper` that steps in C, without derivatives.
+
+    The library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a model that has
+    no C, the result is the eager stepper, and a warning says what is missing.
+
+    Parameters
+    ----------
+    source
+        A model, a `Stepper` of one, a run (its h, box and units are recorded), or a header that `export_c` wrote.
+    trust_code
+        As in `load_c`, for a header.
+
+    Returns
+    -------
+    ExportedStepper or Stepper
+        The eager stepper where C is not possible.
+
+    Raises
+    ------
+    InputError
+        If the source is none of these, or a header cannot be compiled: a header has no eager stepper to fall back on.
+    """
+    if isinstance(source, str | os.PathLike):
+        return load_c(source, trust_code=trust_code)
+    eager = source if isinstance(source, Stepper) else None
+    # A run has its model as an attribute.
+    run: Any = source
+    own = source if isinstance(source, TRACEABLE) else getattr(source, "model", None)
+    model: Any = own if eager is None else eager.L_d
+    if not isinstance(model, TRACEABLE):
+        if eager is None:
+            given = type(source).__name__
+            raise InputError(f"compile needs a model, a Stepper, a run or the path of a C header, got {given}")
+        return _fall_back(eager, f"{type(model).__name__} is no ContactLagrangian and has no C form")
+    of_run: dict[str, Any] = {} if eager or model is run else {"h": run.h, "box": run.box, "units": run.data.units}
+    eager = eager or Stepper(model)
+    if eager.throw:
+        return _fall_back(eager, "throw=True needs the eager stepper")
+    try:
+        compiler()
+        return compile_c(model, **of_run)
+    except InputError as error:
+        return _fall_back(eager, str(error))
+
+
+def _fall_back(eager: Stepper, reason: str) -> Stepper:
+    warnings.warn(f"hz.compile: stepping in PyTorch instead of C: {reason}", RuntimeWarning, stacklevel=3)
+    return eager
+
+
+def compile_c(
+    model: Any,
+    *,
+    h: float = 1.0,
+    box: Mapping[str, Sequence[float]] | None = None,
+    units: Sequence[str] = (),
+    dtype: str | None = None,
+    tolerance: float | None = None,
+    parameters: Chosen = (),
+) -> ExportedStepper:
+    """Compile a model's C and load it; `load_c` compiles a header.
+
+    The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
+    processor. The compiler is $CC, or cc, gcc or clang from the PATH.
+
+    The model, a ContactLagrangian or OwnLagrangian, is not changed. The other arguments are those of `export_c`; dtype
+    defaults to the model's. The result is a drop-in for `Stepper`, and its `with_parameters` sets parameters. Raise
+    InputError if no compiler is installed, or an argument is not usable.
+    """
+    given: object = model
+    if not isinstance(given, TRACEABLE):
+        raise InputError(f"compile_c takes a model, got {type(given).__name__}; load_c opens a header")
+    dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
+    extra = {"parameters": described_parameters(model, parameters)} if parameters else {}
+    entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None, **extra})
+    entries = described(model, entries, "model", dtype, tolerance)
+    # A copy, because training may change the model before `whole` is called.
+    kept: Any = copy.deepcopy(model)
+    header = c_source(kept, entries, "stepper.h", derivatives=False)
+    return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

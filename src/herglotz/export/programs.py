@@ -84,7 +84,7 @@ class RolloutModule(nn.Module):
         """
         graphs, layout = self.graphs, self.graphs.layout
         carry = [dense(x) for x in graphs.start(q, p, s)]
-        parts = [*((graphs.begin, graphs.iterate) if layout.iterates else ()), graphs.finish, graphs.report]
+        parts = [*((graphs.begin, graphs.iterate) if layout.iterates else ()), graphs.finish]
         given = [[s.shape[0]], *(graph.constants for graph in parts)]
 
         def step(*x: Any) -> list[Tensor]:
@@ -98,10 +98,7 @@ class RolloutModule(nn.Module):
             if layout.iterates:
                 begin, iterate = (lambda *x: graphs.begin.call(*x, *constants[0])), graphs.iterate.call
                 found = solved(begin, iterate, constants[1], layout, self.iterations, h, tuple(u), carry)
-            new = graphs.finish.call(h, *u, *carry, *found, *constants[-2])
-            rows = (*new[:STATE], *new[layout.size :])
-            rows = graphs.report.call(h, *carry[:STATE], *rows, *constants[-1])
-            return [dense(y) for y in (*new[: layout.size], *rows)]
+            return [dense(y) for y in graphs.finish.call(h, *u, *carry, *found, *constants[-1])]
 
         return tuple(scan_op(step, carry, [h, *u], list(chain(*given)))[layout.size :])
 
@@ -156,7 +153,7 @@ class StepModule(nn.Module):
             if self.attaches:
                 found = self._attached((q, p, s, h), (*graphs.layout.split(carry)[1], *u), found)
         new = graphs.finish(h, *u, *carry, *found)
-        outputs = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
+        outputs = new[len(carry) :]
         if self.jacobian is None:
             return outputs
         (J,) = self.jacobian(q, p, s, h, found[2] if found else new[0] - q, *u)

@@ -4,8 +4,7 @@
     begin    (h, carry) → Newton's first carry           only where a step iterates
              (q, p, s, h, u) → the same, K and w/K       where dry friction can hold a coordinate
     iterate  (q, p, s, h, Newton's carry, …) → Newton's carry
-    finish   (h, u, carry[, Newton's last carry]) → carry, then c[, residual, status]
-    report   (h, q, p, s, q1, p1, s1, c[, residual, status]) → the file's outputs
+    finish   (h, u, carry[, Newton's last carry]) → carry, then the file's outputs
 
 The carry is q, p, s; then V and V′ at q where the model's terms are known; then the last velocities where the guess
 continues them; then, in float32, the rounding errors of q and s (Kahan's sum; without it a digit is lost every ten
@@ -25,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from herglotz.codegen.trace import traced
-from herglotz.export.equation import Terms, dense, example, inverse, length, step_equation
+from herglotz.export.equation import dense, equation_of, example, inverse, length, step_equation
 from herglotz.export.metadata import TOLERANCE
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Status
@@ -153,14 +152,14 @@ def begin(h: Tensor, trail: Tensor) -> Values:
 
 def begin_sticking(model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
     """Newton's first carry in z, K and w/K: `herglotz.stepping.newton.StickSlip`."""
-    equation = Terms(model, State(q, p, s), h, u).equation
+    equation = equation_of(model, State(q, p, s), h, u)
     assert isinstance(equation, PartialsEquation)
     z, *bounds = at_rest(equation)
     return *first_carry(z), *(dense(x) for x in bounds)
 
 
-def finish(model: ContactLagrangian, h: Tensor, *rest: Tensor) -> Values:
-    """The next carry, c and, where the step iterates, residual and status.
+def finish(model: ContactLagrangian, box: Box | None, h: Tensor, *rest: Tensor) -> Values:
+    """The next carry, and the outputs of a step (`report`).
 
     `rest` is u where the model takes inputs, the carry, and Newton's carry where the step iterates.
     """
@@ -169,8 +168,11 @@ def finish(model: ContactLagrangian, h: Tensor, *rest: Tensor) -> Values:
     u, rest = rest[:split], rest[split:]
     state, field, trail, errors = layout.split(rest)
     if layout.iterates:
-        return _solved(model, h, (state, trail, errors), rest[layout.size :])
-    return _explicit(model, h, (state, field, errors), u)
+        new = _solved(model, h, (state, trail, errors), rest[layout.size :])
+    else:
+        new = _explicit(model, h, (state, field, errors), u)
+    outputs = report(box, h, state, new[:STATE], *new[layout.size :])
+    return tuple(dense(x) for x in (*new[: layout.size], *outputs))
 
 
 def _explicit(model: ContactLagrangian, h: Tensor, carry: tuple[Values, ...], u: Values) -> Values:
@@ -180,7 +182,7 @@ def _explicit(model: ContactLagrangian, h: Tensor, carry: tuple[Values, ...], u:
     good = (h > 0) & torch.isfinite(h) & (move.c != 0)
     q1, *error_q = _added(state[0], torch.where(good[:, None], move.delta, torch.nan), errors[:1])
     s1, *error_s = _added(state[2], move.L, errors[1:])
-    return tuple(dense(x) for x in (q1, move.p1, s1, *move.there, *error_q, *error_s, move.c))
+    return q1, move.p1, s1, *move.there, *error_q, *error_s, move.c
 
 
 def _solved(model: ContactLagrangian, h: Tensor, carry: tuple[Values, ...], found: Values) -> Values:
@@ -197,8 +199,7 @@ def _solved(model: ContactLagrangian, h: Tensor, carry: tuple[Values, ...], foun
         p1, L = p1 - (h / 2)[:, None] * slope, L - h / 2 * V
     s1, *error_s = _added(s, L, errors[1:])
     velocities = (_appended(trail[0], x / h[:, None]),) if trail else ()
-    new = (q1, p1, s1, *field, *velocities, *error_q, *error_s)
-    return tuple(dense(y) for y in (*new, c, residual, status))
+    return q1, p1, s1, *field, *velocities, *error_q, *error_s, c, residual, status
 
 
 def _added(x: Tensor, change: Tensor, error: Values) -> Values:
@@ -245,10 +246,7 @@ class StepGraphs(nn.Module):
             else:
                 self.begin = traced(begin, (h, carry[STATE + layout.field]))
             self.iterate = traced(partial(newton_iteration, model), (q, p, s, h, *found, *field, *u, *bounds))
-        self.finish = traced(partial(finish, model), (h, *u, *carry, *found))
-        rows = [y + 1 for y in (q, p, s, s + 1)]
-        solved = (s + 3, (s > 0).to(torch.uint8)) if layout.iterates else ()
-        self.report = traced(partial(report, Box.of(box, model, h_range)), (h, q, p, s, *rows, *solved))
+        self.finish = traced(partial(finish, model, Box.of(box, model, h_range)), (h, *u, *carry, *found))
 
 
 class Box:
@@ -307,12 +305,12 @@ def s_matters(metadata: Mapping[str, Any]) -> bool:
     return metadata.get("level") in ("affine", "full")
 
 
-def report(box: Box | None, h: Tensor, *x: Tensor) -> tuple[Tensor, ...]:
+def report(box: Box | None, h: Tensor, before: Values, after: Values, c: Tensor, *solved: Tensor) -> Values:
     """The outputs of a step, q1, p1, s1, c, residual, status[, outside]; the first four are NaN where the step failed.
 
-    x is (q, p, s) before and after the step, then c, then the residual and status of steps that iterate.
+    `before` and `after` are (q, p, s), `solved` the residual and the status of steps that iterate.
     """
-    before, (q1, p1, s1), (c, *solved) = x[:3], x[3:6], x[6:]
+    q1, p1, s1 = after
     residual, newton_status = solved or (0.0 * c, None)
     finite = torch.isfinite(residual + s1) & torch.isfinite(q1 + p1).all(-1)
     status = torch.where(finite, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
@@ -323,4 +321,4 @@ def report(box: Box | None, h: Tensor, *x: Tensor) -> tuple[Tensor, ...]:
     nan = torch.where(status == int(Status.CONVERGED), 0.0, torch.nan).to(q1.dtype)
     new = (q1 + nan[:, None], p1 + nan[:, None], s1 + nan)
     outside = () if box is None else (box.flags(h, before, new),)
-    return tuple(dense(y) for y in (*new, c + nan, residual, status, *outside))
+    return *new, c + nan, residual, status, *outside

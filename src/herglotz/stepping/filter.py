@@ -16,7 +16,7 @@ The error of a model differs from motion to motion: the common scale κ of all v
 
 which changes no estimate (a = 0: κ is not learned). A fixed-lag smoother is the same filter of a longer state: x and
 copies of x at the last samples. A step does not change the copies, and an update moves them by their covariance with q.
-`export/runtime/smoother.h` keeps only the blocks of P that change.
+`export/runtime/filter.h` keeps only the blocks of P that change.
 
 Source: A. Gelb (ed.), Applied optimal estimation (1974), sections 4.2 and 6.1; B. D. O. Anderson & J. B. Moore, Optimal
 filtering (1979), section 7.3; M. West & J. Harrison, Bayesian forecasting and dynamic models (1997), section 10.8.

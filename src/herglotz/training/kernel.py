@@ -28,10 +28,9 @@ from torch.func import functional_call, vmap
 import herglotz
 from herglotz.codegen.angles import Angles
 from herglotz.codegen.c_compiler import SOURCE, built, compiler
-from herglotz.codegen.c_function import Outputs
 from herglotz.codegen.gated import Prepared, gated
 from herglotz.codegen.interpret import interpret
-from herglotz.codegen.program import Program
+from herglotz.codegen.program import Outputs, Program
 from herglotz.codegen.trace import traced
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative
@@ -307,8 +306,9 @@ def source_of(model: ContactLagrangian) -> str:
     parts += [step.function("finish", "end"), step.function("derive", "end", "A", "*c", "G")]
     values = {"N": n, "M": m, "P": P, "D": functions.d, "STICKS": int(sticks)}
     sizes = "".join(f"#define hz_{name} {value}\n" for name, value in values.items())
-    head, *loops = ((RUNTIME / name).read_text() for name in ("mathematics.h", "sweep.c", "tridiagonal.c"))
-    return "\n".join([sizes, head, *parts, prepared.function(), OPTIMISED, *loops])
+    names = ("mathematics.h", "inverse.h", "sweep.c", "tridiagonal.c")
+    head, inverse, *loops = ((RUNTIME / name).read_text() for name in names)
+    return "\n".join([sizes, head, inverse, *parts, prepared.function(), OPTIMISED, *loops])
 
 
 OPTIMISED = """

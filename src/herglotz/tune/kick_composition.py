@@ -28,13 +28,12 @@ import torch
 from torch import Tensor
 
 from herglotz.codegen.c_compiler import build
-from herglotz.codegen.c_function import as_scalars, whole
 from herglotz.codegen.interpret import interpret
-from herglotz.codegen.program import Program
+from herglotz.codegen.program import Program, as_scalars, whole
 from herglotz.codegen.trace import example_batch, traced
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
-from herglotz.export.lower.c_parameters import number, written
+from herglotz.export.c_header import number, written
 from herglotz.mechanics.contact import join
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import OneStepMethod, Rollout, State, Status, Step

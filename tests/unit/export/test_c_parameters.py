@@ -1,7 +1,6 @@
-"""Numbers of a model that a C program sets between steps: steps, derivatives, bounds, and headers without them."""
+"""Numbers of a model that a C program sets between steps: steps, derivatives and bounds."""
 
 import ctypes
-import re
 import shutil
 import subprocess
 from typing import Any
@@ -12,9 +11,8 @@ from export_models import randomise
 
 from herglotz.errors import InputError
 from herglotz.export import export_c, load_c
-from herglotz.export.c_header import RUNTIME, c_source, described, runtime
+from herglotz.export.c_header import c_source, described
 from herglotz.export.load import compiled
-from herglotz.export.lower.c_parameters import without_parameters
 from herglotz.export.metadata import describe
 from herglotz.export.parameters import described_parameters, parsed
 from herglotz.models import ContactLagrangian, ModelConfig, numbers_of
@@ -128,22 +126,6 @@ def test_derivatives_by_numbers_are_those_of_autograd_through_the_step(case):
 
 def join(state):
     return state.q, state.p, state.s[None]
-
-
-def test_no_trace_of_parameters_in_a_header_that_has_none(tmp_path):
-    # fails if a header without parameters grows or changes: what the runtime has for them is taken out as a whole
-    model = model_of("viscous, motors")
-    for path, parameters in (("a.h", ()), ("b.h", ["friction.viscous"])):
-        export_c(model, tmp_path / path, h=H, parameters=parameters, name="arm")
-    plain, other = ((tmp_path / name).read_text() for name in ("a.h", "b.h"))
-    assert not re.search(r"(?i)theta|arm_P\b|parameter", plain.replace("herglotz-metadata", ""))
-    assert "arm_P" in other
-    for name in (*RUNTIME, "library.c"):
-        marked = runtime(name)
-        assert not re.search(r"hz_P\b|THETA|parameters", without_parameters(marked)), name
-        lines = without_parameters(marked).splitlines()
-        assert set(lines) <= {re.sub(r"hz_TAKES_THETA |hz_WITH_THETA\([^)]*\) | \+ hz_P\b", "", x) for x in
-                              marked.splitlines()}, name  # fmt: skip
 
 
 PROGRAM = """

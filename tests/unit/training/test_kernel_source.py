@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 
 from herglotz.codegen.angles import Angles
-from herglotz.codegen.c_function import whole
 from herglotz.codegen.gated import Prepared, gated
-from herglotz.codegen.program import Program, add, multiply
+from herglotz.codegen.program import Program, add, multiply, whole
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.training import kernel
 

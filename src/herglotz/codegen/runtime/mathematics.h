@@ -100,33 +100,3 @@ static inline void FN_product(int n, int m, const double *W, const double *trans
   for (i = 0; i < n; i++)
     for (j = 0; j < m; j++) y[j] += x[i] * W[i * m + j];
 }
-
-/* X = A^-1 (n, n) by Gauss and Jordan; not finite where A is singular. */
-static inline void FN_inverse(int n, const double *A, double *X) {
-  double rows[hz_N][2 * hz_N];
-  int i, j, k;
-  for (i = 0; i < n; i++)
-    for (j = 0; j < n; j++) {
-      rows[i][j] = A[i * n + j];
-      rows[i][n + j] = i == j;
-    }
-  for (k = 0; k < n; k++) {
-    int best = k;
-    double pivot;
-    for (i = k + 1; i < n; i++)
-      if (fabs(rows[i][k]) > fabs(rows[best][k])) best = i;
-    pivot = rows[best][k];
-    for (j = 0; j < 2 * n; j++) {
-      const double other = rows[best][j] / pivot;
-      rows[best][j] = rows[k][j];
-      rows[k][j] = other;
-    }
-    for (i = 0; i < n; i++) {
-      const double factor = rows[i][k];
-      if (i != k)
-        for (j = 0; j < 2 * n; j++) rows[i][j] -= factor * rows[k][j];
-    }
-  }
-  for (i = 0; i < n; i++)
-    for (j = 0; j < n; j++) X[i * n + j] = rows[i][n + j];
-}

@@ -15,20 +15,21 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from types import MethodType
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from herglotz.codegen.c_function import function, needed_by, row_of, whole
 from herglotz.codegen.interpret import interpret
-from herglotz.codegen.program import Program, Ref, literal
+from herglotz.codegen.program import Program, Ref, function, literal, needed_by, row_of, whole
 from herglotz.codegen.trace import Graph
 from herglotz.export.equation import Equations, example, field_like
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian, OwnLagrangian
+from herglotz.models.friction import Friction
 from herglotz.models.jet import Jet
 from herglotz.models.terms import FeatureKinetic, PositionKinetic, Potential
 from herglotz.stepping import State
@@ -51,19 +52,22 @@ def step_parts(equations: Equations) -> Graph:
     return equations.traced(StepParts(equations.model), (q, p, s, h, *more, *u))
 
 
-def pushed(model: ContactLagrangian) -> ContactLagrangian:
-    """The model with generalised forces as inputs: G becomes the unit matrix, u₀ becomes 0. Changed in place.
+def with_zero_as_input(model: ContactLagrangian) -> ContactLagrangian:
+    """The model with a last input, 1 where inputs act and 0 where none does, as the factor of u₀. Changed in place.
 
-    Where inputs act through the position, they stand before the forces.
+    Inputs that are all 0 then exert no force. A model without u₀ stays as it is.
     """
-    friction, n = model.friction, model.config.dof
-    if model.config.inputs and friction is not None:
-        m = model.config.inputs if model.capabilities.inputs_by_position else 0
-        model.config = replace(model.config, inputs=m + n, input_map=())
-        friction.inputs, friction.input_zero = m + n, None
-        del friction.input_map
-        friction.register_buffer("input_map", torch.eye(m + n).to(friction.viscous)[m:])
+    friction = model.friction
+    if friction is not None and friction.input_zero is not None:
+        model.config = replace(model.config, inputs=model.config.inputs + 1, input_map=())
+        friction.applied = MethodType(_applied, friction)
     return model
+
+
+def _applied(friction: Friction, u: Tensor) -> Tensor:
+    """G (u − a u₀), where a is the last input."""
+    assert friction.input_zero is not None
+    return (u[..., :-1] - u[..., -1:] * friction.input_zero) @ friction.input_map.T
 
 
 class GivenPotential(nn.Module):
@@ -190,19 +194,19 @@ class StepParts:
 
 
 PREPARE, BEGIN, EVALUATE, GAINS = range(4)
-Tables = dict[tuple[float, ...], str]
 
 
 class StepInC:
     """The C functions of one model's step, in float64: numbers are rounded when they are written."""
 
     def __init__(self, equations: Equations):
+        self.equations = equations
         self.explicit = equations.model.capabilities.explicit
         self.program = Program()
         self.n, self.m = n, m = equations.model.dof, equations.model.inputs
         # The sizes of the arguments of traced functions; 0 is a scalar.
         self.start = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0}
-        self.more = {name: size for name, size in (("P->push", m), ("P->theta", len(equations.numbers or ()))) if size}
+        self.more = {name: size for name, size in (("P->u", m), ("P->theta", len(equations.numbers or ()))) if size}
         field = {"P->V0.value": 0, "P->V0.slope": n, "t->move": n, "x": n, "V1->value": 0, "V1->slope": n}
         given = {name: self.program.given(name, size) for name, size in (self.start | field | self.more).items()}
         arrays = interpret(self.program, step_parts(equations), list(given.values()))
@@ -273,14 +277,68 @@ class StepInC:
         return "".join(lines)
 
     def source(self) -> str:
-        """The functions as a text of `REAL` and `FN_`, which become those of one sample or of a register of samples."""
-        parts = []
+        """The step as a text of `REAL` and `FN_`, which become those of one sample or of a register of samples.
+
+        Constants are written as `R(0.5)`.
+        """
+        parts = [TYPES.format(problem=self.members("P"), terms=self.members("t")), self._potential()]
         for name, (comment, arguments) in FUNCTIONS.items():
             if name == "evaluate" and self.explicit:
                 continue
             head = f"\n/* {comment} */\nstatic inline void FN_{name}({arguments})"
             parts.append(function(self.program, head, self.runs[name], self.outputs.get(name, {}), self.handed_on))
         return "".join(parts)
+
+    def tables(self) -> str:
+        """The constant rows of all functions that have been written."""
+        rows = ((name, ", ".join(map(literal, row)), len(row)) for row, name in self.program.tables.items())
+        return "".join(f"static const hz_real {name}[{size}] = {{{row}}};\n" for name, row, size in rows)
+
+    def _interpreted(self, graph: Graph, sizes: Mapping[str, int]) -> tuple[Program, list[np.ndarray]]:
+        """A graph as a program of arguments with these names and sizes, which shares the tables, and its results."""
+        program = Program(tables=self.program.tables)
+        return program, interpret(program, graph, [program.given(name, size) for name, size in sizes.items()])
+
+    def _theta(self) -> tuple[dict[str, int], str]:
+        """The size and the declaration of the argument θ of a C function, where the header has parameters."""
+        K = len(self.equations.numbers or ())
+        return ({"theta": K}, "const REAL theta[hz_P], ") if K else ({}, "")
+
+    def _potential(self) -> str:
+        """The potential and its slope as a C function."""
+        theta, declared = self._theta()
+        program, V, slope = Program(tables=self.program.tables), np.full(1, 0.0, object), np.full(self.n, 0.0, object)
+        if self.equations.model.config.baseline:
+            program, (V, slope) = self._interpreted(self.equations.potential, {"q": self.n} | theta)
+        head = "\n/* V(q) and V'(q). */\n"
+        head += f"static inline void FN_potential(const REAL q[hz_N], {declared}FN_potential_t *V)"
+        return whole(program, head, {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())})
+
+    def slopes(self) -> str:
+        """The derivative of a solved step as a C function."""
+        program, (slopes,) = self._interpreted(self.equations.jacobian, self.start | {"move": self.n} | self.more)
+        head = "\n/* d(q, p, s)' / d(q, p, s, h, u, theta) at the solution q1 = q0 + move, row by row. */\n"
+        head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
+        return whole(program, head, {"slopes": list(slopes.ravel())})
+
+    def momentum(self) -> str:
+        """The Legendre transform p = L_v as a C function: `herglotz.stepping.velocity`."""
+        theta, declared = self._theta()
+        program, arrays = self._interpreted(self.equations.momentum, {"q": self.n, "v": self.n, "s": 0, "h": 0} | theta)
+        named = zip(("p", "by_v", "grip", "grip_by_v"), arrays, strict=False)
+        outputs = {name: list(x.ravel()) for name, x in named}
+        head = "\n/* L_v and L_vv at (q, v, s); of set-valued friction (h/2) r(q, v) and its slope by v. */\n"
+        head += "static inline void FN_momentum(const REAL q[hz_N], const REAL v[hz_N], REAL s, REAL h,\n    "
+        head += declared + ", ".join(f"REAL {name}[{'hz_N * hz_N' if name == 'by_v' else 'hz_N'}]" for name in outputs)
+        return whole(program, f"{head})", outputs)
+
+    def pull(self) -> str:
+        """The derivative of a solved step, transposed and times a vector, as a C function."""
+        sizes = self.start | {"move": self.n, "of": 2 * self.n + 1} | self.more
+        program, rows = self._interpreted(self.equations.pull, sizes)
+        head = "\n/* The derivatives before a solved step, by (q, p, s, h, u, theta), from `of`, those after. */\n"
+        head += "static inline void FN_pull(const FN_problem *P, const REAL move[hz_N], const REAL *of, REAL *pulled)"
+        return whole(program, head, {"pulled": [x for row in rows for x in row.ravel()]})
 
 
 FUNCTIONS = {
@@ -299,37 +357,6 @@ FUNCTIONS = {
 }
 
 
-class Emitted(NamedTuple):
-    """The parts of a header that depend on the model; `step` is a text of `REAL` and `FN_`.
-
-    momentum is the Legendre transform and slopes the derivative of a step; either is "" where it was not asked for.
-    """
-
-    tables: str
-    step: str
-    momentum: str
-    slopes: str
-
-
-def model_source(
-    step: StepInC, equations: Equations, derivatives: bool, velocities: bool = True, adjoint: bool = False
-) -> Emitted:
-    """The emitted parts of a header, with constants as `R(0.5)`."""
-    push = "  REAL push[hz_INPUTS];\n" if step.m else ""
-    push += "  REAL theta[hz_P];\n" if equations.numbers else ""
-    push += "  REAL bound[hz_N]; /* dry friction holds moves up to this */\n" if step.sticks else ""
-    types = TYPES.format(push=push, problem=step.members("P"), terms=step.members("t"))
-    texts = types + _potential_source(equations, step) + step.source()
-    slopes = _slopes_source(equations, step) if derivatives else ""
-    slopes += _pull_source(equations, step) if adjoint else ""
-    momentum = _momentum_source(equations, step) if velocities else ""
-    tables = "".join(
-        f"static const hz_real {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
-        for row, name in step.program.tables.items()
-    )
-    return Emitted(tables, texts, momentum, slopes)
-
-
 TYPES = """
 /* The potential at one point. */
 typedef struct {{
@@ -339,7 +366,16 @@ typedef struct {{
 /* The start of a step, and numbers that do not change while it is solved. */
 typedef struct {{
   REAL q0[hz_N], p0[hz_N], s0, h;
-{push}  FN_potential_t V0;
+#if hz_INPUTS
+  REAL u[hz_INPUTS];
+#endif
+#if hz_P
+  REAL theta[hz_P];
+#endif
+#if hz_STICKING
+  REAL bound[hz_N]; /* dry friction holds moves up to this */
+#endif
+  FN_potential_t V0;
 {problem}}} FN_problem;
 
 /* The step equation at one q1 = q0 + move. After the solve, q1 = q0 + move + rest with the last, tiny correction. */
@@ -352,56 +388,3 @@ typedef struct {{
 def as_lanes(text: str) -> str:
     """A text of `REAL` and `FN_` as that of a register of samples."""
     return text.replace("SPREAD(", "hz_spread(").replace("FN_", "hz_wide_").replace("REAL", "hz_lanes")
-
-
-def interpreted(graph: Graph, sizes: Mapping[str, int], tables: Tables) -> tuple[Program, list[np.ndarray]]:
-    """A graph as a program of arguments with these names and sizes, which shares the tables, and its results."""
-    program = Program(tables=tables)
-    return program, interpret(program, graph, [program.given(name, size) for name, size in sizes.items()])
-
-
-def _theta(equations: Equations) -> tuple[dict[str, int], str]:
-    """The size and the declaration of the argument θ of a C function, where the header has parameters."""
-    K = len(equations.numbers or ())
-    return ({"theta": K}, "const REAL theta[hz_P], ") if K else ({}, "")
-
-
-def _potential_source(equations: Equations, step: StepInC) -> str:
-    """The potential and its slope as a C function."""
-    theta, declared = _theta(equations)
-    program, V, slope = Program(tables=step.program.tables), np.full(1, 0.0, object), np.full(step.n, 0.0, object)
-    if equations.model.config.baseline:
-        program, (V, slope) = interpreted(equations.potential, {"q": step.n} | theta, step.program.tables)
-    head = f"\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], {declared}FN_potential_t *V)"
-    return whole(program, head, {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())})
-
-
-def _slopes_source(equations: Equations, step: StepInC) -> str:
-    """The derivative of a solved step as a C function."""
-    sizes = step.start | {"move": step.n} | step.more
-    program, (slopes,) = interpreted(equations.jacobian, sizes, step.program.tables)
-    head = "\n/* d(q, p, s)' / d(q, p, s, h, push) at the solution q1 = q0 + move, row by row. */\n"
-    head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
-    return whole(program, head, {"slopes": list(slopes.ravel())})
-
-
-def _momentum_source(equations: Equations, step: StepInC) -> str:
-    """The Legendre transform p = L_v as a C function: `herglotz.stepping.velocity`."""
-    theta, declared = _theta(equations)
-    sizes = {"q": step.n, "v": step.n, "s": 0, "h": 0} | theta
-    program, arrays = interpreted(equations.momentum, sizes, step.program.tables)
-    named = zip(("p", "by_v", "grip", "grip_by_v"), arrays, strict=False)
-    outputs = {name: list(x.ravel()) for name, x in named}
-    head = "\n/* L_v and L_vv at (q, v, s); of set-valued friction (h/2) r(q, v) and its slope by v. */\n"
-    head += "static inline void FN_momentum(const REAL q[hz_N], const REAL v[hz_N], REAL s, REAL h,\n    "
-    head += declared + ", ".join(f"REAL {name}[{'hz_N * hz_N' if name == 'by_v' else 'hz_N'}]" for name in outputs)
-    return whole(program, f"{head})", outputs)
-
-
-def _pull_source(equations: Equations, step: StepInC) -> str:
-    """The derivative of a solved step, transposed and times a vector, as a C function."""
-    sizes = step.start | {"move": step.n, "of": 2 * step.n + 1} | step.more
-    program, rows = interpreted(equations.pull, sizes, step.program.tables)
-    head = "\n/* The derivatives by (q, p, s, h, push) before a solved step from those `of` (q, p, s)' after it. */\n"
-    head += "static inline void FN_pull(const FN_problem *P, const REAL move[hz_N], const REAL *of, REAL *pulled)"
-    return whole(program, head, {"pulled": [x for row in rows for x in row.ravel()]})

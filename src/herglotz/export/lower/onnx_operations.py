@@ -68,9 +68,11 @@ def filled_like(x: Value, number: float, dtype: int = -1, **_: Any) -> Value:
     return op.Expand(constant(number, x.dtype if dtype == -1 else ir.DataType(dtype)), op.Shape(x))
 
 
-def finite(x: Value) -> Value:
-    """Whether |x| < ∞, which is false for NaN too."""
-    return op.Less(op.Abs(x), constant(math.inf, x.dtype))
+def gathered(x: Value, places: Sequence[Value | None]) -> Value:
+    """`index`; along the first axis as a Gather: the general form runs at a tenth of the speed."""
+    if len(places) == 1:
+        return op.Gather(x, places[0])
+    return default_registry["aten::index.Tensor"].overloads[0](x, places)
 
 
 def without_nan(x: Value, nan: float = 0.0, posinf: float | None = None, neginf: float | None = None) -> Value:
@@ -203,7 +205,7 @@ OPERATIONS: dict[Any, Callable[..., Any]] = {
     aten.diag_embed.default: diagonal_matrix,
     aten.expm1.default: expm1,
     aten.full_like.default: filled_like,
-    aten.isfinite.default: finite,
+    aten.index.Tensor: gathered,
     aten.linalg_inv_ex.default: inverse,
     aten.log1p.default: log1p,
     aten.log_sigmoid_backward.default: log_sigmoid_backward,

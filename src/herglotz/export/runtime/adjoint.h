@@ -17,40 +17,22 @@ static inline int hz_step_vjp(const hz_state *before, const hz_state *after, hz_
   enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS + hz_P };
   hz_problem P;
   hz_real pulled[WIDTH], move[hz_N];
-#if hz_P && hz_INPUTS
-  hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS], push_by_theta[hz_INPUTS * hz_P];
-#endif /* hz_P */
-  int i, j;
+  int i;
   if (hz_before(before, h)) return hz_before(before, h);
   if (hz_before(after, h) || hz_BAD_U(u)) return hz_DIVERGED;
-#if hz_P
-  if (theta && !hz_in_bounds(theta)) return hz_BAD_INPUT;
-#endif /* hz_P */
+  if (hz_BAD_THETA(theta)) return hz_BAD_INPUT;
   hz_pose(before, after, h, hz_WITH_U(u) hz_WITH_THETA(theta) &P, move);
-#if hz_P && hz_INPUTS
-  hz_inputs_at(P.theta, hz_input_map, hz_input_offset);
-  if (u) hz_push_slopes(u, P.theta, push_by_theta);
-#endif /* hz_P */
   hz_pull(&P, move, of, pulled);
   for (i = 0; i < WIDTH; i++)
     if (!hz_finite(pulled[i])) return hz_DIVERGED;
   for (i = 0; by_state && i < SIZE; i++) by_state[i] = pulled[i];
   if (by_h) *by_h = pulled[SIZE];
 #if hz_INPUTS
-  for (j = 0; by_input && j < hz_M; j++) {
-    by_input[j] = hz_R(0.0);
-    for (i = 0; u && i < hz_INPUTS; i++) by_input[j] += pulled[SIZE + 1 + i] * hz_input_map[i * hz_M + j];
-  }
-#else
-  (void)j;
+  for (i = 0; by_input && i < hz_M; i++) by_input[i] = pulled[SIZE + 1 + i];
 #endif
 #if hz_P
-  for (j = 0; by_theta && j < hz_P; j++) by_theta[j] = pulled[WIDTH - hz_P + j];
-#if hz_INPUTS
-  for (j = 0; by_theta && u && j < hz_P; j++)
-    for (i = 0; i < hz_INPUTS; i++) by_theta[j] += pulled[SIZE + 1 + i] * push_by_theta[i * hz_P + j];
+  for (i = 0; by_theta && i < hz_P; i++) by_theta[i] = pulled[WIDTH - hz_P + i];
 #endif
-#endif /* hz_P */
   return hz_CONVERGED;
 }
 
@@ -64,7 +46,7 @@ static inline int hz_rollout_vjp(hz_real h, hz_TAKES_U hz_TAKES_THETA long steps
   hz_real of[2 * hz_N + 1], one_h;
 #if hz_P
   hz_real one_theta[hz_P];
-#endif /* hz_P */
+#endif
   hz_state before, after;
   long k;
   int i, status;
@@ -72,7 +54,7 @@ static inline int hz_rollout_vjp(hz_real h, hz_TAKES_U hz_TAKES_THETA long steps
   if (by_h) *by_h = hz_R(0.0);
 #if hz_P
   for (i = 0; by_theta && i < hz_P; i++) by_theta[i] = hz_R(0.0);
-#endif /* hz_P */
+#endif
   if (steps < 0) return hz_BAD_INPUT;
   before.sigma = hz_R(1.0);
   for (k = steps; k >= 0; k--) {
@@ -89,7 +71,7 @@ static inline int hz_rollout_vjp(hz_real h, hz_TAKES_U hz_TAKES_THETA long steps
       if (by_h) *by_h += one_h;
 #if hz_P
       for (i = 0; by_theta && i < hz_P; i++) by_theta[i] += one_theta[i];
-#endif /* hz_P */
+#endif
     }
     for (i = 0; i < hz_N; i++) {
       of[i] += of_q ? of_q[k * hz_N + i] : hz_R(0.0);

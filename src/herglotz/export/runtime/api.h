@@ -35,9 +35,9 @@ static inline void hz_pose(const hz_state *before, const hz_state *after, hz_rea
 #if hz_P
   if (!theta) theta = &hz_defaults;
   for (i = 0; i < hz_P; i++) P->theta[i] = theta->value[i];
-#endif /* hz_P */
+#endif
 #if hz_INPUTS
-  hz_push(u, hz_WITH_THETA(theta) P->push);
+  for (i = 0; i < hz_INPUTS; i++) P->u[i] = hz_taken(u, i);
 #endif
 }
 
@@ -59,10 +59,7 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
   }
   first.s = next.s = s0;
   first.sigma = next.sigma = hz_R(1.0);
-  if (hz_before(&first, h) || hz_before(&next, h) || hz_BAD_U(u)) return hz_BAD_INPUT;
-#if hz_P
-  if (theta && !hz_in_bounds(theta)) return hz_BAD_INPUT;
-#endif /* hz_P */
+  if (hz_before(&first, h) || hz_before(&next, h) || hz_BAD_U(u) || hz_BAD_THETA(theta)) return hz_BAD_INPUT;
   hz_pose(&first, &next, h, hz_WITH_U(u) hz_WITH_THETA(theta) &P, t.move);
   hz_potential(q0, hz_WITH_THETA(P.theta) &P.V0);
   hz_potential(q1, hz_WITH_THETA(P.theta) &V1);
@@ -92,9 +89,7 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
 static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_TAKES_THETA hz_real *residual) {
   hz_real left = hz_R(0.0);
   int status = hz_before(state, h);
-#if hz_P
-  if (!status && theta && !hz_in_bounds(theta)) status = hz_BAD_INPUT;
-#endif /* hz_P */
+  if (!status && hz_BAD_THETA(theta)) status = hz_BAD_INPUT;
   if (!status && hz_BAD_U(u)) status = hz_DIVERGED;
   if (!status) {
     status = hz_outside_box(state) | hz_outside_h(h);
@@ -113,14 +108,7 @@ static inline int hz_step_slopes(const hz_state *before, const hz_state *after, 
   hz_problem P;
   hz_real slopes[SIZE * WIDTH], move[hz_N];
   int i, j;
-#if hz_P && hz_INPUTS
-  hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS], push_by_theta[hz_INPUTS * hz_P];
-#endif /* hz_P */
   hz_pose(before, after, h, hz_WITH_U(u) hz_WITH_THETA(theta) &P, move);
-#if hz_P && hz_INPUTS
-  hz_inputs_at(P.theta, hz_input_map, hz_input_offset);
-  if (u) hz_push_slopes(u, P.theta, push_by_theta);
-#endif /* hz_P */
   hz_slopes(&P, move, slopes);
   for (i = 0; i < SIZE * WIDTH; i++)
     if (!hz_finite(slopes[i])) return hz_DIVERGED; /* the step exists, but a derivative is beyond the largest number */
@@ -128,24 +116,10 @@ static inline int hz_step_slopes(const hz_state *before, const hz_state *after, 
     for (j = 0; by_state && j < SIZE; j++) by_state[i * SIZE + j] = slopes[i * WIDTH + j];
     if (by_h) by_h[i] = slopes[i * WIDTH + SIZE];
 #if hz_P
-    for (j = 0; by_theta && j < hz_P; j++) {
-#if hz_INPUTS
-      int k;
+    for (j = 0; by_theta && j < hz_P; j++) by_theta[i * hz_P + j] = slopes[i * WIDTH + WIDTH - hz_P + j];
 #endif
-      by_theta[i * hz_P + j] = slopes[i * WIDTH + WIDTH - hz_P + j];
 #if hz_INPUTS
-      for (k = 0; u && k < hz_INPUTS; k++)
-        by_theta[i * hz_P + j] += slopes[i * WIDTH + SIZE + 1 + k] * push_by_theta[k * hz_P + j];
-#endif
-    }
-#endif /* hz_P */
-#if hz_INPUTS
-    for (j = 0; by_input && j < hz_M; j++) {
-      int k;
-      by_input[i * hz_M + j] = hz_R(0.0);
-      for (k = 0; k < hz_INPUTS; k++)
-        by_input[i * hz_M + j] += slopes[i * WIDTH + SIZE + 1 + k] * hz_input_map[k * hz_M + j];
-    }
+    for (j = 0; by_input && j < hz_M; j++) by_input[i * hz_M + j] = slopes[i * WIDTH + SIZE + 1 + j];
 #endif
   }
   return 0;
@@ -188,11 +162,7 @@ static inline int hz_run_some(hz_state *states, long b, long count, const hz_job
 
 /* A job of `count` samples, all with the step *job->h; statuses and the returned status are those of hz_rollout_batch. */
 static inline int hz_run_batch(long count, hz_state *states, const hz_job *job, int *statuses) {
-#if hz_P
-  const int possible = job->steps >= 0 && job->every > 0 && (!job->theta || hz_in_bounds(job->theta));
-#else
-  const int possible = job->steps >= 0 && job->every > 0;
-#endif /* hz_P */
+  const int possible = job->steps >= 0 && job->every > 0 && !hz_BAD_THETA(job->theta);
   int worst = 0, flagged = 0, status[hz_SIDE], flags[hz_SIDE], some, w;
   long b;
   for (b = 0; b < count; b += some) {

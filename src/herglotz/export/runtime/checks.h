@@ -1,4 +1,4 @@
-/* Checks of states, steps and inputs; the forces of inputs; the description of a run. */
+/* Checks of states, steps and inputs; the description of a run. */
 
 /* The status of a state before a step h: hz_BAD_INPUT unless h is finite and > 0, hz_DIVERGED where the state is not
    finite. */
@@ -19,18 +19,8 @@ static inline void hz_lose(hz_state *state) {
 #define hz_TAKES_U const hz_real *u,
 #define hz_WITH_U(argument) argument,
 
-/* The step's own inputs: forces G (u - u0), or u where L_d takes u itself; 0 where u is null. */
-static inline void hz_push(const hz_real *u, hz_TAKES_THETA hz_real push[hz_INPUTS]) {
-  int i, j;
-#if hz_P
-  hz_real hz_input_map[hz_INPUTS * hz_M], hz_input_offset[hz_INPUTS];
-  hz_inputs_at(theta->value, hz_input_map, hz_input_offset);
-#endif /* hz_P */
-  for (i = 0; i < hz_INPUTS; i++) {
-    push[i] = u ? hz_input_offset[i] : hz_R(0.0);
-    for (j = 0; u && j < hz_M; j++) push[i] += hz_input_map[i * hz_M + j] * u[j];
-  }
-}
+/* Number i of what a step takes of inputs u: these, then 1 where the inputs have a zero; nothing but 0 where u is null. */
+static inline hz_real hz_taken(const hz_real *u, int i) { return !u ? hz_R(0.0) : i < hz_M ? u[i] : hz_R(1.0); }
 
 static inline int hz_inputs_finite(const hz_real *u) {
   int j, good = 1;
@@ -69,7 +59,7 @@ typedef struct {
 #endif
 #if hz_P
   const hz_parameters *theta;
-#endif /* hz_P */
+#endif
   hz_real *q, *p, *s, *sigma, *residual;
   unsigned char *status;
 } hz_job;

@@ -9,7 +9,7 @@ typedef struct {
   hz_state x;
 #if hz_P
   hz_parameters theta;
-#endif /* hz_P */
+#endif
   hz_real P[hz_F][hz_F]; /* the covariance is scale * P */
   hz_real scale, weight; /* the learned factor of all variances and its weight in updates; 1 at the start */
 } hz_filter;
@@ -24,7 +24,7 @@ typedef struct {
   hz_real position[hz_N], momentum[hz_N];
 #if hz_P
   hz_real theta[hz_P];
-#endif /* hz_P */
+#endif
   hz_real adaptation;
 } hz_noise;
 
@@ -33,16 +33,13 @@ typedef struct {
    bounds; `filter` is written on success only. */
 static inline int hz_filter_start(hz_filter *filter, const hz_state *x, hz_TAKES_THETA const hz_real std[hz_F]) {
   int i, j;
-  if (hz_before(x, hz_R(1.0))) return hz_BAD_INPUT;
-#if hz_P
-  if (theta && !hz_in_bounds(theta)) return hz_BAD_INPUT;
-#endif /* hz_P */
+  if (hz_before(x, hz_R(1.0)) || hz_BAD_THETA(theta)) return hz_BAD_INPUT;
   for (i = 0; i < hz_F; i++)
     if (!(hz_finite(std[i]) && std[i] >= hz_R(0.0))) return hz_BAD_INPUT;
   filter->x = *x;
 #if hz_P
   filter->theta = theta ? *theta : hz_defaults;
-#endif /* hz_P */
+#endif
   for (i = 0; i < hz_F; i++)
     for (j = 0; j < hz_F; j++) filter->P[i][j] = i == j ? std[i] * std[i] : hz_R(0.0);
   filter->scale = filter->weight = hz_R(1.0);
@@ -57,7 +54,7 @@ static inline int hz_noise_usable(const hz_noise *noise) {
   }
 #if hz_P
   for (i = 0; i < hz_P; i++) good &= hz_finite(noise->theta[i]) && noise->theta[i] >= hz_R(0.0);
-#endif /* hz_P */
+#endif
   return good;
 }
 
@@ -68,16 +65,14 @@ static inline void hz_filter_spread(hz_real P[hz_F][hz_F], hz_real h, const hz_n
 #if hz_P
   for (i = 0; i < hz_P; i++)
     P[hz_F - hz_P + i][hz_F - hz_P + i] += noise->theta[i] * noise->theta[i] * h / hz_R(2.0);
-#endif /* hz_P */
+#endif
 }
 
 /* hz_filter_predict, which also returns A. */
 static inline int hz_filter_move(hz_filter *filter, hz_real h, hz_TAKES_U const hz_noise *noise, hz_real A[hz_F][hz_F]) {
   enum { SIZE = 2 * hz_N + 1, KEPT = 2 * hz_N + hz_CARRIES_S };
   hz_real by_state[SIZE * SIZE], P[hz_F][hz_F], half[hz_F][hz_F];
-#if hz_P
-  hz_real by_theta[SIZE * hz_P];
-#endif /* hz_P */
+  hz_real by_theta[SIZE * hz_P + 1];
   hz_state x = filter->x;
   int i, j, k, status;
   if (!hz_noise_usable(noise)) return hz_BAD_INPUT;
@@ -88,9 +83,7 @@ static inline int hz_filter_move(hz_filter *filter, hz_real h, hz_TAKES_U const 
     for (j = 0; j < hz_F; j++) {
       A[i][j] = i == j ? hz_R(1.0) : hz_R(0.0);
       if (i < KEPT && j < KEPT) A[i][j] = by_state[i * SIZE + j];
-#if hz_P
       if (i < KEPT && j >= KEPT) A[i][j] = by_theta[i * hz_P + j - KEPT];
-#endif /* hz_P */
       P[i][j] = filter->P[i][j];
     }
   hz_filter_spread(P, h, noise);
@@ -129,7 +122,7 @@ static inline void hz_filter_shift(hz_filter *filter, const hz_real gain[hz_F], 
   if (hz_CARRIES_S) filter->x.s += gain[2 * hz_N] * miss;
 #if hz_P
   for (j = 0; j < hz_P; j++) filter->theta.value[j] += gain[hz_F - hz_P + j] * miss;
-#endif /* hz_P */
+#endif
 }
 
 /* Numbers of theta stay within their bounds. */
@@ -143,7 +136,7 @@ static inline void hz_filter_bound(hz_filter *filter) {
   }
 #else
   (void)filter;
-#endif /* hz_P */
+#endif
 }
 
 /* The innovation of one measured position, its variance, the part of that which is noise, and the gain. */
@@ -182,22 +175,48 @@ static inline hz_real hz_filter_scale(hz_filter *filter, hz_real total, const hz
   return surprise;
 }
 
-/* Update the filter by measured positions y one by one, as their noise is independent; angles count modulo a turn.
-   `surprise` (may be null) receives the squared innovation over its variance, summed: hz_N on average. Numbers of theta
-   stay within their bounds. hz_BAD_INPUT where y or the noise is not finite; the filter changes on success only. */
-static inline int hz_filter_update(hz_filter *filter, const hz_real y[hz_N], const hz_noise *noise, hz_real *surprise) {
+/* An earlier sample, and the covariance C of its numbers (rows) with those of now. */
+typedef struct {
+  hz_filter then;
+  hz_real C[hz_F][hz_F];
+} hz_past;
+
+/* hz_filter_update of the filter and of `count` earlier samples. */
+static inline int hz_filter_correct(hz_filter *filter, hz_past *past, int count, const hz_real y[hz_N],
+    const hz_noise *noise, hz_real *surprise) {
   hz_innovation found;
-  hz_real total = hz_R(0.0);
-  int i;
+  hz_real gain[hz_F], total = hz_R(0.0);
+  int i, j, k, b;
   if (!hz_all_finite(y) || !hz_noise_usable(noise)) return hz_BAD_INPUT;
   for (i = 0; i < hz_N; i++) {
     hz_filter_take(filter, i, y[i], noise, &found);
     total += found.miss * found.miss / found.variance;
+    for (b = 0; b < count; b++) {
+      for (j = 0; j < hz_F; j++) gain[j] = past[b].C[j][i] / found.variance;
+      hz_filter_shift(&past[b].then, gain, found.miss);
+      for (j = 0; j < hz_F; j++)
+        for (k = 0; k < hz_F; k++) {
+          hz_real *C = past[b].C[j] + k;
+          past[b].then.P[j][k] -= gain[j] * gain[k] * found.variance;
+          *C = k == i ? gain[j] * found.own : *C - gain[j] * found.gain[k] * found.variance;
+        }
+    }
   }
   hz_filter_bound(filter);
   total = hz_filter_scale(filter, total, noise);
+  for (b = 0; b < count; b++) {
+    hz_filter_bound(&past[b].then);
+    past[b].then.scale = filter->scale;
+  }
   if (surprise) *surprise = total;
   return hz_CONVERGED;
+}
+
+/* Update the filter by measured positions y one by one, as their noise is independent; angles count modulo a turn.
+   `surprise` (may be null) receives the squared innovation over its variance, summed: hz_N on average. Numbers of theta
+   stay within their bounds. hz_BAD_INPUT where y or the noise is not finite; the filter changes on success only. */
+static inline int hz_filter_update(hz_filter *filter, const hz_real y[hz_N], const hz_noise *noise, hz_real *surprise) {
+  return hz_filter_correct(filter, 0, 0, y, noise, surprise);
 }
 
 /* The velocity v of the filter's state and its covariance, hz_N numbers and (hz_N, hz_N): v = 4 d(h/2)/h - d(h)/h from
@@ -206,9 +225,7 @@ static inline int hz_filter_velocity(const hz_filter *filter, hz_real h, hz_TAKE
     hz_real *covariance) {
   enum { SIZE = 2 * hz_N + 1, KEPT = 2 * hz_N + hz_CARRIES_S };
   hz_real by_state[SIZE * SIZE], G[hz_N][hz_F], half[hz_N][hz_F], speed[hz_N];
-#if hz_P
-  hz_real by_theta[SIZE * hz_P];
-#endif /* hz_P */
+  hz_real by_theta[SIZE * hz_P + 1];
   int i, j, k, pass;
   for (i = 0; i < hz_N; i++)
     for (speed[i] = hz_R(0.0), j = 0; j < hz_F; j++) G[i][j] = hz_R(0.0);
@@ -221,9 +238,7 @@ static inline int hz_filter_velocity(const hz_filter *filter, hz_real h, hz_TAKE
     for (i = 0; i < hz_N; i++) {
       speed[i] += by * (x.q[i] - filter->x.q[i]);
       for (j = 0; j < KEPT; j++) G[i][j] += by * (by_state[i * SIZE + j] - (i == j ? hz_R(1.0) : hz_R(0.0)));
-#if hz_P
       for (j = 0; j < hz_P; j++) G[i][KEPT + j] += by * by_theta[i * hz_P + j];
-#endif /* hz_P */
     }
   }
   for (i = 0; i < hz_N; i++)
@@ -234,4 +249,82 @@ static inline int hz_filter_velocity(const hz_filter *filter, hz_real h, hz_TAKE
       for (covariance[i * hz_N + j] = hz_R(0.0), k = 0; k < hz_F; k++)
         covariance[i * hz_N + j] += filter->scale * half[i][k] * G[j][k];
   return hz_CONVERGED;
+}
+
+/* A fixed-lag smoother: hz_filter, with estimates of the last samples that use the positions measured since. The samples
+   lie in an array of the caller, so that nothing is allocated:
+
+     hz_past past[20];
+     hz_smoother smoother;
+     hz_smoother_start(&smoother, &filter, past, 20);
+     ...
+     hz_smoother_predict(&smoother, h, &noise);
+     hz_smoother_update(&smoother, y, &noise, 0);
+     hz_filter_velocity(hz_smoothed(&smoother, 20), h, v, 0);
+
+   A position moves an earlier sample by its covariance with the present one, which a step carries along as C A'.
+   Source: B. D. O. Anderson & J. B. Moore, Optimal filtering (1979), section 7.3. */
+
+typedef struct {
+  hz_filter now;
+  hz_past *past; /* a ring: `count` of `lag` are filled, the newest is past[newest] */
+  int lag, count, newest, moved; /* moved: steps have been made since the last sample, which lies in the ring */
+} hz_smoother;
+
+/* Start at a filter that has been started, with an array of lag > 0 samples, which must live as long as the smoother.
+   hz_BAD_INPUT where there is no array, or the filter is not finite; `smoother` is written on success only. */
+static inline int hz_smoother_start(hz_smoother *smoother, const hz_filter *filter, hz_past *past, int lag) {
+  int i, j;
+  if (!past || lag < 1 || hz_before(&filter->x, hz_R(1.0))) return hz_BAD_INPUT;
+  for (i = 0; i < hz_F; i++)
+    for (j = 0; j < hz_F; j++)
+      if (!hz_finite(filter->P[i][j])) return hz_BAD_INPUT;
+  smoother->now = *filter;
+  smoother->past = past;
+  smoother->lag = lag;
+  smoother->newest = lag - 1;
+  smoother->count = smoother->moved = 0;
+  return hz_CONVERGED;
+}
+
+/* The estimate of the sample `back` samples ago, 0 to lag; null where that sample is not kept. */
+static inline const hz_filter *hz_smoothed(const hz_smoother *smoother, int back) {
+  if (back < 0 || back > smoother->count) return 0;
+  return back ? &smoother->past[(smoother->newest + smoother->lag + 1 - back) % smoother->lag].then : &smoother->now;
+}
+
+/* hz_filter_predict; several steps may lie between two samples. */
+static inline int hz_smoother_predict(hz_smoother *smoother, hz_real h, hz_TAKES_U const hz_noise *noise) {
+  hz_filter next = smoother->now;
+  hz_real A[hz_F][hz_F], row[hz_F];
+  int i, j, k, b;
+  const int status = hz_filter_move(&next, h, hz_WITH_U(u) noise, A);
+  if (status & 15) return status;
+  if (!smoother->moved) {
+    hz_past *last;
+    smoother->newest = (smoother->newest + 1) % smoother->lag;
+    if (smoother->count < smoother->lag) smoother->count++;
+    last = smoother->past + smoother->newest;
+    last->then = smoother->now;
+    for (i = 0; i < hz_F; i++)
+      for (j = 0; j < hz_F; j++) last->C[i][j] = smoother->now.P[i][j];
+    smoother->moved = 1;
+  }
+  for (b = 0; b < smoother->count; b++)
+    for (i = 0; i < hz_F; i++) {
+      hz_real *own = smoother->past[b].C[i];
+      for (j = 0; j < hz_F; j++)
+        for (row[j] = hz_R(0.0), k = 0; k < hz_F; k++) row[j] += own[k] * A[j][k];
+      for (j = 0; j < hz_F; j++) own[j] = row[j];
+    }
+  smoother->now = next;
+  return status;
+}
+
+/* hz_filter_update of all kept samples. */
+static inline int hz_smoother_update(hz_smoother *smoother, const hz_real y[hz_N], const hz_noise *noise,
+    hz_real *surprise) {
+  const int status = hz_filter_correct(&smoother->now, smoother->past, smoother->count, y, noise, surprise);
+  if (!status) smoother->moved = 0;
+  return status;
 }

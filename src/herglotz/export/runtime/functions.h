@@ -1,4 +1,4 @@
-/* Elementary functions without branches, which compilers vectorise, for numbers, registers and rows. */
+/* Numbers and registers of numbers: the series of elementary functions, and what differs between the two. */
 
 /* The exponential series (e^r - 1 - r) / r^2 and the series of artanh(r) / r, (sin r - r) / r^3 and (cos r - 1 + r^2 / 2)
    / r^4 in z = r^2; in double precision even and odd powers of the first two apart, which are computed side by side. pi / 2
@@ -58,57 +58,24 @@
       hz_R(1.0 / 3628800)) * z + hz_R(1.0 / 40320)) * z - hz_R(1.0 / 720)) * z + hz_R(1.0 / 24))
 #endif
 
-/* exp(r) - 1 and 2^k where y = k ln 2 + r with |r| <= ln(2)/2, for |y| <= hz_FAR: a few units in the last place, without
-   branches or calls. Needs IEEE 754 numbers. NaN gives NaN. */
-static inline hz_real hz_reduced(hz_real y, hz_real *power) {
-  hz_pun two;
-  hz_real r = y == y ? y * hz_R(1.44269504088896340736) : hz_R(0.0);
-  const int k = (int)(r + (r < hz_R(0.0) ? hz_R(-0.5) : hz_R(0.5)));
-  r = (y - (hz_real)k * hz_R(hz_LN2_HIGH)) - (hz_real)k * hz_R(hz_LN2_LOW);
-  two.bits = (hz_bits_t)(k + hz_BIAS) << hz_MANTISSA;
-  *power = two.number;
-  return r + r * r * hz_EXP_TERMS(r);
-}
-
-/* exp(y) - 1 for |y| cut off at hz_LIMIT. */
-static inline hz_real hz_growth(hz_real y) {
-  hz_real two, e;
-  y = y > hz_R(hz_LIMIT) ? hz_R(hz_LIMIT) : y;
-  y = y < hz_R(-hz_LIMIT) ? hz_R(-hz_LIMIT) : y;
-  e = hz_reduced(y, &two);
-  return two * e + (two - hz_R(1.0));
-}
-
-static inline hz_real hz_expm1(hz_real x) { return hz_fabs(x) <= hz_R(hz_LIMIT) ? hz_growth(x) : hz_expm1_of(x); }
-
-static inline hz_real hz_exp(hz_real x) {
-  hz_real two, e;
-  if (!(hz_fabs(x) <= hz_R(hz_FAR))) return hz_exp_of(x);
-  e = hz_reduced(x, &two);
-  return two * e + two;
-}
-
-static inline hz_real hz_tanh(hz_real x) {
-  const hz_real e = hz_growth(hz_R(2.0) * x);
-  return e / (e + hz_R(2.0));
-}
-
-static inline hz_real hz_sigmoid(hz_real x) { return hz_R(0.5) + hz_R(0.5) * hz_tanh(hz_R(0.5) * x); }
-
-/* log(1 + e^x), by log(1 + y) = 2 artanh(y / (2 + y)) with y = e^-|x|. */
-static inline hz_real hz_softplus(hz_real x) {
-  const hz_real size = hz_fabs(x), y = hz_R(1.0) + hz_growth(-size), r = y / (hz_R(2.0) + y), z = r * r;
-  return (x > hz_R(0.0) ? x : hz_R(0.0)) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
-}
-
-/* artanh(x), by its series where |x| <= 1/3. */
-#define hz_SERIES hz_R(0.1111111111111111)
-static inline hz_real hz_atanh(hz_real x) {
-  const hz_real z = x * x;
-  return z <= hz_SERIES ? x * hz_ARTANH_TERMS(z) : hz_atanh_of(x);
-}
-
 static inline hz_real hz_choose(hz_real a, hz_real b, hz_real x, hz_real y) { return a > b ? x : y; }
+
+/* Whether x <= limit is false, as of NaN. */
+static inline int hz_above(hz_real x, hz_real limit) { return !(x <= limit); }
+
+/* The nearest whole number, 0 of NaN, which an integer holds; 2^k. */
+typedef int hz_count;
+static inline hz_real hz_whole(hz_real x, hz_count *k) {
+  x = x == x ? x : hz_R(0.0);
+  *k = (int)(x + (x < hz_R(0.0) ? hz_R(-0.5) : hz_R(0.5)));
+  return (hz_real)*k;
+}
+
+static inline hz_real hz_power(hz_count k) {
+  hz_pun two;
+  two.bits = (hz_bits_t)(k + hz_BIAS) << hz_MANTISSA;
+  return two.number;
+}
 
 static inline hz_real hz_nearest(hz_real x) { return hz_floor_of(x + hz_R(0.5)); }
 
@@ -134,7 +101,7 @@ typedef long long hz_signed_t;
 typedef hz_real hz_lanes __attribute__((vector_size(hz_LANE_BYTES), may_alias));
 typedef hz_real hz_part __attribute__((vector_size(hz_LANE_BYTES), aligned(sizeof(hz_real)), may_alias));
 typedef hz_signed_t hz_masks __attribute__((vector_size(hz_LANE_BYTES)));
-typedef int hz_counts __attribute__((vector_size(hz_LANE_BYTES / sizeof(hz_real) * sizeof(int))));
+typedef int hz_wide_count __attribute__((vector_size(hz_LANE_BYTES / sizeof(hz_real) * sizeof(int))));
 enum { hz_LANES = (int)(hz_LANE_BYTES / sizeof(hz_real)), hz_wide_WIDTH = hz_LANES };
 #define hz_wide_LANE(x, w) (x)[w]
 typedef struct {
@@ -154,156 +121,25 @@ static inline hz_lanes hz_wide_choose(hz_lanes a, hz_lanes b, hz_lanes x, hz_lan
   return hz_select((hz_masks)(a > b), x, y);
 }
 
-static inline hz_lanes hz_wide_reduced(hz_lanes y, hz_lanes *power) {
-  const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
-  hz_lanes r = hz_select((hz_masks)(y == y), y * hz_R(1.44269504088896340736), zero), whole;
-  hz_counts k;
-  r += hz_select((hz_masks)(r < zero), -half, half);
-  k = __builtin_convertvector(r, hz_counts);
-  whole = __builtin_convertvector(k, hz_lanes);
-  r = (y - whole * hz_R(hz_LN2_HIGH)) - whole * hz_R(hz_LN2_LOW);
-  *power = (hz_lanes)(__builtin_convertvector(k + hz_BIAS, hz_masks) << hz_MANTISSA);
-  return r + r * r * hz_EXP_TERMS(r);
-}
-
-static inline hz_lanes hz_wide_cut(hz_lanes y, hz_real limit) {
-  const hz_lanes most = hz_spread(limit);
-  y = hz_select((hz_masks)(y > most), most, y);
-  return hz_select((hz_masks)(y < -most), -most, y);
-}
-
-/* The nearest whole number. Numbers beyond the integers of the processor are cut off: as angles they have no digits
-   left. */
-static inline hz_lanes hz_wide_nearest(hz_lanes x) {
-  const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
-  x = hz_wide_cut(hz_select((hz_masks)(x == x), x, zero), hz_R(hz_SINGLE ? 1e9 : 1e18));
-  return __builtin_convertvector(__builtin_convertvector(x + hz_select((hz_masks)(x < zero), -half, half), hz_masks), hz_lanes);
-}
-
-static inline hz_lanes hz_wide_growth(hz_lanes y) {
-  hz_lanes two;
-  const hz_lanes e = hz_wide_reduced(hz_wide_cut(y, hz_R(hz_LIMIT)), &two);
-  return two * e + (two - hz_R(1.0));
-}
-
 static inline hz_lanes hz_wide_fabs(hz_lanes x) { return hz_select((hz_masks)(x < hz_spread(hz_R(0.0))), -x, x); }
 
-static inline hz_lanes hz_wide_tanh(hz_lanes x) {
-  const hz_lanes e = hz_wide_growth(hz_R(2.0) * x);
-  return e / (e + hz_R(2.0));
-}
-
-static inline hz_lanes hz_wide_sigmoid(hz_lanes x) { return hz_R(0.5) + hz_R(0.5) * hz_wide_tanh(hz_R(0.5) * x); }
-
-static inline hz_lanes hz_wide_softplus(hz_lanes x) {
-  const hz_lanes size = hz_wide_fabs(x), y = hz_R(1.0) + hz_wide_growth(-size), r = y / (hz_R(2.0) + y), z = r * r;
-  const hz_lanes zero = hz_spread(hz_R(0.0));
-  return hz_select((hz_masks)(x > zero), x, zero) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
-}
-
-/* One sum without branches: of a branch for each lane GCC makes a tree. */
-static inline int hz_any(hz_masks where) {
+/* Of any number: one sum without branches, because GCC makes a tree of a branch for each lane. */
+static inline int hz_wide_above(hz_lanes x, hz_real limit) {
+  const hz_masks where = ~(hz_masks)(x <= hz_spread(limit));
   hz_signed_t any = 0;
   int w;
   for (w = 0; w < hz_LANES; w++) any |= where[w];
   return any != 0;
 }
 
-/* y_w = f(x_w) by <math.h> where the formula before does not hold. */
-#define hz_ELSE(holds, function)                                                          \
-  do {                                                                                    \
-    const hz_masks where = ~(hz_masks)(holds);                                            \
-    int w;                                                                                \
-    for (w = 0; hz_any(where) && w < hz_LANES; w++)                                      \
-      if (where[w]) y[w] = function(x[w]);                                                \
-  } while (0)
-static inline hz_lanes hz_wide_atanh(hz_lanes x) {
-  const hz_lanes z = x * x;
-  hz_lanes y = x * hz_ARTANH_TERMS(z);
-  hz_ELSE(z <= hz_spread(hz_SERIES), hz_atanh_of);
-  return y;
-}
-
-static inline hz_lanes hz_wide_expm1(hz_lanes x) {
-  hz_lanes y = hz_wide_growth(x);
-  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_LIMIT)), hz_expm1_of);
-  return y;
-}
-
-static inline hz_lanes hz_wide_exp(hz_lanes x) {
-  hz_lanes two, y = hz_wide_reduced(hz_wide_cut(x, hz_R(hz_FAR)), &two);
-  y = two * y + two;
-  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_FAR)), hz_exp_of);
-  return y;
-}
-
-/* sin(x + quarters pi / 2) where |x| <= hz_TURNED: x = k pi / 2 + r with |r| <= pi / 4, about a unit in the last place. */
-static inline hz_lanes hz_wide_wave(hz_lanes x, int quarters) {
+static inline hz_lanes hz_wide_whole(hz_lanes x, hz_wide_count *k) {
   const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
-  hz_lanes r = hz_wide_cut(x, hz_R(hz_TURNED)) * hz_R(0.63661977236758134308), whole, z, y;
-  hz_masks turns;
-  hz_counts k;
-  r = hz_select((hz_masks)(r == r), r, zero);
-  r += hz_select((hz_masks)(r < zero), -half, half);
-  k = __builtin_convertvector(r, hz_counts);
-  whole = __builtin_convertvector(k, hz_lanes);
-  r = (x - whole * hz_R(hz_QUARTER_1)) - whole * hz_R(hz_QUARTER_2);
-  r = (r - whole * hz_R(hz_QUARTER_3)) - whole * hz_R(hz_QUARTER_4);
-  z = r * r;
-  turns = __builtin_convertvector(k + quarters, hz_masks);
-  y = hz_select((hz_masks)((turns & 1) != 0), hz_R(1.0) - (hz_R(0.5) * z - z * z * hz_COS_TERMS(z)),
-      r + r * z * hz_SIN_TERMS(z));
-  return hz_select((hz_masks)((turns & 2) != 0), -y, y);
+  x = hz_select((hz_masks)(x == x), x, zero);
+  *k = __builtin_convertvector(x + hz_select((hz_masks)(x < zero), -half, half), hz_wide_count);
+  return __builtin_convertvector(*k, hz_lanes);
 }
 
-static inline hz_lanes hz_wide_sin(hz_lanes x) {
-  hz_lanes y = hz_wide_wave(x, 0);
-  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_TURNED)), hz_sin);
-  return y;
+static inline hz_lanes hz_wide_power(hz_wide_count k) {
+  return (hz_lanes)(__builtin_convertvector(k + hz_BIAS, hz_masks) << hz_MANTISSA);
 }
-
-static inline hz_lanes hz_wide_cos(hz_lanes x) {
-  hz_lanes y = hz_wide_wave(x, 1);
-  hz_ELSE(hz_wide_fabs(x) <= hz_spread(hz_R(hz_TURNED)), hz_cos);
-  return y;
-}
-#undef hz_ELSE
-
-static inline hz_lanes hz_wide_sqrt(hz_lanes x) {
-  int w;
-  for (w = 0; w < hz_LANES; w++) x[w] = hz_sqrt(x[w]);
-  return x;
-}
-
-static inline hz_lanes hz_wide_pow(hz_lanes x, hz_real power) {
-  int w;
-  for (w = 0; w < hz_LANES; w++) x[w] = hz_pow(x[w], power);
-  return x;
-}
-
-#define hz_PARTS_OF(function) \
-  for (; k + hz_LANES <= count; k += hz_LANES) *(hz_part *)(y + k) = hz_wide_##function(*(const hz_part *)(x + k));
-#define hz_WIDE_ROW_OF(function)                                                               \
-  static inline void hz_wide_##function##_row(int count, const hz_lanes *x, hz_lanes *y) {     \
-    int k;                                                                                     \
-    for (k = 0; k < count; k++) y[k] = hz_wide_##function(x[k]);                               \
-  }
-#else
-#define hz_PARTS_OF(function)
-#define hz_WIDE_ROW_OF(function)
 #endif
-
-/* y_k = f(x_k) for a whole row. */
-#define hz_ROW_OF(function)                                                              \
-  static inline void hz_##function##_row(int count, const hz_real *x, hz_real *y) {      \
-    int k = 0;                                                                           \
-    hz_PARTS_OF(function)                                                                \
-    for (; k < count; k++) y[k] = hz_##function(x[k]);                                   \
-  }                                                                                      \
-  hz_WIDE_ROW_OF(function)
-hz_ROW_OF(tanh)
-hz_ROW_OF(sigmoid)
-hz_ROW_OF(softplus)
-#undef hz_ROW_OF
-#undef hz_PARTS_OF
-#undef hz_WIDE_ROW_OF

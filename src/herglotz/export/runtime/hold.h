@@ -13,7 +13,7 @@ static inline double hz_steps_of(double H, double longest) {
    changes on success only. Returns a status without flags. */
 static inline int hz_hold_jacobian(hz_state *state, hz_real h, hz_TAKES_U double steps, hz_real *by_state,
     hz_WITH_U(hz_real *by_input) hz_real *by_time) {
-  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + hz_M * hz_INPUTS + 1 };
+  enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + hz_M + 1 };
   hz_state x = *state, before;
   hz_track track;
   hz_real left, A[SIZE * SIZE], B[SIZE * (hz_M + 1)], by_h[SIZE], map[SIZE * WIDTH], old[SIZE * WIDTH];

@@ -1,9 +1,10 @@
+#if hz_P
 /* Numbers of the model that are set at run time, `theta` of the functions below; null means hz_defaults. hz_advance
    steps with the numbers that its track was started with. by_theta of hz_step_jacobian, the derivatives by these
    numbers, is (2 hz_N + 1, hz_P). */
-
 #define hz_TAKES_THETA const hz_parameters *theta,
 #define hz_WITH_THETA(argument) argument,
+#define hz_BAD_THETA(theta) ((theta) && !hz_in_bounds(theta))
 
 /* Whether every number is finite and within its bounds. */
 static inline int hz_in_bounds(const hz_parameters *theta) {
@@ -21,4 +22,8 @@ static inline int hz_set_parameter(hz_parameters *theta, int which, hz_real valu
   theta->value[which] = value;
   return hz_CONVERGED;
 }
-
+#else
+#define hz_TAKES_THETA
+#define hz_WITH_THETA(argument)
+#define hz_BAD_THETA(theta) 0
+#endif

@@ -1,4 +1,85 @@
-/* Matrix products and sums of long rows. */
+/* Sines and cosines of registers; functions, products and sums of rows. */
+
+#ifdef hz_LANE_BYTES
+/* The nearest whole number. Numbers beyond the integers of the processor are cut off: as angles they have no digits
+   left. */
+static inline hz_lanes hz_wide_nearest(hz_lanes x) {
+  const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
+  x = hz_wide_cut(hz_select((hz_masks)(x == x), x, zero), hz_R(hz_SINGLE ? 1e9 : 1e18));
+  return __builtin_convertvector(__builtin_convertvector(x + hz_select((hz_masks)(x < zero), -half, half), hz_masks), hz_lanes);
+}
+
+/* sin(x + quarters pi / 2) where |x| <= hz_TURNED: x = k pi / 2 + r with |r| <= pi / 4, about a unit in the last place. */
+static inline hz_lanes hz_wide_wave(hz_lanes x, int quarters) {
+  hz_wide_count k;
+  const hz_lanes whole = hz_wide_whole(hz_wide_cut(x, hz_R(hz_TURNED)) * hz_R(0.63661977236758134308), &k);
+  hz_lanes r, z, y;
+  hz_masks turns;
+  r = (x - whole * hz_R(hz_QUARTER_1)) - whole * hz_R(hz_QUARTER_2);
+  r = (r - whole * hz_R(hz_QUARTER_3)) - whole * hz_R(hz_QUARTER_4);
+  z = r * r;
+  turns = __builtin_convertvector(k + quarters, hz_masks);
+  y = hz_select((hz_masks)((turns & 1) != 0), hz_R(1.0) - (hz_R(0.5) * z - z * z * hz_COS_TERMS(z)),
+      r + r * z * hz_SIN_TERMS(z));
+  return hz_select((hz_masks)((turns & 2) != 0), -y, y);
+}
+
+static inline hz_lanes hz_wide_sin(hz_lanes x) {
+  const hz_lanes size = hz_wide_fabs(x);
+  hz_lanes y = hz_wide_wave(x, 0);
+  int w;
+  for (w = 0; w < hz_wide_WIDTH && hz_wide_above(size, hz_R(hz_TURNED)); w++)
+    if (hz_above(hz_wide_LANE(size, w), hz_R(hz_TURNED))) hz_wide_LANE(y, w) = hz_sin(hz_wide_LANE(x, w));
+  return y;
+}
+
+static inline hz_lanes hz_wide_cos(hz_lanes x) {
+  const hz_lanes size = hz_wide_fabs(x);
+  hz_lanes y = hz_wide_wave(x, 1);
+  int w;
+  for (w = 0; w < hz_wide_WIDTH && hz_wide_above(size, hz_R(hz_TURNED)); w++)
+    if (hz_above(hz_wide_LANE(size, w), hz_R(hz_TURNED))) hz_wide_LANE(y, w) = hz_cos(hz_wide_LANE(x, w));
+  return y;
+}
+
+static inline hz_lanes hz_wide_sqrt(hz_lanes x) {
+  int w;
+  for (w = 0; w < hz_LANES; w++) x[w] = hz_sqrt(x[w]);
+  return x;
+}
+
+static inline hz_lanes hz_wide_pow(hz_lanes x, hz_real power) {
+  int w;
+  for (w = 0; w < hz_LANES; w++) x[w] = hz_pow(x[w], power);
+  return x;
+}
+
+#define hz_PARTS_OF(function) \
+  for (; k + hz_LANES <= count; k += hz_LANES) *(hz_part *)(y + k) = hz_wide_##function(*(const hz_part *)(x + k));
+#define hz_WIDE_ROW_OF(function)                                                               \
+  static inline void hz_wide_##function##_row(int count, const hz_lanes *x, hz_lanes *y) {     \
+    int k;                                                                                     \
+    for (k = 0; k < count; k++) y[k] = hz_wide_##function(x[k]);                               \
+  }
+#else
+#define hz_PARTS_OF(function)
+#define hz_WIDE_ROW_OF(function)
+#endif
+
+/* y_k = f(x_k) for a whole row. */
+#define hz_ROW_OF(function)                                                              \
+  static inline void hz_##function##_row(int count, const hz_real *x, hz_real *y) {      \
+    int k = 0;                                                                           \
+    hz_PARTS_OF(function)                                                                \
+    for (; k < count; k++) y[k] = hz_##function(x[k]);                                   \
+  }                                                                                      \
+  hz_WIDE_ROW_OF(function)
+hz_ROW_OF(tanh)
+hz_ROW_OF(sigmoid)
+hz_ROW_OF(softplus)
+#undef hz_ROW_OF
+#undef hz_PARTS_OF
+#undef hz_WIDE_ROW_OF
 
 /* y_k += sum_j w_jk x_j, where w is (inputs, outputs) and t its transpose. Long rows of outputs are summed side by
    side, without sums across lanes; a few outputs of many inputs are dot products. Vector types
@@ -8,52 +89,39 @@ static inline void hz_product(int inputs, int outputs, const hz_real *w, const h
   int j, k = 0;
 #ifdef hz_LANE_BYTES
   enum { L = hz_LANES };
+  const hz_lanes zero = hz_spread(hz_R(0.0));
+  int i, half;
   for (; k + 4 * L <= outputs; k += 4 * L) {
     hz_part *to = (hz_part *)(y + k);
-    hz_lanes a = to[0], b = to[1], c = to[2], d = to[3];
-    hz_lanes e = hz_spread(hz_R(0.0)), f = e, g = e, o = e;
+    hz_lanes even[4], odd[4];
+    for (i = 0; i < 4; i++) {
+      even[i] = to[i];
+      odd[i] = zero;
+    }
     for (j = 0; j + 2 <= inputs; j += 2) {
       const hz_part *from = (const hz_part *)(w + j * outputs + k);
       const hz_part *next = (const hz_part *)(w + (j + 1) * outputs + k);
-      a += from[0] * x[j];
-      b += from[1] * x[j];
-      c += from[2] * x[j];
-      d += from[3] * x[j];
-      e += next[0] * x[j + 1];
-      f += next[1] * x[j + 1];
-      g += next[2] * x[j + 1];
-      o += next[3] * x[j + 1];
+      for (i = 0; i < 4; i++) {
+        even[i] += from[i] * x[j];
+        odd[i] += next[i] * x[j + 1];
+      }
     }
-    if (j < inputs) {
-      const hz_part *from = (const hz_part *)(w + j * outputs + k);
-      a += from[0] * x[j];
-      b += from[1] * x[j];
-      c += from[2] * x[j];
-      d += from[3] * x[j];
-    }
-    to[0] = a + e;
-    to[1] = b + f;
-    to[2] = c + g;
-    to[3] = d + o;
+    for (i = 0; j < inputs && i < 4; i++) even[i] += ((const hz_part *)(w + j * outputs + k))[i] * x[j];
+    for (i = 0; i < 4; i++) to[i] = even[i] + odd[i];
   }
   for (; k + L <= outputs; k += L) {
     hz_part *to = (hz_part *)(y + k);
-    hz_lanes a = to[0], b = hz_spread(hz_R(0.0)), c = b, d = b;
+    hz_lanes sum[4] = {to[0], zero, zero, zero};
     const hz_real *from = w + k;
-    for (j = 0; j + 4 <= inputs; j += 4, from += 4 * outputs) {
-      a += *(const hz_part *)from * x[j];
-      b += *(const hz_part *)(from + outputs) * x[j + 1];
-      c += *(const hz_part *)(from + 2 * outputs) * x[j + 2];
-      d += *(const hz_part *)(from + 3 * outputs) * x[j + 3];
-    }
-    for (; j < inputs; j++, from += outputs) a += *(const hz_part *)from * x[j];
-    to[0] = (a + b) + (c + d);
+    for (j = 0; j + 4 <= inputs; j += 4, from += 4 * outputs)
+      for (i = 0; i < 4; i++) sum[i] += *(const hz_part *)(from + i * outputs) * x[j + i];
+    for (; j < inputs; j++, from += outputs) sum[0] += *(const hz_part *)from * x[j];
+    to[0] = (sum[0] + sum[1]) + (sum[2] + sum[3]);
   }
   if (inputs >= L) {
     const hz_real *row = t + k * inputs;
     for (; k < outputs; k++, row += inputs) {
-      hz_lanes sum = hz_spread(hz_R(0.0));
-      int half, i;
+      hz_lanes sum = zero;
       for (j = 0; j + L <= inputs; j += L) sum += *(const hz_part *)(row + j) * *(const hz_part *)(x + j);
       for (half = L / 2; half > 0; half /= 2)
         for (i = 0; i < half; i++) sum[i] += sum[i + half];
@@ -86,64 +154,18 @@ static inline hz_real hz_sum(int count, const hz_real *x) {
   return sum;
 }
 
-/* The inverse X of a matrix A (n, n), n <= hz_N, by elimination with exchanged rows; not finite where A has no
-   inverse. */
-static inline void hz_inverse(int n, const hz_real *A, hz_real *X) {
-  hz_real rows[hz_N][2 * hz_N], pivot;
-  int i, j, k, best;
-  for (i = 0; i < n; i++)
-    for (j = 0; j < n; j++) {
-      rows[i][j] = A[i * n + j];
-      rows[i][n + j] = i == j ? hz_R(1.0) : hz_R(0.0);
-    }
-  for (k = 0; k < n; k++) {
-    for (best = k, i = k + 1; i < n; i++)
-      if (hz_fabs(rows[i][k]) > hz_fabs(rows[best][k])) best = i;
-    pivot = rows[best][k];
-    for (j = 0; j < 2 * n; j++) {
-      const hz_real other = rows[best][j] / pivot;
-      rows[best][j] = rows[k][j];
-      rows[k][j] = other;
-    }
-    for (i = 0; i < n; i++) {
-      const hz_real factor = rows[i][k];
-      if (i != k)
-        for (j = 0; j < 2 * n; j++) rows[i][j] -= factor * rows[k][j];
-    }
-  }
-  for (i = 0; i < n; i++)
-    for (j = 0; j < n; j++) X[i * n + j] = rows[i][n + j];
-}
-
 #if defined(hz_LANE_BYTES) && hz_WIDE
 /* hz_product for a register of samples, eight sums at a time. */
 static inline void hz_wide_product(int inputs, int outputs, const hz_real *w, const hz_real *t, const hz_lanes *x,
     hz_lanes *hz_RESTRICT y) {
-  int j, k = 0;
+  int i, j, k = 0;
   (void)t;
   for (; k + 8 <= outputs; k += 8) {
-    hz_lanes a = y[k], b = y[k + 1], c = y[k + 2], d = y[k + 3];
-    hz_lanes e = y[k + 4], f = y[k + 5], g = y[k + 6], o = y[k + 7];
-    for (j = 0; j < inputs; j++) {
-      const hz_real *from = w + j * outputs + k;
-      const hz_lanes v = x[j];
-      a += from[0] * v;
-      b += from[1] * v;
-      c += from[2] * v;
-      d += from[3] * v;
-      e += from[4] * v;
-      f += from[5] * v;
-      g += from[6] * v;
-      o += from[7] * v;
-    }
-    y[k] = a;
-    y[k + 1] = b;
-    y[k + 2] = c;
-    y[k + 3] = d;
-    y[k + 4] = e;
-    y[k + 5] = f;
-    y[k + 6] = g;
-    y[k + 7] = o;
+    hz_lanes sum[8];
+    for (i = 0; i < 8; i++) sum[i] = y[k + i];
+    for (j = 0; j < inputs; j++)
+      for (i = 0; i < 8; i++) sum[i] += w[j * outputs + k + i] * x[j];
+    for (i = 0; i < 8; i++) y[k + i] = sum[i];
   }
   for (; k < outputs; k++) {
     hz_lanes sum = y[k];

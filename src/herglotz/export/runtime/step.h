@@ -19,7 +19,7 @@ static inline void FN_track_start(const FN_state *state, hz_TAKES_THETA FN_track
   int i;
 #if hz_P
   for (i = 0; i < hz_P; i++) track->P.theta[i] = SPREAD(theta ? theta->value[i] : hz_defaults.value[i]);
-#endif /* hz_P */
+#endif
   FN_potential(state->q, hz_WITH_THETA(track->P.theta) &track->P.V0);
   track->P.h = zero;
   for (i = 0; i < hz_N; i++) track->low_q[i] = track->low_p[i] = zero;
@@ -294,7 +294,7 @@ static inline hz_parameters FN_theta(const FN_problem *P, int w) {
   return theta;
 }
 
-#endif /* hz_P */
+#endif
 /* One step of every sample whose status is 0; a sample that fails gets its status and keeps its state. Samples that
    registers leave unsolved are solved one by one. */
 static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_WIDTH],
@@ -325,14 +325,8 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
   }
   P->s0 = state->s;
 #if hz_INPUTS
-  for (w = 0; w < FN_WIDTH; w++) {
-    hz_real push[hz_INPUTS];
-#if hz_P
-    const hz_parameters theta = FN_theta(P, w);
-#endif /* hz_P */
-    hz_push(u[w], hz_WITH_THETA(&theta) push);
-    for (i = 0; i < hz_INPUTS; i++) FN_LANE(P->push[i], w) = push[i];
-  }
+  for (w = 0; w < FN_WIDTH; w++)
+    for (i = 0; i < hz_INPUTS; i++) FN_LANE(P->u[i], w) = hz_taken(u[w], i);
 #endif
   FN_begin(P, t.move);
 #if hz_EXPLICIT
@@ -363,7 +357,7 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
     hz_state one;
 #if hz_P
     const hz_parameters theta = FN_theta(P, w);
-#endif /* hz_P */
+#endif
     if (!failed[w] && !hz_finite(FN_LANE(sum, w))) failed[w] = hz_DIVERGED;
     if (!failed[w] && !(hz_R(1.0) + FN_LANE(E, w) > hz_R(0.0))) failed[w] = hz_SINGULAR;
     if (!failed[w]) continue;
