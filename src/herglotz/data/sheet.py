@@ -94,8 +94,8 @@ def from_sheet(sheet: Sheet, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     """The recordings of a sheet; see `herglotz.data.table.from_table`.
 
     Where no name says so and time starts anew, a column groups the rows by its values (`_group_by_values`), with a
-    warning. Beside a column that groups the rows, one that is the same in every row says nothing: text and unusual
-    names without a unit are left aside, and a note says so. Raise InputError for any other column of text, and as
+    warning. A column that is the same in every row says nothing: text and unusual names without a unit are left aside,
+    and a note says so. Raise InputError for any other column of text, and as
     `herglotz.data.csv_columns.assign` and `from_table`.
     """
     units: list[str] = []
@@ -123,9 +123,9 @@ def _grouped(sheet: Sheet, wanted: Wanted) -> tuple[Columns, np.ndarray, list[st
     _refuse_text(sheet, columns, [i for i in texts if not (bare.q and _is_free(columns, wanted, i))])
     values, notes = sheet.numbers(bare), []
     group = _group_by_values(sheet, bare, wanted, values) if columns.trajectory is None else columns.trajectory
-    aside = [] if group is None else _same_everywhere(sheet, bare, wanted, values, texts)
+    aside = _same_everywhere(sheet, bare, wanted, values, texts)
     _refuse_text(sheet, columns, [i for i in texts if i not in (group, *aside)])
-    if group is None or not (aside or group != columns.trajectory):
+    if not aside and group == columns.trajectory:
         return columns, values, notes
     if group != columns.trajectory:
         notes = [
@@ -134,7 +134,8 @@ def _grouped(sheet: Sheet, wanted: Wanted) -> tuple[Columns, np.ndarray, list[st
             "column numbers the recordings, give --group NAME (group= in Python)"
         ]
     names = [columns.names[i] for i in aside]
-    chosen = replace(wanted, drop=(*as_names(wanted.drop), *names), group=columns.names[group])
+    groups = wanted.group if group is None else columns.names[group]
+    chosen = replace(wanted, drop=(*as_names(wanted.drop), *names), group=groups)
     columns = assign(sheet.heads, sheet.where, chosen)
     values = values[:, [bare.numeric.index(i) for i in columns.numeric]]
     return columns, values, [*notes, *([same_everywhere(names)] if names else [])]

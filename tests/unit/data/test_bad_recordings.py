@@ -257,9 +257,8 @@ def test_a_column_of_text_that_changes_where_time_starts_anew_groups_the_rows(tm
     [
         ("swing,t,x", ["a"] * 5 + ["b"] * 7, "a"),
         ("y[m],t,x", ["lost"] * 4 + ["none"] * 4 + ["found"] * 4, "lost"),
-        ("swing,t,x", ["only"] * 12, "only"),
     ],
-    ids=["changes elsewhere", "a position", "one text, no groups"],
+    ids=["changes elsewhere", "a position"],
 )
 def test_other_text_is_refused_with_both_remedies(tmp_path, header, labels, cell):
     # fails if text that groups no rows is left aside unsaid, or a remedy is missing
@@ -272,6 +271,22 @@ def test_other_text_is_refused_with_both_remedies(tmp_path, header, labels, cell
     )
     with pytest.raises(InputError, match=r"column 'swing': 'a' is not a number; .*--drop swing .*--group swing "):
         load(path)
+
+
+@pytest.mark.parametrize("cell", [0, 2, "shoulder"])
+def test_a_column_that_is_the_same_in_every_row_is_left_aside(tmp_path, capsys, cell):
+    # fails if a status that never changes is a coordinate (0 was, and a fit with inputs ended with an internal error),
+    # if text refuses the table, or if the only coordinate, or one that a unit or the user names, is left aside
+    t = [0.1 * k for k in range(12)]
+    x = [0.1, 0.3, 0.4, 0.2, 0.0, 0.1, 0.3, 0.5, 0.4, 0.2, 0.1, 0.0]
+    data = load(written(tmp_path, "mode,t,x,u", cells([cell] * 12, t, x, x[::-1])))
+    assert data.names == ("x",)
+    assert "mode is the same in every row, and is left aside" in capsys.readouterr().err
+    if cell != "shoulder":
+        named = load(written(tmp_path, "mode,t,x", cells([cell] * 12, t, x)), coordinates=("x", "mode"))
+        assert named.names == ("x", "mode")
+        assert load(written(tmp_path, "mode[m],t,x", cells([cell] * 12, t, x))).names == ("mode", "x")
+        assert load(written(tmp_path, "t,mode", cells(t, [cell] * 12))).names == ("mode",)
 
 
 @pytest.mark.parametrize("constant", ["experiment", "trial id", "session", "place"])

@@ -33,7 +33,8 @@ def rows(separator=",", *more):
 )
 def test_units_in_a_row_of_their_own(tmp_path, header, units, rate):
     # fails if units below the header are refused, lost, or a column does not get the role of its unit
-    data = load(written(tmp_path, f"{header}\n{units}\n{rows(',', 7)}"), unwrap=False)
+    text = "".join(f"{t},{x},{7 + x}\n" for t, x in zip(T, X, strict=True))
+    data = load(written(tmp_path, f"{header}\n{units}\n{text}"), unwrap=False)
     assert data.names[0] == "theta"
     assert (data.units[0], data.angles[0], data.time_unit) == ("rad", True, "s")
     assert (data.t.tolist(), data.q[:, 0].tolist()) == (T.tolist(), X.tolist())
