@@ -56,8 +56,8 @@ HELP = "score a run on another recording"
 FLAGS = (
     flag("source", "folder that `herglotz fit` or `select` wrote", metavar="RUN", type=Path),
     flag("data", "recording of the same coordinates, in the same units", metavar="DATA", type=existing),
-    flag("--warmup", "samples that the state is estimated from, at least 3 (default %(default)s)",
-         type=count, default=WARMUP, metavar="K"),
+    flag("--warmup", f"samples that the state is estimated from, at least 3 (default {WARMUP}, or half of the shortest "
+         "recording if that is shorter)", type=count, metavar="K"),
     flag("--windows", "score W windows (with --horizon)", type=count, metavar="W"),
     flag("--horizon", "time of the free run in a window, in the data's unit of time", type=positive, metavar="T"),
     flag("--out", "write the predicted motion: .csv or .npz, and a .png", type=Path, metavar="FILE"),

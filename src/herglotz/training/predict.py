@@ -128,7 +128,7 @@ def predict(
     run: FittedRun,
     data: Trajectories,
     *,
-    warmup: int = WARMUP,
+    warmup: int | None = None,
     windows: int | None = None,
     horizon: float | None = None,
     same_zeros: bool = False,
@@ -146,7 +146,8 @@ def predict(
     data
         Recordings of the same coordinates, in the same units, with inputs where the model takes them.
     warmup
-        Number of samples K that the state is estimated from, at least 3.
+        Number of samples K that the state is estimated from, at least 3; default 20, or half of the shortest recording
+        if that has fewer than 22.
     windows, horizon
         Score this many windows, spread evenly over the recording, instead of one free run to the end of each
         trajectory. A window has K samples of warm-up and a free run over the time `horizon`.
@@ -166,7 +167,7 @@ def predict(
     """
     refuse({
         f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}":
-            type(warmup) is not int or warmup < 3,
+            warmup is not None and (type(warmup) is not int or warmup < 3),
     })  # fmt: skip
     data = of_the_run(run, data).unwrapped().to(dtype=next(run.model.parameters()).dtype, device="cpu")
     data = measured(data, drifts=(run.metrics.get("plan") or {}).get("drifts") or ())
@@ -175,7 +176,9 @@ def predict(
     if every > 1:
         data = data.thinned(every)
     if windows is not None or horizon is not None:
-        data = _windows(data, warmup, windows, horizon)
+        data = _windows(data, warmup or WARMUP, windows, horizon)
+        warmup = warmup or WARMUP
+    warmup = warmup or _usual(min(data.lengths))
     _check_lengths(data, warmup, every)
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)
@@ -246,13 +249,18 @@ def of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
     return acting(data, run.arrival)
 
 
+def _usual(length: int) -> int:
+    """The warm-up of recordings of this length: at least two samples have to follow."""
+    return WARMUP if length >= WARMUP + 2 else max(3, length // 2)
+
+
 def _check_lengths(data: Trajectories, warmup: int, every: int) -> None:
     """Raise unless every trajectory has two samples after its warm-up."""
     length = min(data.lengths)
     shortest = data.label(data.lengths.index(length))
     thinned = f", every {every} of the recording" if every > 1 else ""
-    shorter, remedy = max(3, length // 2), "leave it out, as no warm-up is short enough"
-    remedy = f"use --warmup {shorter} or a longer recording" if length >= 5 else remedy
+    remedy = "leave it out, as no warm-up is short enough"
+    remedy = f"use --warmup {max(3, length // 2)} or a longer recording" if length >= 5 else remedy
     refuse({
         f"{data.source or 'data'}: {shortest} has {length} samples{thinned}; a warm-up of {warmup} needs at least "
         f"{warmup + 2}: {remedy}": length < warmup + 2,

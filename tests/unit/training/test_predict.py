@@ -239,6 +239,18 @@ def test_a_warm_up_that_is_lost_counts_as_the_worst_of_the_others(monkeypatch):
     assert lost.all(1).tolist() == [False, True, False, False]
 
 
+def test_short_recordings_are_predicted_by_default():
+    # fails if recordings of 8 to 14 samples need a flag: they were refused, "use --warmup 4"
+    model = model_of("linear")
+    whole = recording(model, count=2)
+    short = predict(run_of(model), whole.rows(torch.cat([torch.arange(9), torch.arange(81, 93)]), (9, 12)))
+    assert short.warmup == 4
+    assert short.rms is not None
+    # From exact positions the start is known to rounding.
+    assert short.rms < 1e-6
+    assert predict(run_of(model), whole).warmup == 20
+
+
 def test_float32():
     # fails if a float64 recording meets a float32 model
     model = model_of("linear").float()
@@ -263,7 +275,7 @@ def test_mistakes_say_what_to_do():
             {"data": replace(data, recordings=("run 5", "run 6")), "warmup": 80},
             r"trajectory 0 \(run 5\) has 81 samples",
         ),
-        ({"data": data.rows(torch.arange(85), (81, 4))}, "at least 22: leave it out, as no warm-up is short enough"),
+        ({"data": data.rows(torch.arange(85), (81, 4))}, "at least 5: leave it out, as no warm-up is short enough"),
         ({"warmup": 2}, "warmup must be a whole number >= 3"),
         ({"windows": 3}, "windows and horizon go together"),
         ({"windows": 3, "horizon": 99.0}, "other.csv: no trajectory holds 20 samples and a time of 99 after them"),
