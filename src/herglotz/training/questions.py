@@ -154,11 +154,15 @@ class Questions:
                 found = self._zeros_again(self.best, self.differ)
                 self.best = found if found is self.best else self.read.settled(found)
             return
-        longer = self.wanted.part.step_ratio > 1
+        longer, first = self.wanted.part.step_ratio > 1, self.read.first
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
         if longer and self.best is not None and (hold := self.read.better_hold(self.best, self.holds)):
             self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
             self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
+        # Means of inputs over longer steps are not what acted: of a part many terms may make up for the difference.
+        if first is not None and not (self.best and self.best.at_the_noise):
+            other = self.read.again(first)
+            self.best = self.read.better(self.best, other and self.read.settled(other))
 
     def _zeros_again(self, best: Trial, differ: tuple[Tensor, Tensor]) -> Trial:
         """The model with zeros fitted once more, and with the levels at which its inputs saturate beside these."""
