@@ -73,7 +73,7 @@ def test_only_the_door_differentiates_lagrangians():
         "mechanics/contact.py",  # the derivative of a flow
         "stepping/linearise.py",  # the derivative of a step
         "training/problems/one_step.py",  # with respect to parameters
-        "training/equation_numbers.py",  # the same
+        "training/equation_words.py",  # the same
         "training/kernel.py",  # the same
         "training/problems/joint_masses.py",  # the same
     }

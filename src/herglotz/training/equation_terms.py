@@ -22,8 +22,8 @@ from herglotz.models.feature_potential import Combination, baseline_is_named, so
 from herglotz.models.features import Feature
 from herglotz.models.terms import AffineDamping, FeatureKinetic, Kinetic, LinearDamping
 from herglotz.models.translations import across_in_words
-from herglotz.training.equation_numbers import Numbers
 from herglotz.training.equation_words import (
+    Numbers,
     distance,
     drag_in_words,
     feature_in_words,

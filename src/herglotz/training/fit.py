@@ -25,9 +25,8 @@ from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.disagreeing import look_at_agreeing, outlying
 from herglotz.training.distributed import is_first
-from herglotz.training.equation import equation_of
-from herglotz.training.equation_notes import notes_of
-from herglotz.training.equation_numbers import Joint
+from herglotz.training.equation import equation_of, notes_of
+from herglotz.training.equation_words import Joint
 from herglotz.training.evaluate import evaluate
 from herglotz.training.look import look, on_a_line
 from herglotz.training.objectives import OBJECTIVES

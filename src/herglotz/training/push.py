@@ -8,7 +8,7 @@ from torch import Tensor
 from herglotz.data.splits import leading
 from herglotz.models import ContactLagrangian
 from herglotz.models.terms import LinearDamping
-from herglotz.training.equation_numbers import Joint, Numbers
+from herglotz.training.equation_words import Joint, Numbers
 from herglotz.training.fitted_run import FittedRun
 
 # Standard deviations by which the work of friction exceeds 0.

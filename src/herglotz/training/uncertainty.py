@@ -24,7 +24,7 @@ from herglotz.threads import one_thread
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
-from herglotz.training.equation_numbers import Joint
+from herglotz.training.equation_words import Joint
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
