@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import cast
+from collections.abc import Callable, Collection
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -65,6 +65,11 @@ class ParameterVector:
         """`herglotz.mechanics.partials` of the model with parameters theta, for steps with inputs u (..., m)."""
         return cast(Partials, functional_call(self.model, self.unflatten(theta), (q0, q1, s0, h, order, u)))
 
+    def evaluated(self, theta: Tensor, function: Callable[..., Any], *args: Any) -> Any:
+        """function(model, *args) of the model with parameters theta."""
+        numbers = {f"model.{name}": x for name, x in self.unflatten(theta).items()}
+        return functional_call(_Of(self.model, function), numbers, args)
+
     def at(self, theta: Tensor, u: Tensor | None = None) -> FixedModel:
         """The discrete Lagrangian with parameters theta, for steps with inputs u."""
         return FixedModel(self, theta, u)
@@ -72,6 +77,17 @@ class ParameterVector:
     def index(self, prefix: str) -> Tensor:
         """Positions in the vector of all numbers with this prefix."""
         return torch.tensor([i for i, name in enumerate(self.numbers) if name.startswith(prefix)], dtype=torch.long)
+
+
+class _Of(nn.Module):
+    """A function of a model as a module, whose parameters `functional_call` reaches."""
+
+    def __init__(self, model: ContactLagrangian, function: Callable[..., Any]):
+        super().__init__()
+        self.model, self.function = model, function
+
+    def forward(self, *args: Any) -> Any:
+        return self.function(self.model, *args)
 
 
 class FixedModel:

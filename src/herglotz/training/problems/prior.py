@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import functional_call, jacrev, vmap
+from torch.func import jacrev, vmap
 
 from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
@@ -157,8 +157,7 @@ class Prior:
 
     def _departures(self, theta: Tensor, q: Tensor, v: Tensor) -> list[Tensor]:
         """Network outputs, each relative to its natural size: forces (n, ...) and rates (1, ...)."""
-        named = {f"model.{name}": value for name, value in self.parameters.unflatten(theta).items()}
-        force, rate = functional_call(_Departures(self.parameters.model), named, (q, v))
+        force, rate = self.parameters.evaluated(theta, _departures, q, v)
         parts = [] if force is None else [force / self.force]
         return parts if rate is None else [*parts, rate[None] / self.typical_rate]
 
@@ -176,16 +175,8 @@ def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) 
     )
 
 
-class _Departures(torch.nn.Module):
-    """Force of the potential's network and rate of the damping's, as a module so that functional_call reaches them."""
-
-    def __init__(self, model: ContactLagrangian):
-        super().__init__()
-        self.model = model
-
-    def forward(self, q: Tensor, v: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        jet = self.model.potential.departure(coordinates(q, 1))
-        force = None if jet is None else jet.gradient
-        damping = self.model.damping
-        rate = damping.departure(q, v) if isinstance(damping, AffineDamping) else None
-        return force, rate
+def _departures(model: ContactLagrangian, q: Tensor, v: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Force of the potential's network, and rate of the damping's."""
+    jet, damping = model.potential.departure(coordinates(q, 1)), model.damping
+    rate = damping.departure(q, v) if isinstance(damping, AffineDamping) else None
+    return None if jet is None else jet.gradient, rate
