@@ -18,7 +18,7 @@ from herglotz.training.one_step_fit import NOISE_OF_R, best_restart, fit_one_ste
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import OneStep
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.smoothing_fit import fit_smoothing, weakest
+from herglotz.training.smoother import fit_smoothing, weakest
 from herglotz.training.task import Task, drag_starts_the_fit, with_sticking
 from herglotz.training.trajectory_fit import Chosen, fit_states, fit_trajectories
 
