@@ -35,9 +35,8 @@ from herglotz.training.plan import Plan
 from herglotz.training.push import pushes
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
-from herglotz.training.stages import Progress, Stages
+from herglotz.training.stages import Progress, Stages, log_result, tensorboard_log
 from herglotz.training.summary import left_out_of, outlying_of
-from herglotz.training.tensorboard import log_result, tensorboard_log
 from herglotz.training.uncertainty import joint_of, laplace
 
 # Multiple of the σ of exact data. Smaller changes of the data are rounding.
