@@ -28,11 +28,11 @@ from herglotz.training.distributed import is_first
 from herglotz.training.equation import equation_of, notes_of
 from herglotz.training.equation_words import Joint
 from herglotz.training.evaluate import evaluate
+from herglotz.training.feedback import pushes
 from herglotz.training.look import look, on_a_line
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.own_fit import fit_own
 from herglotz.training.plan import Plan
-from herglotz.training.push import pushes
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages, log_result, tensorboard_log

@@ -29,7 +29,7 @@ from herglotz.progress import beat
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
 from herglotz.training.following import HALF, unexplained
-from herglotz.training.free_run import continued
+from herglotz.training.free_run import run_on
 from herglotz.training.look import Look
 from herglotz.training.named_terms import (
     DRY,
@@ -44,7 +44,7 @@ from herglotz.training.named_terms import (
 )
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
+from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid
 from herglotz.training.problems.prior import NETWORKS, prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
@@ -109,7 +109,11 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     if not math.isfinite(float(cost)):
         return None
     low, high = task.data.q.amin(0), task.data.q.amax(0)
-    runs = _Ahead.of(task.data, seen.data, problem, _turn(task.data, known))
+    steps, q = task.data.steps(), known[:, : task.data.dof]
+    v = (q[steps.index + 1] - q[steps.index]) / steps.h[:, None]
+    # The longest turn of the coordinates' motion.
+    turn = float((2 * math.pi * q.std(0) / v.square().mean(0).sqrt().clamp_min(1e-300)).max())
+    runs = _Ahead.of(task.data, seen.data, problem, turn)
     guess = runs.stepped_on(fitted.model, states, base.model_step)
     runs, guess = runs.until_lost(guess, low, high)
     ahead, path = None, None
@@ -179,20 +183,10 @@ class _Ahead:
 
         The fitted model steps quicker than the model with all terms.
         """
-        known, parts = states[self.rows], []
-        for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
-            last = int((self.rows[first : first + length] >= 0).nonzero()[-1])
-            if last < length - 1:
-                # Trajectories have three samples at least.
-                parts.append(torch.arange(first + min(last, length - 3), first + length))
-        if not parts:
-            return known
-        at = torch.cat(parts).to(known.device)
-        rest = self.data.rows(at, tuple(map(len, parts)))
-        grid = segment_grid(rest, rest.samples, max_step)
-        x = known[at[grid.start_sample]]
-        known[at] = grid.at_samples(continued(model, x, grid.h, step_inputs(model, rest, grid)))
-        return known
+        x = states[self.rows]
+        known = [int((own >= 0).sum()) for own in self.rows.split(list(self.data.lengths))]
+        run_on(model, self.data, x, known, max_step)
+        return x
 
     def until_lost(self, states: Tensor, low: Tensor, high: Tensor) -> tuple[_Ahead, Tensor | None]:
         """These runs up to where a step fails, with their `states`; None where one fails inside of [low, high], (n,).
@@ -213,13 +207,6 @@ class _Ahead:
             self, data=self.data.rows(rows, tuple(lengths)), rows=self.rows[rows], beyond=self.beyond[rows.cpu()]
         )
         return cut, states[rows]
-
-
-def _turn(data: Trajectories, states: Tensor) -> float:
-    """The longest turn of the coordinates' motion."""
-    steps, q = data.steps(), states[:, : data.dof]
-    v = (q[steps.index + 1] - q[steps.index]) / steps.h[:, None]
-    return float((2 * math.pi * q.std(0) / v.square().mean(0).sqrt().clamp_min(1e-300)).max())
 
 
 def _with_absent_terms(
@@ -271,15 +258,9 @@ def _of_unseen(Z: Tensor, q: Tensor, problem: ShootingProblem, runs: _Ahead, dat
         r = there * (q[rows] - data.q[at]) / problem.deviations
         if float(r.square().sum()) <= AT_THE_NOISE**2 * float(there.sum()):
             J = (Z[rows] * (there / problem.deviations)[..., None]).flatten(0, 1)
-            own = _own(problem, segment)
+            own = problem.places(segment)
             found[own[:, None], own] += J.T @ J
     return found
-
-
-def _own(problem: ShootingProblem, segment: int) -> Tensor:
-    """Places of the parameters and of the start state of a segment among the unknowns."""
-    P, d = problem.P, problem.d
-    return torch.cat([torch.arange(P), torch.arange(P + segment * d, P + (segment + 1) * d)])
 
 
 def _summary(
@@ -296,7 +277,7 @@ def _summary(
     C, follow = _open(told, absent, problem)
     start, parameters, hidden = [], [], []
     for segment, z in zip(runs.segments, Z.split(list(runs.data.lengths)), strict=True):
-        own = _own(problem, segment)
+        own = problem.places(segment)
         state = inverse_of(A[own[P:]][:, own[P:]])
         start.append(((z[..., P:] @ state) * z[..., P:]).sum(-1).mean(-1))
         parameters.append(((z @ C[own][:, own]) * z).sum(-1).mean(-1))

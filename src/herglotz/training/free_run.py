@@ -43,7 +43,8 @@ def run_on(
     NaN from a failed step on, and for a run whose start is NaN. Return the grid of the model steps; None if all samples
     are known.
     """
-    before = [k - 1 if k < length else length for k, length in zip(known, data.lengths, strict=True)]
+    # Trajectories have three samples at least.
+    before = [min(k - 1, length - 3) if k < length else length for k, length in zip(known, data.lengths, strict=True)]
     rows = (~leading(data.lengths, before)).nonzero()[:, 0].to(states.device)
     if not len(rows):
         return None

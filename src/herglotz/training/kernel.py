@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call, vmap
 
 import herglotz
@@ -41,7 +41,7 @@ from herglotz.stepping.equation import PartialsEquation
 from herglotz.stepping.newton import StickSlip, at_rest
 from herglotz.stepping.state import State
 from herglotz.training.dictionary import dictionary, keys_of
-from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.parameter_vector import FunctionOf, ParameterVector
 from herglotz.training.rates import Base, buffers_at, rates_of, terms_of
 
 RUNTIME = Path(herglotz.__file__).parent / "codegen" / "runtime"
@@ -199,17 +199,6 @@ def states_of(model: ContactLagrangian) -> int:
     return 2 * model.dof + model.s_enters_motion
 
 
-class _Increments(nn.Module):
-    """The partials of a model by q0 and Δ as a module, for `functional_call` with other parameters and buffers."""
-
-    def __init__(self, model: ContactLagrangian):
-        super().__init__()
-        self.model = model
-
-    def forward(self, *arguments: Any) -> Partials:
-        return self.model.partials_increment(*arguments)
-
-
 class _At:
     """The discrete Lagrangian at parameters θ (P,), with the `constants` of a kernel (n + R,), and inputs u (B, m)."""
 
@@ -230,7 +219,8 @@ class _At:
 
     def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
         """See `ContactLagrangian.partials_increment`."""
-        return functional_call(_Increments(self.model), self.named, (q0, delta, s0, h, order, self.u))
+        increments = FunctionOf(self.model, ContactLagrangian.partials_increment)
+        return functional_call(increments, self.named, (q0, delta, s0, h, order, self.u))
 
 
 class Functions:
@@ -359,11 +349,9 @@ def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:
     θ and `constants` have no batch, and a size of 0 is a scalar.
     """
     make = torch.Generator().manual_seed(0)
-    random = lambda *shape: torch.rand(*shape, generator=make, dtype=torch.float64)  # noqa: E731
     found = []
     for name, size in given.items():
-        if name in ("theta", "constants"):
-            found.append(0.1 + random(size) / 10)
-        else:
-            found.append(0.1 + random(1, size) / 10 if size else 0.1 + random(1) / 10)
+        batch = [] if name in ("theta", "constants") else [1]
+        shape = [*batch, size] if size else batch
+        found.append(0.1 + torch.rand(shape, generator=make, dtype=torch.float64) / 10)
     return tuple(found)

@@ -203,7 +203,9 @@ def left_by_the_past(
     some = slice(None, None, -(-len(y) // MOST_PREDICTED))
     since = data.t - data.t[list(data.offsets)][data.trajectory]
     time = torch.stack([since, since.square()], 1)
-    y, x, z, time = (_standard(part) for part in (y[some], x[some], signals(data)[at[some]], time[at[some]]))
+    parts = (y[some], x[some], signals(data)[at[some]], time[at[some]])
+    # Columns of mean 0 and variance 1; constant columns become 0.
+    y, x, z, time = ((part - part.mean(0)) / part.std(0, correction=0).clamp_min(1e-300) for part in parts)
     apart = torch.cdist(x, x).square()
     kernels = [torch.exp(-apart / (2 * width**2)) for width in WIDTHS]
     others = (torch.ones_like(apart), *(1 + x @ x.T / x.shape[1] for x in (z, time)))
@@ -241,8 +243,3 @@ def _remains(kernel: Tensor, y: Tensor) -> float:
         errors = [torch.linalg.solve(inverse[fold][:, fold], weights[fold]) for fold in folds]
         found.append(float(torch.cat(errors).square().mean()))
     return min(found)
-
-
-def _standard(x: Tensor) -> Tensor:
-    """Columns of mean 0 and variance 1; constant columns become 0."""
-    return (x - x.mean(0)) / x.std(0, correction=0).clamp_min(1e-300)

@@ -113,7 +113,7 @@ def fit_by_smoothing(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG
     if found is None:
         return _lost(task, model, "smoothing", sigma, "the model has no step near the data")
     problem = found.problem
-    problem.parameters.set(found.theta)
+    problem.parameters.set(problem.unpack(found.x)[0])
     notes = {"departure": weakest(task.config, model), "reason": found.result.reason, "process": problem.process,
              "robust": problem.freedom is not None, "follows_data": found.follows_data()}  # fmt: skip
     return Fitted(model, problem.states(found.x), "smoothing", problem.sigma, notes)

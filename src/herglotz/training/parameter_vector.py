@@ -68,7 +68,7 @@ class ParameterVector:
     def evaluated(self, theta: Tensor, function: Callable[..., Any], *args: Any) -> Any:
         """function(model, *args) of the model with parameters theta."""
         numbers = {f"model.{name}": x for name, x in self.unflatten(theta).items()}
-        return functional_call(_Of(self.model, function), numbers, args)
+        return functional_call(FunctionOf(self.model, function), numbers, args)
 
     def at(self, theta: Tensor, u: Tensor | None = None) -> FixedModel:
         """The discrete Lagrangian with parameters theta, for steps with inputs u."""
@@ -79,14 +79,15 @@ class ParameterVector:
         return torch.tensor([i for i, name in enumerate(self.numbers) if name.startswith(prefix)], dtype=torch.long)
 
 
-class _Of(nn.Module):
-    """A function of a model as a module, whose parameters `functional_call` reaches."""
+class FunctionOf(nn.Module):
+    """A function of a `model` as a module, whose parameters and buffers `functional_call` reaches."""
 
     def __init__(self, model: ContactLagrangian, function: Callable[..., Any]):
         super().__init__()
         self.model, self.function = model, function
 
     def forward(self, *args: Any) -> Any:
+        """Its value."""
         return self.function(self.model, *args)
 
 

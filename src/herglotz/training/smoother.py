@@ -131,17 +131,12 @@ class SmoothingFit:
     problem: SmoothingProblem
     result: OptimiserResult
 
-    @property
-    def theta(self) -> Tensor:
-        """Parameters, (P,)."""
-        return self.problem.unpack(self.x)[0]
-
     def follows_data(self) -> bool:
         """Whether free runs from the first states stay within a factor of the noise, without process noise."""
-        problem, states = self.problem, self.problem.unpack(self.x)[1]
-        start = state_of(problem.with_s(states[:, 0]))
+        problem = self.problem
+        theta, states = problem.unpack(self.x)
         with torch.no_grad():
-            stepper = Stepper(problem.parameters.at(self.theta))
+            stepper, start = Stepper(problem.parameters.at(theta)), state_of(problem.with_s(states[:, 0]))
             out = stepper.rollout(*start, h=problem.grid.h, inputs=problem.u)
         miss = problem.grid.at_samples(out.q) - problem.data.q
         return float(miss.square().mean().sqrt()) <= LOST * problem.sigma

@@ -110,9 +110,8 @@ class Laplace:
 
         First order in the unknowns: dq_k = Z_k d(θ, start), with Z through every implicit step.
         """
-        data, P, d = self.run.data.unwrapped(), len(self.theta), self.problem.d
-        own = [torch.cat([torch.arange(P), torch.arange(P + b * d, P + (b + 1) * d)]) for b in range(len(data))]
-        return self._bands(data, self.path.x[:, 0], [self.covariance[i[:, None], i[None, :]] for i in own])
+        data, own = self.run.data.unwrapped(), map(self.problem.places, range(len(self.run.data)))
+        return self._bands(data, self.path.x[:, 0], [self.covariance[i[:, None], i] for i in own])
 
     def predict(self, data: Trajectories, seen: int) -> Bands:
         """Bands of new trajectories: their first `seen` samples give the start states, a free run the rest.

@@ -87,8 +87,12 @@ class Prior:
         self.grid = unit[:, : len(low)] * (high - low) + low
         self.velocity = (2 * unit[:, len(low) :] - 1) * speed
         self.typical_rate = float((speed / low.new_tensor(model.config.scale)).min())
-        force = float(self._baseline_force().square().mean().sqrt())
-        self.force = force if force > 0 else 1.0
+        with torch.no_grad():
+            own, features = model.potential.baseline(self.grid, 1).gradient, model.potential.features
+            if features is not None and not bool(own.any()):
+                own = features(self.grid, 1).gradient
+        # RMS force of the baseline.
+        self.force = float(own.square().mean().sqrt()) or 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
         self.networks = self._index(*NETWORKS).to(self.start.device)
         with torch.no_grad():
@@ -141,14 +145,6 @@ class Prior:
 
     def _index(self, *prefixes: str) -> Tensor:
         return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
-
-    def _baseline_force(self) -> Tensor:
-        with torch.no_grad():
-            potential = self.parameters.model.potential
-            own = potential.baseline(self.grid, 1).gradient
-            if potential.features is None or bool(own.any()):
-                return own
-            return potential.features(self.grid, 1).gradient
 
     def _departed(self, theta: Tensor, q: Tensor, v: Tensor) -> Tensor:
         """The residuals of the networks' outputs at points of the grid, (k, ...)."""

@@ -196,6 +196,10 @@ class ShootingProblem(StatesProblem):
         """Flat unknowns from parameters (P,) and the states in which the segments of a path start."""
         return self.pack(theta, path.x[:, 0, : self.d])
 
+    def places(self, segment: int) -> Tensor:
+        """Places of the parameters and of the start state of a segment among the unknowns, (P + d,)."""
+        return torch.cat([torch.arange(self.P), self.P + torch.arange(segment * self.d, (segment + 1) * self.d)])
+
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Inverse of `pack`."""
         return x[: self.P], x[self.P :].reshape(-1, self.d)

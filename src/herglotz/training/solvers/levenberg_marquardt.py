@@ -22,44 +22,34 @@ NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
 
 
 class ByProducts(Protocol):
-    """A matrix JᵀJ with a structure of its own, which its products and its solver use."""
+    """A matrix JᵀJ with a structure of its own: JᵀJ v, its diagonal, and (JᵀJ + diag(damping))⁻¹ b or None."""
 
-    def __matmul__(self, v: Tensor, /) -> Tensor:
-        """JᵀJ v."""
-        ...
-
-    def diagonal(self) -> Tensor:
-        """Its diagonal, or an estimate of it."""
-        ...
-
-    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(JᵀJ + diag(damping))⁻¹ b, or None if there is no finite solution."""
-        ...
+    def __matmul__(self, v: Tensor, /) -> Tensor: ...
+    def diagonal(self) -> Tensor: ...  # noqa: D102
+    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None: ...  # noqa: D102
 
 
 class SumOfSquares(Protocol):
-    """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, possibly in chunks.
+    """A sum of squares ½|r(x)|² (inf or NaN if x is not admissible), and its (½|r|², JᵀJ, Jᵀr), perhaps in chunks.
 
     A problem with an attribute `at_once` that is true computes the normal equations in little more time than the cost.
     """
 
-    def cost(self, x: Tensor) -> Tensor:
-        """½|r|², a scalar; inf or NaN if x is not admissible."""
-        ...
-
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, ByProducts, Tensor]:
-        """(½|r|², JᵀJ, Jᵀr) at x."""
-        ...
+    def cost(self, x: Tensor) -> Tensor: ...  # noqa: D102
+    def normal_equations(  # noqa: D102
+        self, x: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, ByProducts, Tensor]: ...
 
 
 class Progress(Protocol):
-    """Receives the state of an optimiser; `resumed` is that state from an interrupted run (None: start from x)."""
+    """Called after each iteration; `search()` gives the state of the search as plain values.
+
+    `resumed` is that state from an interrupted run (None: start from x).
+    """
 
     resumed: dict[str, Any] | None
 
-    def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]], /) -> None:
-        """Called after each iteration; `search()` gives the state of the search as plain values."""
-        ...
+    def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], Any], /) -> None: ...  # noqa: D102
 
 
 def memory_of(problem: Any) -> dict[str, Any]:
@@ -106,17 +96,6 @@ class _Search:
         """Why the search is over; None while it is not."""
         return "converged" if self.quiet >= patience else "no_descent" if self.damping > 1e12 else None
 
-    def ends(self, predicted: float, enough: float) -> bool:
-        """True if a Newton step predicts a decrease far below the tolerance `enough`."""
-        return self.damping <= NEWTON_DAMPING and 0 <= predicted < NEGLIGIBLE * enough
-
-    @classmethod
-    def gone_on(cls, x: Tensor, cost: float, scale: Tensor, damping: float, resumed: Any) -> _Search:
-        """The search at its start x, or where it was interrupted."""
-        if resumed is None:
-            return cls(x, cost, damping, scale.clone(), [cost])
-        return cls(**{**resumed["search"], "x": x, "scale": resumed["search"]["scale"].to(x)})
-
 
 def levenberg_marquardt(
     problem: SumOfSquares,
@@ -147,16 +126,20 @@ def levenberg_marquardt(
     cost, A, b = _of_first(problem.normal_equations(x))
     if not bool(torch.isfinite(cost)):
         return OptimiserResult(x, float(cost), "not_finite", 0)
-    at = _Search.gone_on(x, float(cost), A.diagonal(), damping, resumed)
+    at = _Search(x, float(cost), damping, A.diagonal().clone(), [float(cost)])
+    if resumed is not None:
+        at = _Search(**{**resumed["search"], "x": x, "scale": resumed["search"]["scale"].to(x)})
     rounding = max(ROUNDING, 8 * torch.finfo(cost.dtype).eps)
     while at.iteration < max_iterations and at.over(patience) is None:
         at.iteration += 1
         beat()
-        step = _damped_step(A, b, at.damping * _floored(at.scale))
+        # Parameters without influence yet, behind a layer that starts at 0, get the largest scale.
+        floor = float(at.scale.max()) or 1.0
+        step = _damped_step(A, b, at.damping * torch.where(at.scale > 0, at.scale, floor))
         new, predicted, equations = math.inf, 0.0, None
         if step is not None:
             predicted = float(-(b @ step) - 0.5 * step @ (A @ step))
-            if at.ends(predicted, max(rtol * at.best, atol)):
+            if at.damping <= NEWTON_DAMPING and 0 <= predicted < NEGLIGIBLE * max(rtol * at.best, atol):
                 at.quiet = patience
                 break
             # Most steps are accepted, unless the step before was not.
@@ -182,15 +165,6 @@ def levenberg_marquardt(
             callback(at.iteration, at.best, at.x, lambda: {"search": asdict(at), "memory": memory_of(problem)})
     reason = at.over(patience) or "max_iterations"
     return OptimiserResult(at.x, at.best, reason, at.iteration, at.history, memory_of(problem))
-
-
-def _floored(scale: Tensor) -> Tensor:
-    """A positive scaling for parameters without influence yet (behind a layer that starts at 0).
-
-    All others keep their scaling, however small, because it has a unit.
-    """
-    largest = float(scale.max())
-    return torch.where(scale > 0, scale, largest if largest > 0 else 1.0)
 
 
 Equations = tuple[Tensor, "Tensor | ByProducts", Tensor]
