@@ -31,7 +31,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from statistics import NormalDist
 
 import torch
 from torch import Tensor
@@ -54,7 +53,7 @@ from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import inverse_of
 from herglotz.training.run import Run
-from herglotz.training.uncertainty import Laplace, inflation_of
+from herglotz.training.uncertainty import Laplace, inflation_of, quantile
 
 # Relative variation below which a function is constant: rounding of float32.
 MAX_VARIATION_OF_CONSTANT = 1e-6
@@ -110,10 +109,10 @@ class LearnedFunction:
 
     def interval(self, level: float = 0.9) -> tuple[Tensor, Tensor]:
         """Lower and upper ends of the central interval of the posterior, (K,) each; `level` is its probability."""
-        refuse({f"level must be between 0 and 1, got {level:g}; 0.9 is usual": not 0 < level < 1})
+        width = quantile(level)
         if self.mean is None or self.std is None:
             raise InputError("a function without a posterior has no band; give one: learned_functions(laplace(run))")
-        width = NormalDist().inv_cdf(0.5 + level / 2) * self.std
+        width = width * self.std
         return self.mean - width, self.mean + width
 
 
@@ -160,11 +159,12 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
             posterior = function_posterior(of)
             std = posterior.std(by_numbers(posterior.model, lines.values, posterior.theta)).split(points)
             mean = lines.values(posterior.model).split(points)
-    every = zip(lines.parts, value, mean, std, strict=True)
-    return [
-        LearnedFunction(kind, i, x, y, low, high, m, _inside(s, x, low, high))
-        for (kind, i, (x, low, high)), y, m, s in every
-    ]
+    found = []
+    for (kind, i, (x, low, high)), y, m, s in zip(lines.parts, value, mean, std, strict=True):
+        # Waves vanish beyond the recorded range by their form, not by the data.
+        s = None if s is None else torch.where((x >= low) & (x <= high), s, torch.inf)
+        found.append(LearnedFunction(kind, i, x, y, low, high, m, s))
+    return found
 
 
 class _Lines:
@@ -225,9 +225,8 @@ class _Lines:
         q = self._line(i, x)
         v = torch.zeros_like(q)
         v[:, i] = self.speed[i]
-        return (self._friction(model, q, -v) - self._friction(model, q, v))[:, i].double().cpu() / float(
-            2 * self.speed[i]
-        )
+        both = (self._friction(model, q, -v) - self._friction(model, q, v))[:, i]
+        return both.double().cpu() / float(2 * self.speed[i])
 
     def _line(self, i: int, x: Tensor) -> Tensor:
         """Positions (K, n): coordinate i along x, the others at their medians."""
@@ -259,11 +258,6 @@ def _range(values: Tensor, points: int, beyond: float, turns: bool = False) -> L
         return torch.linspace(-math.pi, math.pi, points, dtype=torch.float64), -math.pi, math.pi
     room = beyond * ((high - low) or 1.0)
     return torch.linspace(low - room, high + room, points, dtype=torch.float64), low, high
-
-
-def _inside(std: Tensor | None, x: Tensor, low: float, high: float) -> Tensor | None:
-    """The deviations, infinite beyond the recorded range: waves vanish there by their form, not by the data."""
-    return None if std is None else torch.where((x >= low) & (x <= high), std, torch.inf)
 
 
 def _varies(values: Tensor, among: Tensor | None = None) -> bool:
@@ -393,12 +387,12 @@ def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> 
     """The posterior of a model with all waves, linearised at the fit; None if a step fails there."""
     theta, problem = ParameterVector(model).get(), _problem(posterior, model, 2)
     P, d, start = problem.P, problem.d, posterior.path.x[:, 0, : problem.d]
-    coarse, fine = (_sums(x, problem.pack(theta, start)) for x in (_problem(posterior, model, 1), problem))
-    if not bool(coarse[0].isfinite() & fine[0].isfinite()):
+    both = (x.normal_equations(problem.pack(theta, start)) for x in (_problem(posterior, model, 1), problem))
+    coarse, (cost, A, b) = ([dense(x).double().cpu() for x in equations] for equations in both)
+    if not bool(coarse[0].isfinite() & cost.isfinite()):
         return None
     more = 1 / (2**model.config.order - 1)
-    cost, b = (x + more * (x - y) for x, y in ((fine[0], coarse[0]), (fine[2], coarse[2])))
-    A = fine[1]
+    cost, b = (x + more * (x - y) for x, y in ((cost, coarse[0]), (b, coarse[2])))
     states = inverse_of(A[P:, P:])
     onto = A[:P, P:] @ states
     q, h = posterior.problem.data.q, posterior.run.h
@@ -429,12 +423,6 @@ def _problem(posterior: Laplace, model: ContactLagrangian, parts: int) -> Shooti
     problem = ShootingProblem(model, of.data, grid, **settings)
     problem.guess_from(of, posterior.path)
     return problem
-
-
-def _sums(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """½|r|², JᵀJ and Jᵀr, float64 on the CPU."""
-    cost, A, b = problem.normal_equations(x)
-    return cost.double().cpu(), dense(A).double().cpu(), b.double().cpu()
 
 
 def _prior(

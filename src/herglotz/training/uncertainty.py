@@ -62,16 +62,19 @@ class Bands:
 
     def interval(self, level: float = 0.9, *, measured: bool = True) -> tuple[Tensor, Tensor]:
         """Lower and upper end of the central interval of a measured value, or of the true position, (N, n) each."""
-        if not 0 < level < 1:
-            raise InputError(f"level must be between 0 and 1, got {level:g}; 0.9 is usual")
-        width = NormalDist().inv_cdf(0.5 + level / 2)
-        std = (self.std.square() + self.sigma**2).sqrt() if measured else self.std
-        return self.q - width * std, self.q + width * std
+        width = quantile(level) * ((self.std.square() + self.sigma**2).sqrt() if measured else self.std)
+        return self.q - width, self.q + width
 
     def inside(self, q: Tensor, level: float = 0.9) -> Tensor:
         """Which measured positions q, (N, n), lie inside their interval; bool (N, n)."""
         low, high = self.interval(level)
         return (q >= low) & (q <= high)
+
+
+def quantile(level: float) -> float:
+    """Half the width of the central interval of this probability, in standard deviations of a normal distribution."""
+    refuse({f"level must be between 0 and 1, got {level:g}; 0.9 is usual": not 0 < level < 1})
+    return NormalDist().inv_cdf(0.5 + level / 2)
 
 
 class Laplace:
