@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, cast
 
 import torch
@@ -65,10 +65,12 @@ class ParameterVector:
         """`herglotz.mechanics.partials` of the model with parameters theta, for steps with inputs u (..., m)."""
         return cast(Partials, functional_call(self.model, self.unflatten(theta), (q0, q1, s0, h, order, u)))
 
-    def evaluated(self, theta: Tensor, function: Callable[..., Any], *args: Any) -> Any:
-        """function(model, *args) of the model with parameters theta."""
-        numbers = {f"model.{name}": x for name, x in self.unflatten(theta).items()}
-        return functional_call(FunctionOf(self.model, function), numbers, args)
+    def evaluated(
+        self, theta: Tensor, function: Callable[..., Any], *args: Any, buffers: Mapping[str, Tensor] | None = None
+    ) -> Any:
+        """function(model, *args) of the model with parameters theta, and with other values of some `buffers`."""
+        numbers = {f"model.{name}": x for name, x in (self.unflatten(theta) | dict(buffers or {})).items()}
+        return functional_call(_FunctionOf(self.model, function), numbers, args)
 
     def at(self, theta: Tensor, u: Tensor | None = None) -> FixedModel:
         """The discrete Lagrangian with parameters theta, for steps with inputs u."""
@@ -79,7 +81,7 @@ class ParameterVector:
         return torch.tensor([i for i, name in enumerate(self.numbers) if name.startswith(prefix)], dtype=torch.long)
 
 
-class FunctionOf(nn.Module):
+class _FunctionOf(nn.Module):
     """A function of a `model` as a module, whose parameters and buffers `functional_call` reaches."""
 
     def __init__(self, model: ContactLagrangian, function: Callable[..., Any]):
@@ -92,10 +94,16 @@ class FunctionOf(nn.Module):
 
 
 class FixedModel:
-    """A discrete Lagrangian with closed-form partials: the model at one parameter vector (and at inputs u)."""
+    """A discrete Lagrangian with closed-form partials: the model at one parameter vector (and at inputs u).
 
-    def __init__(self, parameters: ParameterVector, theta: Tensor, u: Tensor | None = None):
-        self.parameters, self.theta, self.u = parameters, theta, u
+    `buffers` of the model may have other values; these count in `partials_increment` alone.
+    """
+
+    def __init__(
+        self, parameters: ParameterVector, theta: Tensor, u: Tensor | None = None,
+        buffers: Mapping[str, Tensor] | None = None,
+    ):  # fmt: skip
+        self.parameters, self.theta, self.u, self.buffers = parameters, theta, u, buffers
 
     @property
     def capabilities(self) -> Capabilities:
@@ -113,3 +121,8 @@ class FixedModel:
     def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
         """See `herglotz.mechanics.partials`."""
         return self.parameters.partials(self.theta, q0, q1, s0, h, order, self.u)
+
+    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
+        """See `ContactLagrangian.partials_increment`."""
+        function, args = ContactLagrangian.partials_increment, (q0, delta, s0, h, order, self.u)
+        return self.parameters.evaluated(self.theta, function, *args, buffers=self.buffers)
