@@ -156,15 +156,7 @@ def predict(
         True: the sensors have the zeros of the run's reference recording. False: if recordings of the fit differ in
         their zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
 
-    Returns
-    -------
-    Prediction
-        `failed_steps` is above 0 if a free run fails.
-
-    Raises
-    ------
-    InputError
-        If the coordinates, units or inputs differ from those of the run, or a trajectory is too short.
+    Raise InputError if the coordinates, units or inputs differ from those of the run, or a trajectory is too short.
     """
     refuse({
         f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}":

@@ -57,23 +57,11 @@ class Smoothed:
 
 
 def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
-    """The smoothed states of each trajectory for a fixed model.
+    """The smoothed states of each trajectory for a fixed model; steps may differ, and samples may be missing.
 
-    Parameters
-    ----------
-    model
-        The dynamics; its parameters stay fixed.
-    data
-        Positions, and inputs if the model takes inputs. Steps may differ, samples may be missing.
-    sigma
-        Standard deviation of the noise of q, in its units.
-    process
-        Process noise (`SmoothingProblem`). Small: the states follow the model; large: they follow the data.
-
-    Raises
-    ------
-    InputError
-        If sigma or process is not positive, or a step has no solution near the data.
+    `sigma` is the standard deviation of the noise of q, in its units, `process` the process noise (`SmoothingProblem`).
+    Small: the states follow the model; large: they follow the data. Raise InputError if sigma or process is not
+    positive, or a step has no solution near the data.
     """
     check_positive("sigma", sigma)
     check_positive("process", process)

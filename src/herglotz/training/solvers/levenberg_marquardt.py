@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from herglotz.progress import beat
+from herglotz.training.arrowhead import Arrowhead
 from herglotz.training.distributed import everywhere, of_first
 
 # A smaller relative change of the cost is the rounding of a long sum.
@@ -21,12 +22,8 @@ GROWTH = 2.0
 NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
 
 
-class ByProducts(Protocol):
-    """A matrix JᵀJ with a structure of its own: JᵀJ v, its diagonal, and (JᵀJ + diag(damping))⁻¹ b or None."""
-
-    def __matmul__(self, v: Tensor, /) -> Tensor: ...
-    def diagonal(self) -> Tensor: ...  # noqa: D102
-    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None: ...  # noqa: D102
+# (½|r|², JᵀJ, Jᵀr)
+Equations = tuple[Tensor, Tensor | Arrowhead, Tensor]
 
 
 class SumOfSquares(Protocol):
@@ -36,9 +33,7 @@ class SumOfSquares(Protocol):
     """
 
     def cost(self, x: Tensor) -> Tensor: ...  # noqa: D102
-    def normal_equations(  # noqa: D102
-        self, x: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, ByProducts, Tensor]: ...
+    def normal_equations(self, x: Tensor) -> Equations: ...  # noqa: D102
 
 
 class Progress(Protocol):
@@ -111,7 +106,7 @@ def levenberg_marquardt(
     """Minimise ½|r(x)|² from the start x, in at most `max_iterations` accepted and rejected steps.
 
     Each iteration solves (JᵀJ + λ D) δ = −Jᵀr with D the running maximum of diag JᵀJ (Marquardt's scaling, Moré's
-    monotone version) by Cholesky, or by conjugate gradients if JᵀJ is given by products; λ starts at `damping` and
+    monotone version) by Cholesky, or by eliminating the states of an `Arrowhead`; λ starts at `damping` and
     follows the ratio of actual to predicted decrease (Nielsen's rule).
 
     The search ends after `patience` accepted steps in a row that each lower the cost by less than `atol`, or `rtol`
@@ -167,19 +162,16 @@ def levenberg_marquardt(
     return OptimiserResult(at.x, at.best, reason, at.iteration, at.history, memory_of(problem))
 
 
-Equations = tuple[Tensor, "Tensor | ByProducts", Tensor]
-
-
 def _of_first(equations: Equations) -> Equations:
-    """The equations of the first process; a matrix given by products is the same in every process."""
+    """The equations of the first process; an `Arrowhead` is the same in every process."""
     cost, A, b = equations
     if isinstance(A, Tensor):
-        return cast(Equations, of_first(cost, A, b))
+        (A,) = of_first(A)
     cost, b = of_first(cost, b)
     return cost, A, b
 
 
-def _damped_step(A: Tensor | ByProducts, b: Tensor, diagonal: Tensor) -> Tensor | None:
+def _damped_step(A: Tensor | Arrowhead, b: Tensor, diagonal: Tensor) -> Tensor | None:
     if not isinstance(A, Tensor):
         step = A.solve(-b, diagonal)
         return step if everywhere(step is not None) else None
