@@ -115,16 +115,8 @@ def reason_of(
     state += [] if data.u is None else [at(data.u)]
     x, middle = torch.cat(state, 1), at.rows[:, SAMPLES // 2]
     hidden = float(noise.square().mean())
-    # Terms of a model make up for an end stop, and leave no kicks: the recorded motion itself has them.
-    kicked = (("What is missed comes in kicks", miss, owner), ("The recorded velocity jumps", data.q, data.trajectory))
-    for what, signal, run in kicked:
-        if (row := _kick(data, signal, run)) is not None:
-            unit = "" if data.time_unit == "1" else data.time_unit
-            when = f"t = {size(float(data.t[row]), unit)} of {data.label(int(data.trajectory[row]))}"
-            return (
-                f"{what}, the hardest at {when}, as by blows and end stops. Try what strikes as an input (--inputs), "
-                "or recordings that are cut there"
-            )
+    if kicks := _kicks(data, miss, owner):
+        return kicks
     # Measured where a force is missing: of 75 recordings with a memory 52 are told, 34 of them by neighbours alone; of
     # 50 without one 8 are, 7 of them by neighbours alone.
     by_state, by_past, by_time = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
@@ -160,6 +152,23 @@ class _Parabolas:
     def __call__(self, x: Tensor, order: int = 0) -> Tensor:
         """The derivative of this order of x (N, m) in the middle of each window, (K, m)."""
         return (self.weights[order][:, None] * x[self.rows]).sum(1) / self.h**order
+
+
+def _kicks(data: Trajectories, miss: Tensor, owner: Tensor) -> str:
+    """That the motion is kicked, and what to try; "" if no kicks are seen.
+
+    Terms of a model make up for an end stop, and leave no kicks: the recorded motion itself has them.
+    """
+    seen = (("What is missed comes in kicks", miss, owner), ("The recorded velocity jumps", data.q, data.trajectory))
+    for what, signal, run in seen:
+        if (row := _kick(data, signal, run)) is not None:
+            unit = "" if data.time_unit == "1" else data.time_unit
+            when = f"t = {size(float(data.t[row]), unit)} of {data.label(int(data.trajectory[row]))}"
+            return (
+                f"{what}, the hardest at {when}, as by blows and end stops. Try what strikes as an input (--inputs), "
+                "or recordings that are cut there"
+            )
+    return ""
 
 
 def _kick(data: Trajectories, x: Tensor, owner: Tensor) -> int | None:
