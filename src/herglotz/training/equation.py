@@ -334,5 +334,5 @@ def longest_step(run: FittedRun) -> float:
 def free_run(run: FittedRun, max_step: float) -> Tensor:
     """Positions of free runs of all recordings from their first states, with steps up to `max_step`, (N, n)."""
     data, states = run.data.unwrapped(), run.states.joined.detach().clone()
-    run_on(run.model, data, states, (1,) * len(data), max_step)
+    run_on(run.stepper, data, states, (1,) * len(data), max_step)
     return states[:, : data.dof].detach()

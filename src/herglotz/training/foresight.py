@@ -29,7 +29,7 @@ from herglotz.progress import beat
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
 from herglotz.training.following import HALF, unexplained
-from herglotz.training.free_run import run_on
+from herglotz.training.free_run import continued
 from herglotz.training.look import Look
 from herglotz.training.named_terms import (
     DRY,
@@ -44,7 +44,7 @@ from herglotz.training.named_terms import (
 )
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid
+from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
 from herglotz.training.problems.prior import NETWORKS, prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
@@ -183,10 +183,20 @@ class _Ahead:
 
         The fitted model steps quicker than the model with all terms.
         """
-        x = states[self.rows]
-        known = [int((own >= 0).sum()) for own in self.rows.split(list(self.data.lengths))]
-        run_on(model, self.data, x, known, max_step)
-        return x
+        known, parts = states[self.rows], []
+        for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
+            last = int((self.rows[first : first + length] >= 0).nonzero()[-1])
+            if last < length - 1:
+                # Trajectories have three samples at least.
+                parts.append(torch.arange(first + min(last, length - 3), first + length))
+        if not parts:
+            return known
+        at = torch.cat(parts).to(known.device)
+        rest = self.data.rows(at, tuple(map(len, parts)))
+        grid = segment_grid(rest, rest.samples, max_step)
+        x = known[at[grid.start_sample]]
+        known[at] = grid.at_samples(continued(model, x, grid.h, step_inputs(model, rest, grid)))
+        return known
 
     def until_lost(self, states: Tensor, low: Tensor, high: Tensor) -> tuple[_Ahead, Tensor | None]:
         """These runs up to where a step fails, with their `states`; None where one fails inside of [low, high], (n,).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -12,10 +13,12 @@ from herglotz.data import Trajectories
 from herglotz.data.splits import leading
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper, state_of
+from herglotz.training.first_states import states_of_pairs
 from herglotz.training.flow import motion
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
+from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import solve_path
 
 
@@ -26,7 +29,7 @@ def states_everywhere(
     out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
     trained = leading(data.lengths, train_lengths).to(out.device)
     out[trained] = fitted.states
-    run_on(fitted.model, data, out, train_lengths, max_step)
+    run_on(Stepper(fitted.model), data, out, train_lengths, max_step)
     lost = data.trajectory[~trained & ~torch.isfinite(out).all(-1)]
     if not len(lost):
         return state_of(out), "ok"
@@ -36,28 +39,61 @@ def states_everywhere(
 
 
 def run_on(
-    model: ContactLagrangian, data: Trajectories, states: Tensor, known: Sequence[int], max_step: float
+    stepper: Stepper, data: Trajectories, states: Tensor, known: Sequence[int], max_step: float
 ) -> SegmentGrid | None:
     """Fill in `states` (N, 2n+1) by a free run from the last of the `known` leading samples of each trajectory.
 
-    NaN from a failed step on, and for a run whose start is NaN. Return the grid of the model steps; None if all samples
-    are known.
+    NaN from a failed step on. Return the grid of the model steps; None if all samples are known.
     """
-    # Trajectories have three samples at least.
-    before = [min(k - 1, length - 3) if k < length else length for k, length in zip(known, data.lengths, strict=True)]
+    before = [k - 1 if k < length else length for k, length in zip(known, data.lengths, strict=True)]
     rows = (~leading(data.lengths, before)).nonzero()[:, 0].to(states.device)
     if not len(rows):
         return None
     rest = data.rows(rows, tuple(length - k for k, length in zip(before, data.lengths, strict=True) if k < length))
     grid = segment_grid(rest, rest.samples, max_step)
     # A hold may take the inputs of earlier samples into account.
-    u, start = step_inputs(model, data, replace(grid, row=rows[grid.row])), states[rows[grid.start_sample]]
-    begun = torch.isfinite(start).all(-1)
-    nodes = start.new_full((len(start), grid.longest + 1, start.shape[-1]), torch.nan)
-    if bool(begun.any()):
-        nodes[begun] = continued(model, start[begun], grid.h[begun], None if u is None else u[begun])
-    states[rows] = grid.at_samples(nodes)
+    u = step_inputs(cast(ContactLagrangian, stepper.L_d), data, replace(grid, row=rows[grid.row]))
+    states[rows] = grid.at_samples(free_runs(stepper, rest, grid, states[rows[grid.start_sample]], u))
     return grid
+
+
+def free_runs(stepper: Stepper, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None) -> Tensor:
+    """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1); NaN from a failed step on.
+
+    Near the data all steps are solved at once, with the data as initial guess; else one by one. If a start is NaN, its
+    run is NaN.
+    """
+    known, model = torch.isfinite(start).all(-1), cast(ContactLagrangian, stepper.L_d)
+    nodes = near_data(model, data, grid, start, u) if bool(known.all()) else None
+    if nodes is not None:
+        return nodes
+    nodes = start.new_full((len(start), grid.longest + 1, start.shape[-1]), torch.nan)
+    if bool(known.any()):
+        with torch.no_grad():
+            inputs = None if u is None else u[known]
+            out = stepper.rollout(*state_of(start[known]), h=grid.h[known], inputs=inputs)
+        nodes[known] = out.states.joined
+    return nodes
+
+
+def near_data(
+    model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None
+) -> Tensor | None:
+    """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1), all steps solved at once.
+
+    Newton's method starts from the recorded positions; None if it does not converge, when the runs are not near them.
+    """
+    found = motion(model, start, grid.h, u)
+    if found is not None:
+        return found
+    problem = ShootingProblem(model, data, grid, sigma=1.0, compiled=False)
+    with torch.no_grad():
+        problem.guess_from_states(states_of_pairs(model, data))
+        assert problem.path is not None
+        tol = 64 * torch.finfo(start.dtype).eps
+        L_d = problem.parameters.at(problem.parameters.get(), u)
+        path = solve_path(L_d, start, grid.h, problem.path.x, tol)
+    return None if path is None or not bool(torch.isfinite(path.x).all()) else path.x
 
 
 def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor:

@@ -173,7 +173,7 @@ def predict(
     _check_lengths(data, warmup, every)
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)
-    grid = run_on(run.model, data, states, (warmup,) * len(data), high)
+    grid = run_on(run.stepper, data, states, (warmup,) * len(data), high)
     # Every trajectory is longer than its warm-up.
     assert grid is not None
     h = grid.h[inside := torch.arange(grid.longest) < grid.end[:, None]]

@@ -33,6 +33,7 @@ from herglotz.data.polar import circles
 from herglotz.data.sensors import measured
 from herglotz.data.splits import enough, leading
 from herglotz.data.units import common_unit
+from herglotz.stepping import Stepper, state_of
 from herglotz.training.errors_of_runs import EXACT_ENOUGH, Errors
 from herglotz.training.feedback import (
     caveat_of_inputs,
@@ -40,9 +41,9 @@ from herglotz.training.feedback import (
     reason_of_inputs,
     reason_of_set_points,
 )
+from herglotz.training.flow import motion
 from herglotz.training.following import HALF
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
-from herglotz.training.free_run import continued
 from herglotz.training.left_out import beside
 from herglotz.training.look import Look
 from herglotz.training.missed import MOST, reason_of, reason_of_data
@@ -68,7 +69,10 @@ def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories
     """Errors of free runs over windows of 20 recorded steps from states (N, 2n+1) at the samples, (N', n)."""
     grid = segment_grid(data, FIRST_SEGMENT, task.base.model_step)
     start, u = states[grid.start_sample], step_inputs(fitted.model, data, grid)
-    nodes = continued(fitted.model, start, grid.h, u)
+    with torch.no_grad():
+        nodes = motion(fitted.model, start, grid.h, u)
+        if nodes is None:
+            nodes = Stepper(fitted.model).rollout(*state_of(start), h=grid.h, inputs=u).states.joined
     return grid.at_samples(nodes[..., : data.dof]) - data.q
 
 

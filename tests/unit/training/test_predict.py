@@ -14,8 +14,10 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
-from herglotz.training.free_run import continued
+from herglotz.training.free_run import near_data
+from herglotz.training.kernel import kernel_of
 from herglotz.training.predict import missed_from_best_start, predict
+from herglotz.training.problems.grid import segment_grid
 from herglotz.training.recorded_range import MARGIN
 from herglotz.training.smoother import process_noise
 
@@ -205,14 +207,16 @@ def test_windows_cover_the_recording():
 def test_a_step_that_fails_is_counted_and_ends_the_motion(monkeypatch):
     # fails if NaN enters the RMS, or what was not reached is passed over in silence
     model = model_of("linear")
-    run, data = run_of(model), recording(model)
+    run, data, own = run_of(model), recording(model), Stepper.rollout
 
-    def breaks(*args):
-        x = continued(*args)
-        x[0, 11:] = torch.nan
-        return x
+    def breaks(self, *state, **settings):
+        out = own(self, *state, **settings)
+        q = out.q.clone()
+        q[0, 11:] = torch.nan
+        return replace(out, q=q)
 
-    monkeypatch.setattr("herglotz.training.free_run.continued", breaks)
+    monkeypatch.setattr(Stepper, "rollout", breaks)
+    monkeypatch.setattr("herglotz.training.free_run.near_data", lambda *_: None)
     found = predict(run, data)
     assert found.failed_steps == pytest.approx(51 / 122)
     assert found.rms < 1e-9  # type: ignore[operator]
@@ -365,3 +369,19 @@ def test_process_noise_does_not_depend_on_the_step():
     # fails if the noise of every step adds up: over 145 samples a period free runs began 1.6 times the noise off
     model = ContactLagrangian(ModelConfig(level="linear", rate=0.1, scale=(1.0,), speed=(1.0,), potential_width=0))
     assert process_noise(model, 0.1) == pytest.approx(2 * process_noise(model, 0.025))
+
+
+def test_a_run_that_a_kernel_loses_is_solved_from_the_data(monkeypatch):
+    # fails if a problem that a kernel steps is asked for a path, which it has not: an internal error of predict
+    model = model_of("linear")
+    data = recording(model)
+    grid = segment_grid(data, data.samples, H)
+    start = torch.zeros(len(grid.start_sample), 3, dtype=torch.float64)
+    start[:, 0] = data.q[grid.start_sample, 0]
+    stepped = near_data(model, data, grid, start, None)
+    assert kernel_of(model) is not None
+    monkeypatch.setattr("herglotz.training.free_run.motion", lambda *_: None)
+    solved = near_data(model, data, grid, start, None)
+    assert stepped is not None
+    assert solved is not None
+    torch.testing.assert_close(solved, stepped)
