@@ -73,9 +73,9 @@ def test_only_the_door_differentiates_lagrangians():
         "mechanics/contact.py",  # the derivative of a flow
         "stepping/linearise.py",  # the derivative of a step
         "training/problems/one_step.py",  # with respect to parameters
-        "training/equation_numbers.py",  # the same
+        "training/equation_words.py",  # the same
         "training/kernel.py",  # the same
-        "training/problems/joint_masses.py",  # the same
+        "training/problems/shooting.py",  # the same
     }
     used = {str(p.relative_to(SOURCE)) for p in FILES if "autograd.grad" in p.read_text(encoding="utf-8")}
     assert used <= allowed, used - allowed

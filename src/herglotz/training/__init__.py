@@ -9,11 +9,13 @@ from herglotz.training.learned_functions import (
 )
 from herglotz.training.look import Look as Look, look as look
 from herglotz.training.plan import Plan as Plan
-from herglotz.training.problems.one_step import ResidualProblem as ResidualProblem
+from herglotz.training.problems.one_step import (
+    ResidualProblem as ResidualProblem,
+    SupervisedProblem as SupervisedProblem,
+)
 from herglotz.training.problems.prior import Prior as Prior
 from herglotz.training.problems.shooting import ShootingProblem as ShootingProblem
 from herglotz.training.problems.smoothing import SmoothingProblem as SmoothingProblem
-from herglotz.training.problems.supervised import SupervisedProblem as SupervisedProblem
 from herglotz.training.run import Run as Run
 from herglotz.training.run_folder import load_run as load_run, save_run as save_run
 from herglotz.training.selection import Selection as Selection, select as select

@@ -26,7 +26,7 @@ Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
 
 @dataclass(frozen=True)
 class Arrowhead:
-    """The matrix, solved by eliminating the states (`solvers.levenberg_marquardt.ByProducts`)."""
+    """The matrix, solved by eliminating the states."""
 
     corner: Tensor  # (P, P)
     border: Tensor  # (S, d, P)

@@ -182,7 +182,7 @@ class FitConfig:
     absent: tuple[str, ...] = ()
 
     def __post_init__(self):
-        own = {name: getattr(self, name) for name in (*CHOICES, "restarts", "iterations", "substeps")}
+        own = {name: getattr(self, name) for name in (*CHOICES, "restarts", "iterations", "substeps", "batch")}
         refuse({
             f"unknown {name} '{own[name]}'; choose one of {', '.join(choices)}": own[name] not in choices
             for name, choices in CHOICES.items()
@@ -192,7 +192,6 @@ class FitConfig:
             for name, value in own.items() if name not in CHOICES
         })  # fmt: skip
         self._check_together()
-        self._check_batch()
         self._check_device()
 
     def _check_together(self) -> None:
@@ -218,17 +217,10 @@ class FitConfig:
                 self.dissipation and self.sticking,
             "input_map is given but use_inputs is False; leave one of them out":
                 self.input_map and not self.use_inputs,
-        })  # fmt: skip
-
-    def _check_batch(self) -> None:
-        if self.batch is None:
-            return
-        lm, carries_s = self.optimiser == "lm", self.level in ("affine", "full") and self.supervision == "q"
-        refuse({
-            f"batch must be >= 1, got {self.batch}": self.batch < 1,
-            "batch applies only to adam and adamw; lm takes all rows: set the optimiser, or leave batch out": lm,
+            "batch applies only to adam and adamw; lm takes all rows: set the optimiser, or leave batch out":
+                self.batch and self.optimiser == "lm",
             f"batch: the level '{self.level}' carries s along whole trajectories; leave batch out, or record s and set "
-            "supervision='qs'": carries_s,
+            "supervision='qs'": self.batch and self.level in ("affine", "full") and self.supervision == "q",
         })  # fmt: skip
 
     def _check_device(self) -> None:

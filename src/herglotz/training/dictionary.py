@@ -37,15 +37,18 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
     # Joints without coupling have a mass matrix whose other entries are 0.
     if any(c.angles) and n > 1 and c.diagonal and not c.coupled:
         c = replace(c, diagonal=False)
-    features, drag = features_of(c.angles), (*drag_of(c.angles), *_inputs_by_position(c))
+    # All forces by position of the inputs that the model has some of.
+    inputs = {k + 1 for text in c.drag if (k := parse_drag(text, c.angles).input) is not None}
+    features, drag = features_of(c.angles), (*drag_of(c.angles), *by_motion(c.angles, sorted(inputs)))
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
     whole = replace(
         c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
         input_zero=c.inputs > 0, damping_width=0, rate=0.1, scale=(1.0,) * n, speed=(1.0,) * n, tilt=(0.0,) * n,
         stiffness=(0.0 if n == 1 else 1.0,) * n, seed=0, absent=(), dissipation=tuple(POWERS) if c.dissipation else (),
     )  # fmt: skip
-    more = waves_of_kind(c.angles)
-    for wider in (whole, replace(whole, features=_joined(whole.features, more[0]), drag=_joined(drag, more[1]))):
+    waves, braking = waves_of_kind(c.angles)
+    features, drag = (tuple(dict.fromkeys(texts)) for texts in ((*whole.features, *waves), (*drag, *braking)))
+    for wider in (whole, replace(whole, features=features, drag=drag)):
         if set(expand(config.features, c.angles)) <= set(wider.features) and set(config.drag) <= set(wider.drag):
             return wider
     return None
@@ -61,10 +64,6 @@ def waves_of_kind(angles: tuple[bool, ...]) -> tuple[tuple[str, ...], tuple[str,
     features, drag = ([text for name, texts in every.items() if name.startswith(BRAKES) == brakes for text in texts]
                       for brakes in (False, True))  # fmt: skip
     return rates.standard(features), rates.standard(drag)
-
-
-def _joined(first: Iterable[str], second: Iterable[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys((*first, *second)))
 
 
 def _has_other_parts(c: ModelConfig) -> bool:
@@ -110,12 +109,6 @@ def by_motion(angles: tuple[bool, ...], inputs: Iterable[int]) -> tuple[str, ...
     braked = [f"{power} v{j}" for j in range(1, len(angles) + 1) for power in ("", "^2")]
     factors = [f" {factor}" for factor in (*turned, *moved)] + braked
     return tuple(f"u{k}{factor}" for k in inputs for factor in factors)
-
-
-def _inputs_by_position(c: ModelConfig) -> tuple[str, ...]:
-    """All these forces of the inputs that a model has some of."""
-    forces = (parse_drag(text, c.angles).input for text in c.drag)
-    return by_motion(c.angles, sorted({k + 1 for k in forces if k is not None}))
 
 
 def keys_of(numbers: list[str], config: ModelConfig) -> list[str]:

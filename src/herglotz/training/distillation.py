@@ -17,8 +17,8 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.training.config import FitConfig
 from herglotz.training.one_step_fit import fit_one_step
+from herglotz.training.problems.one_step import SupervisedProblem
 from herglotz.training.problems.prior import prior_of
-from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.stages import Stages
 from herglotz.training.structure import kept_structure, search, terms_are_free
 from herglotz.training.task import NOISY, Task, build_model

@@ -22,8 +22,8 @@ from herglotz.models.feature_potential import Combination, baseline_is_named, so
 from herglotz.models.features import Feature
 from herglotz.models.terms import AffineDamping, FeatureKinetic, Kinetic, LinearDamping
 from herglotz.models.translations import across_in_words
-from herglotz.training.equation_numbers import Numbers
 from herglotz.training.equation_words import (
+    Numbers,
     distance,
     drag_in_words,
     feature_in_words,
@@ -82,8 +82,8 @@ class Reader:
 
     def lines(self) -> list[Line]:
         """The lines of all terms with a coefficient other than 0."""
-        friction = (*self._friction(), *self._drag())
-        parts = (self._kinetic(), self._damping(), friction, self._inputs(), self._springs(), self._features())
+        own = (line for i in range(len(self.own)) for line in (*self._viscous(i), *self._dry(i)))
+        parts = (self._kinetic(), self._damping(), own, self._drag(), self._inputs(), self._springs(), self._features())
         found = [replace(line, of=self.line_of.get(line.left, "")) for part in parts for line in part]
         found = [line for line in found if float(line.value.detach()) != 0.0]
         return self._over_masses(found) if self.newton else found
@@ -139,19 +139,12 @@ class Reader:
             for i, name in enumerate(self.names):
                 yield Line("L", f"{name}′ s", "", damping.drag[i])
 
-    def _friction(self) -> Iterator[Line]:
-        """Friction of each coordinate, and between coordinates."""
-        for i, left in enumerate(self.own):
-            yield from self._viscous(i, left)
-            yield from self._dry(i, left)
-
-    def _viscous(self, i: int, left: str) -> Iterator[Line]:
+    def _viscous(self, i: int) -> Iterator[Line]:
         """Friction linear in the speeds; for separate masses with the damping of the contact form, −γ m v."""
-        model, per_time = self.model, unit_of(self.data.units[i], 0, self.time, 1)
+        model, left, per_time = self.model, self.own[i], unit_of(self.data.units[i], 0, self.time, 1)
         parts = [] if model.friction is None else [-model.friction.viscous[i]]
         if self.newton and isinstance(model.damping, LinearDamping):
-            decay = -model.damping.rate * self._masses()[i, i]
-            parts.append(decay)
+            parts.append(-model.damping.rate * self._masses()[i, i])
         if parts:
             yield Line(left, f"{self.names[i]}′", per_time, torch.stack(parts).sum())
         if model.coupling is not None:
@@ -173,9 +166,9 @@ class Reader:
                 size = size if f.input is None else ""
                 yield Line(self.own[i], drag_in_words(f, i, self.names, words), size, value)
 
-    def _dry(self, i: int, left: str) -> Iterator[Line]:
+    def _dry(self, i: int) -> Iterator[Line]:
         """Dry friction of one coordinate; a set-valued friction force below 0 counts as 0."""
-        friction, name = self.model.friction, self.names[i]
+        friction, name, left = self.model.friction, self.names[i], self.own[i]
         if friction is None or not friction.dry:
             return
         unit, coulomb, excess = unit_of(self.data.units[i], 1, self.time, 2), friction.coulomb, friction.breakaway
@@ -275,8 +268,9 @@ class Reader:
     def explained(self) -> list[str]:
         """Notes that an integration of the lines needs: symbols, the law of motion, and sticking."""
         model, names = self.model, self.names
-        found = [] if is_formula(model) else [MORE]
-        if any(p.function == "radius" for p in self._products()):
+        found, config = [] if is_formula(model) else [MORE], self.config
+        features = (x for text in (config.features, config.known) for x in sorted_features(text, config.angles)[0])
+        if any(product.function == "radius" for feature in features for product in feature):
             found.append(f"{self.distance} = √({' + '.join(raised(name, 2) for name in names)})")
         if not self.newton:
             x, by_s = names[0], model.damping is not None
@@ -291,8 +285,3 @@ class Reader:
             more = "; a factor that would push is 0" if any(map(self._dry_by_position, range(len(names)))) else ""
             found.append(held + more)
         return found
-
-    def _products(self) -> Iterator:
-        for text in (self.config.features, self.config.known):
-            for feature in sorted_features(text, self.config.angles)[0]:
-                yield from feature

@@ -23,9 +23,8 @@ from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.plan import Plan
 from herglotz.training.problems.grid import step_inputs
-from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.one_step import ResidualProblem, SupervisedProblem
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.recorded_range import box_of
 from herglotz.training.run import Run
 from herglotz.training.task import Task
@@ -49,10 +48,8 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
     states, status = states_everywhere(fitted, data, train.lengths, task.base.model_step)
     metrics, free = _errors(fitted, task, seen, dropped, states)
     if free is not None and (metrics["extrapolation_rms"] or 0.0) > DIVERGED * metrics["spread"]:
-        times = metrics["extrapolation_rms"] / metrics["spread"]
-        status = (
-            f"the free run over the unseen samples leaves the world: it misses them by {times:.1g} times their spread"
-        )
+        missed = f"it misses them by {metrics['extrapolation_rms'] / metrics['spread']:.1g} times their spread"
+        status = f"the free run over the unseen samples leaves the world: {missed}"
         free, metrics["extrapolation_rms"] = torch.full_like(free, torch.inf), None
     metrics |= judged(task, seen, fitted, states.joined, free, metrics)
     # If a model follows no data, its states are the recorded ones, and have no error.
@@ -65,12 +62,8 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
         "level": config.level,
         **({} if plan is None else {"plan": plan.to_dict()}),
         "data": {"source": data.source, "sha256": data.digest(), "trajectories": len(data), "samples": data.samples},
-        "versions": {
-            "herglotz": herglotz.__version__,
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": {module.__name__: module.__version__ for module in (herglotz, torch, np)}
+        | {"python": platform.python_version()},
     }
     box = box_of(*state_of(fitted.states))
     h = train.typical_step / config.substeps

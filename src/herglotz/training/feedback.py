@@ -1,4 +1,4 @@
-"""Motion that a controller holds: what a free run of its model, and its numbers, cannot tell.
+"""Motion that a controller holds, or that drives itself: what a free run of its model, and its numbers, cannot tell.
 
 Names of inputs tell the set points of a controller, which act through the controller alone. Two facts are measured on
 the training part:
@@ -11,6 +11,8 @@ the training part:
   The map of the inputs and the other forces then make up for each other. Where the inputs are recorded with noise,
   the noise alone is no function of the state, and moves nothing: a fit finds inputs without effect, and the law of the
   machine with its controller.
+
+Friction gives a motion energy only if the motion drives itself, or if another force is missing (`pushes`).
 """
 
 from __future__ import annotations
@@ -25,9 +27,13 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.column_roles import is_recorded_effort, is_set_point
 from herglotz.data.noise import precisions
+from herglotz.data.splits import leading
 from herglotz.data.units import size
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import input_forces
+from herglotz.models.terms import LinearDamping
+from herglotz.training.equation_words import Joint, Numbers
+from herglotz.training.fitted_run import FittedRun
 from herglotz.training.following import HALF, unexplained
 from herglotz.training.free_run import continued
 from herglotz.training.problems.grid import segment_grid, step_inputs
@@ -36,6 +42,12 @@ from herglotz.training.solvers.lifted_newton import linear_recurrence, linear_st
 
 # Inputs that do not follow from the state.
 SIGNALS = ("a small random signal on the inputs", "set points that jump")
+# Standard deviations by which the work of friction exceeds 0.
+CLEARLY = 2.0
+PUSHES = (
+    "Friction pushes: over the training part it gives the motion more energy than it takes, as where motion drives "
+    "itself; else another force is missing"
+)
 
 
 def reason_of_inputs(
@@ -171,3 +183,34 @@ def leaves_without_inputs(model: ContactLagrangian, data: Trajectories, states: 
 def _spread(data: Trajectories) -> Tensor:
     """Standard deviation of each coordinate, (n,)."""
     return data.q.std(0, correction=0).clamp_min(1e-300)
+
+
+def pushes(run: FittedRun, joint: Joint | None) -> str:
+    """What is to be said of friction that clearly gives energy to the training part; nothing of any other."""
+    if joint is None or not isinstance(run.model.damping, LinearDamping):
+        return ""
+    work, deviation, _ = Numbers(run.model, joint).known(work_of_friction(run), "work")
+    return PUSHES if deviation is not None and work > CLEARLY * deviation else ""
+
+
+def work_of_friction(run: FittedRun) -> Tensor:
+    """The energy that friction gives to the training part, (), by the fitted motion from sample to sample.
+
+    Σ (F⁻/c + F⁺)·Δ − γ h p·v without inputs and constant loads, which are no friction; < 0 where it brakes.
+    """
+    model, data = run.model, run.data.unwrapped()
+    assert isinstance(model.damping, LinearDamping)
+    trained = leading(data.lengths, run.train_lengths).to(data.t.device)
+    steps = data.steps()
+    row = steps.index[trained[steps.index] & trained[steps.index + 1]]
+    q0, q1, p = run.states.q[row].detach(), run.states.q[row + 1].detach(), run.states.p.detach()
+    h, move = data.t[row + 1] - data.t[row], q1 - q0
+    work = -model.damping.rate * ((p[row] + p[row + 1]) / 2 * move).sum()
+    forces = model.forces(q0, q1, torch.zeros_like(h), h)
+    if forces is not None:
+        work = work + ((forces[0] / (-model.damping.rate * h).exp()[:, None] + forces[1]) * move).sum()
+    for g, text in enumerate(model.config.drag):
+        if text.startswith("load"):
+            assert model.drag is not None
+            work = work + model.drag.coefficient[g] * move[:, int(text.split()[1]) - 1].sum()
+    return work

@@ -33,20 +33,13 @@ def first_states(problem: ShootingProblem, theta: Tensor, smooth: Trajectories |
 
 def states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
     """The recorded positions with momenta by FL⁺ of each pair and s = 0, (N, 2n+1)."""
-    out = data.q.new_zeros(data.samples, 2 * data.dof + 1)
-    steps, u = data.steps(), step_inputs(model, data)
-    i, zero = steps.index, torch.zeros_like(steps.h)
-    with torch.no_grad():
-        L_d = model if u is None else model.at(u[i])
-        _, p, _ = legendre_plus(L_d, data.q[i], data.q[i + 1], zero, steps.h)
-        first = torch.tensor(data.offsets, device=i.device)
-        h = data.t[first + 1] - data.t[first]
-        L_d = model if u is None else model.at(u[first])
-        _, p_first, _ = legendre_minus(L_d, data.q[first], data.q[first + 1], torch.zeros_like(h), h)
-    n = data.dof
+    n, u, out = data.dof, step_inputs(model, data), data.q.new_zeros(data.samples, 2 * data.dof + 1)
+    i, first = data.steps().index, torch.tensor(data.offsets, device=data.t.device)
     out[:, :n] = data.q
-    out[i + 1, n : 2 * n] = p
-    out[first, n : 2 * n] = p_first
+    with torch.no_grad():
+        for momentum, rows, at in ((legendre_plus, i, i + 1), (legendre_minus, first, first)):
+            L_d, h = model if u is None else model.at(u[rows]), data.t[rows + 1] - data.t[rows]
+            _, out[at, n : 2 * n], _ = momentum(L_d, data.q[rows], data.q[rows + 1], torch.zeros_like(h), h)
     return out
 
 

@@ -25,20 +25,18 @@ from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.disagreeing import look_at_agreeing, outlying
 from herglotz.training.distributed import is_first
-from herglotz.training.equation import equation_of
-from herglotz.training.equation_notes import notes_of
-from herglotz.training.equation_numbers import Joint
+from herglotz.training.equation import equation_of, notes_of
+from herglotz.training.equation_words import Joint
 from herglotz.training.evaluate import evaluate
+from herglotz.training.feedback import pushes
 from herglotz.training.look import look, on_a_line
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.own_fit import fit_own
 from herglotz.training.plan import Plan
-from herglotz.training.push import pushes
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
-from herglotz.training.stages import Progress, Stages
+from herglotz.training.stages import Progress, Stages, log_result, tensorboard_log
 from herglotz.training.summary import left_out_of, outlying_of
-from herglotz.training.tensorboard import log_result, tensorboard_log
 from herglotz.training.uncertainty import joint_of, laplace
 
 # Multiple of the σ of exact data. Smaller changes of the data are rounding.

@@ -109,7 +109,11 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     if not math.isfinite(float(cost)):
         return None
     low, high = task.data.q.amin(0), task.data.q.amax(0)
-    runs = _Ahead.of(task.data, seen.data, problem, _turn(task.data, known))
+    steps, q = task.data.steps(), known[:, : task.data.dof]
+    v = (q[steps.index + 1] - q[steps.index]) / steps.h[:, None]
+    # The longest turn of the coordinates' motion.
+    turn = float((2 * math.pi * q.std(0) / v.square().mean(0).sqrt().clamp_min(1e-300)).max())
+    runs = _Ahead.of(task.data, seen.data, problem, turn)
     guess = runs.stepped_on(fitted.model, states, base.model_step)
     runs, guess = runs.until_lost(guess, low, high)
     ahead, path = None, None
@@ -215,13 +219,6 @@ class _Ahead:
         return cut, states[rows]
 
 
-def _turn(data: Trajectories, states: Tensor) -> float:
-    """The longest turn of the coordinates' motion."""
-    steps, q = data.steps(), states[:, : data.dof]
-    v = (q[steps.index + 1] - q[steps.index]) / steps.h[:, None]
-    return float((2 * math.pi * q.std(0) / v.square().mean(0).sqrt().clamp_min(1e-300)).max())
-
-
 def _with_absent_terms(
     task: Task, model: ContactLagrangian
 ) -> tuple[ContactLagrangian, Baseline, dict[str, list[int]]]:
@@ -271,15 +268,9 @@ def _of_unseen(Z: Tensor, q: Tensor, problem: ShootingProblem, runs: _Ahead, dat
         r = there * (q[rows] - data.q[at]) / problem.deviations
         if float(r.square().sum()) <= AT_THE_NOISE**2 * float(there.sum()):
             J = (Z[rows] * (there / problem.deviations)[..., None]).flatten(0, 1)
-            own = _own(problem, segment)
+            own = problem.places(segment)
             found[own[:, None], own] += J.T @ J
     return found
-
-
-def _own(problem: ShootingProblem, segment: int) -> Tensor:
-    """Places of the parameters and of the start state of a segment among the unknowns."""
-    P, d = problem.P, problem.d
-    return torch.cat([torch.arange(P), torch.arange(P + segment * d, P + (segment + 1) * d)])
 
 
 def _summary(
@@ -296,7 +287,7 @@ def _summary(
     C, follow = _open(told, absent, problem)
     start, parameters, hidden = [], [], []
     for segment, z in zip(runs.segments, Z.split(list(runs.data.lengths)), strict=True):
-        own = _own(problem, segment)
+        own = problem.places(segment)
         state = inverse_of(A[own[P:]][:, own[P:]])
         start.append(((z[..., P:] @ state) * z[..., P:]).sum(-1).mean(-1))
         parameters.append(((z @ C[own][:, own]) * z).sum(-1).mean(-1))

@@ -106,24 +106,24 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
     if found is not None:
         return found
     parameters, n, tol = ParameterVector(model), (start.shape[-1] - 1) // 2, 64 * torch.finfo(start.dtype).eps
-    theta, x, k, block = parameters.get(), start[:, None], 0, 1
+    x = start.new_full((h.shape[0], h.shape[1] + 1, start.shape[-1]), torch.nan)
+    x[:, 0], theta, k, block, alive = start, parameters.get(), 0, 1, torch.arange(len(start))
 
-    def at_once(part: slice) -> Tensor | None:
-        guess = x[:, -1:].repeat(1, h[:, part].shape[1] + 1, 1)
-        v = (x[:, -1, :n] - x[:, -2, :n]) / h[:, k - 1 : k]
-        guess[:, 1:, :n] += v[:, None] * h[:, part].cumsum(1)[..., None]
-        L_d = parameters.at(theta, None if u is None else u[:, part])
-        path = solve_path(L_d, x[:, -1], h[:, part], guess, tol)
+    def at_once(before: Tensor, now: Tensor, h_before: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:
+        guess = now[:, None].repeat(1, h.shape[1] + 1, 1)
+        guess[:, 1:, :n] += ((now - before)[:, :n] / h_before)[:, None] * h.cumsum(1)[..., None]
+        path = solve_path(parameters.at(theta, u), now, h, guess, tol)
         return None if path is None else path.x
 
-    def stepped(part: slice) -> Tensor:
-        inputs = None if u is None else u[:, part]
-        return Stepper(model).rollout(*state_of(x[:, -1]), h=h[:, part], inputs=inputs).states.joined
-
     with torch.no_grad():
-        while k < h.shape[1]:
-            new = at_once(slice(k, k + block)) if block > 1 else None
+        while k < h.shape[1] and len(alive):
+            now, steps, inputs = x[alive, k], h[alive, k : k + block], None if u is None else u[alive, k : k + block]
+            new = at_once(x[alive, k - 1], now, h[alive, k - 1 : k], steps, inputs) if k else None
             block = max(2, block // 4) if new is None else 2 * block
-            new = stepped(slice(k, k + 1)) if new is None else new
-            x, k = torch.cat([x, new[:, 1:]], 1), k + new.shape[1] - 1
+            if new is None:
+                inputs = None if inputs is None else inputs[:, :1]
+                new = Stepper(model).rollout(*state_of(now), h=steps[:, :1], inputs=inputs).states.joined
+            x[alive, k + 1 : k + new.shape[1]] = new[:, 1:]
+            k += new.shape[1] - 1
+            alive = alive[torch.isfinite(x[alive, k]).all(-1)]
     return x

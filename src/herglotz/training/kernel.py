@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
-from torch.func import functional_call, vmap
+from torch import Tensor
+from torch.func import vmap
 
 import herglotz
 from herglotz.codegen.angles import Angles
@@ -33,14 +33,14 @@ from herglotz.codegen.interpret import interpret
 from herglotz.codegen.program import Outputs, Program
 from herglotz.codegen.trace import traced
 from herglotz.errors import InputError
-from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative
-from herglotz.models import Capabilities, ContactLagrangian, ModelConfig, numbers_of
+from herglotz.mechanics import momentum_plus, momentum_residual, step_derivative
+from herglotz.models import ContactLagrangian, ModelConfig, numbers_of
 from herglotz.models.features import expand
 from herglotz.stepping.equation import PartialsEquation
 from herglotz.stepping.newton import StickSlip, at_rest
 from herglotz.stepping.state import State
 from herglotz.training.dictionary import dictionary, keys_of
-from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.parameter_vector import FixedModel, ParameterVector
 from herglotz.training.rates import Base, buffers_at, rates_of, terms_of
 
 RUNTIME = Path(herglotz.__file__).parent / "codegen" / "runtime"
@@ -198,40 +198,6 @@ def states_of(model: ContactLagrangian) -> int:
     return 2 * model.dof + model.s_enters_motion
 
 
-class _Increments(nn.Module):
-    """The partials of a model by q0 and Δ as a module, for `functional_call` with other parameters and buffers."""
-
-    def __init__(self, model: ContactLagrangian):
-        super().__init__()
-        self.model = model
-
-    def forward(self, *arguments: Any) -> Partials:
-        return self.model.partials_increment(*arguments)
-
-
-class _At:
-    """The discrete Lagrangian at parameters θ (P,), with the `constants` of a kernel (n + R,), and inputs u (B, m)."""
-
-    def __init__(
-        self, parameters: ParameterVector, theta: Tensor, bases: Sequence[Base], constants: Tensor, u: Tensor | None
-    ):
-        self.model, self.u = parameters.model, u
-        sharpest, rates = constants.split([self.model.dof, len(constants) - self.model.dof])
-        named = parameters.unflatten(theta) | buffers_at(self.model, bases, rates)
-        if "friction.sharpest" in dict(self.model.named_buffers()):
-            named["friction.sharpest"] = sharpest
-        self.named = {f"model.{name}": value for name, value in named.items()}
-
-    @property
-    def capabilities(self) -> Capabilities:
-        """The capabilities of the model."""
-        return self.model.capabilities
-
-    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
-        """See `ContactLagrangian.partials_increment`."""
-        return functional_call(_Increments(self.model), self.named, (q0, delta, s0, h, order, self.u))
-
-
 class Functions:
     """The functions that the C runtime calls, as tensor code to be traced.
 
@@ -245,7 +211,12 @@ class Functions:
 
     def equation(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, constants: Tensor) -> PartialsEquation:
         """The step equation in Δ, with second derivatives."""
-        n, at = self.n, _At(self.parameters, theta, self.bases, constants, u)
+        n, model = self.n, self.parameters.model
+        sharpest, rates = constants.split([n, len(constants) - n])
+        buffers = buffers_at(model, self.bases, rates)
+        if "friction.sharpest" in dict(model.named_buffers()):
+            buffers["friction.sharpest"] = sharpest
+        at = FixedModel(self.parameters, theta, u, buffers)
         state = State(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
         return PartialsEquation(at, state, h, 2, increments=True)  # pyright: ignore[reportArgumentType]
 
@@ -359,11 +330,9 @@ def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:
     θ and `constants` have no batch, and a size of 0 is a scalar.
     """
     make = torch.Generator().manual_seed(0)
-    random = lambda *shape: torch.rand(*shape, generator=make, dtype=torch.float64)  # noqa: E731
     found = []
     for name, size in given.items():
-        if name in ("theta", "constants"):
-            found.append(0.1 + random(size) / 10)
-        else:
-            found.append(0.1 + random(1, size) / 10 if size else 0.1 + random(1) / 10)
+        batch = [] if name in ("theta", "constants") else [1]
+        shape = [*batch, size] if size else batch
+        found.append(0.1 + torch.rand(shape, generator=make, dtype=torch.float64) / 10)
     return tuple(found)

@@ -11,12 +11,24 @@ looked for:
 * kicks, as of blows and end stops, in the residual or in the motion itself: a twentieth of the samples has more than
   half of the sum of squares, in several places with little before and after each;
 * the past: the lacking accelerations differ where positions, velocities and inputs of two times are alike, so that no
-  function of these gives the accelerations; or the past of the motion explains half of what these do not (`past`);
+  function of these gives the accelerations; or the past of the motion explains half of what these do not;
 * the time, if it explains half of what the state does not, and more than the past.
+
+What the past explains of the lacking force y that the present state does not is measured by kernel ridge regressions,
+which predict y for blocks of time from the other blocks (`left_by_the_past`):
+
+* from the state x = (q, q̇, u) alone, with k(x, x′) = exp(−|x − x′|²/2ℓ²);
+* from the state and the past z, with k(x, x′) (1 + z·z′/m): sums of functions of x, and of such functions times z_j;
+* from the state and the time since the start of the recording, in the same way with z = (t, t²).
+
+A force of the state that a model lacks is predicted by the state as well. The past of a motion has m signals of each
+coordinate: q̇, q̇² and q² through low-pass filters, as springs behind dampers, heat and the action remember them, and
+the position that a play has lost, as hysteresis remembers it. Time predicts what grows, leaks or wears.
 """
 
 from __future__ import annotations
 
+import math
 import shlex
 from dataclasses import replace
 
@@ -29,9 +41,9 @@ from herglotz.data.gaps import MEANS
 from herglotz.data.noise import SAMPLES, precisions
 from herglotz.data.polar import LENGTH, with_hints
 from herglotz.data.rates import filled_inputs
+from herglotz.data.smoothing import slopes
 from herglotz.data.units import COUNTS, size
 from herglotz.training.following import HALF
-from herglotz.training.past import left_by_the_past
 
 # Most samples: the distances between all of them take 32 MB.
 MOST = 2000
@@ -51,6 +63,14 @@ KICK_SAMPLES = (3, 5)
 QUIET = 0.1
 # Fewest kicks. Motion that decays has its largest accelerations in one or two places.
 KICKS = 5
+# Widths ℓ of the kernel, in standard deviations of x, and ridges: those that predict best are taken.
+WIDTHS, RIDGES = (0.5, 1.0, 2.0, 4.0), (1e-3, 1e-2, 1e-1, 1.0)
+# Time constants of the filters, in periods 2π σ(q)/σ(q̇) of the motion, and half widths of the play, in σ(q).
+FILTERS, PLAYS = (1 / 8, 1 / 2, 2.0), (0.1, 0.3, 1.0)
+# Blocks of time that are predicted together, and blocks in all.
+FOLDS, PIECES = 8, 16
+# Most samples of a regression: an inverse takes about 5 ms.
+MOST_PREDICTED = 400
 
 
 def reason_of_data(data: Trajectories) -> str:
@@ -95,16 +115,8 @@ def reason_of(
     state += [] if data.u is None else [at(data.u)]
     x, middle = torch.cat(state, 1), at.rows[:, SAMPLES // 2]
     hidden = float(noise.square().mean())
-    # Terms of a model make up for an end stop, and leave no kicks: the recorded motion itself has them.
-    kicked = (("What is missed comes in kicks", miss, owner), ("The recorded velocity jumps", data.q, data.trajectory))
-    for what, signal, run in kicked:
-        if (row := _kick(data, signal, run)) is not None:
-            unit = "" if data.time_unit == "1" else data.time_unit
-            when = f"t = {size(float(data.t[row]), unit)} of {data.label(int(data.trajectory[row]))}"
-            return (
-                f"{what}, the hardest at {when}, as by blows and end stops. Try what strikes as an input (--inputs), "
-                "or recordings that are cut there"
-            )
+    if kicks := _kicks(data, miss, owner):
+        return kicks
     # Measured where a force is missing: of 75 recordings with a memory 52 are told, 34 of them by neighbours alone; of
     # 50 without one 8 are, 7 of them by neighbours alone.
     by_state, by_past, by_time = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
@@ -142,6 +154,23 @@ class _Parabolas:
         return (self.weights[order][:, None] * x[self.rows]).sum(1) / self.h**order
 
 
+def _kicks(data: Trajectories, miss: Tensor, owner: Tensor) -> str:
+    """That the motion is kicked, and what to try; "" if no kicks are seen.
+
+    Terms of a model make up for an end stop, and leave no kicks: the recorded motion itself has them.
+    """
+    seen = (("What is missed comes in kicks", miss, owner), ("The recorded velocity jumps", data.q, data.trajectory))
+    for what, signal, run in seen:
+        if (row := _kick(data, signal, run)) is not None:
+            unit = "" if data.time_unit == "1" else data.time_unit
+            when = f"t = {size(float(data.t[row]), unit)} of {data.label(int(data.trajectory[row]))}"
+            return (
+                f"{what}, the hardest at {when}, as by blows and end stops. Try what strikes as an input (--inputs), "
+                "or recordings that are cut there"
+            )
+    return ""
+
+
 def _kick(data: Trajectories, x: Tensor, owner: Tensor) -> int | None:
     """Row of the hardest kick, if the second derivative of x, (N, n), is kicks; else None."""
     for width in KICK_SAMPLES:
@@ -171,3 +200,55 @@ def _is_other(lacking: Tensor, noise: float, x: Tensor, row: Tensor) -> bool:
         return False
     differ = float((lacking[near] - lacking[other[near]]).square().mean()) / 2
     return differ > max(CLEAR * noise, noise + OTHER * (1 - noise))
+
+
+def left_by_the_past(
+    data: Trajectories,
+    y: Tensor,  # (K, n) force at some samples
+    x: Tensor,  # (K, m) state there
+    at: Tensor,  # (K,) rows of these samples
+) -> tuple[float, float, float]:
+    """Mean squares that remain, over the variance of y, of predictions from the state, alone, with past, with time."""
+    some = slice(None, None, -(-len(y) // MOST_PREDICTED))
+    since = data.t - data.t[list(data.offsets)][data.trajectory]
+    time = torch.stack([since, since.square()], 1)
+    parts = (y[some], x[some], signals(data)[at[some]], time[at[some]])
+    # Columns of mean 0 and variance 1; constant columns become 0.
+    y, x, z, time = ((part - part.mean(0)) / part.std(0, correction=0).clamp_min(1e-300) for part in parts)
+    apart = torch.cdist(x, x).square()
+    kernels = [torch.exp(-apart / (2 * width**2)) for width in WIDTHS]
+    others = (torch.ones_like(apart), *(1 + x @ x.T / x.shape[1] for x in (z, time)))
+    of_state, of_past, of_time = (min(_remains(k * other, y) for k in kernels) for other in others)
+    return of_state, of_past, of_time
+
+
+def signals(data: Trajectories) -> Tensor:
+    """The signals of the past at every sample, (N, m); each recording begins without a past."""
+    speeds = slopes(data, data.q)
+    spread = data.q.std(0, correction=0)
+    period = 2 * math.pi * float((spread / speeds.std(0, correction=0).clamp_min(1e-300)).max())
+    into = torch.cat([speeds, speeds.square(), data.q.square()], 1)
+    constants = period * into.new_tensor(FILTERS)[:, None]
+    widths = into.new_tensor(PLAYS)[:, None] * spread
+    first, found = set(data.offsets), []
+    for k in range(data.samples):
+        if k in first:
+            low, held = into.new_zeros(len(FILTERS), into.shape[1]), data.q[k].expand_as(widths)
+        else:
+            low = into[k] + (low - into[k]) * torch.exp(-(data.t[k] - data.t[k - 1]) / constants)
+            held = held.clamp(data.q[k] - widths, data.q[k] + widths)
+        found.append(torch.cat([low.flatten(), (data.q[k] - held).flatten()]))
+    return torch.stack(found)
+
+
+def _remains(kernel: Tensor, y: Tensor) -> float:
+    """Mean square of the errors of predictions of left-out blocks, with the best ridge; y has variance 1."""
+    blocks = torch.arange(len(y), device=y.device).tensor_split(PIECES)
+    folds = [torch.cat(blocks[k::FOLDS]) for k in range(FOLDS)]
+    found = []
+    for ridge in RIDGES:
+        inverse = torch.linalg.inv(kernel + ridge * torch.eye(len(y)).to(kernel))
+        weights = inverse @ y
+        errors = [torch.linalg.solve(inverse[fold][:, fold], weights[fold]) for fold in folds]
+        found.append(float(torch.cat(errors).square().mean()))
+    return min(found)

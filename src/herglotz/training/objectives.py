@@ -18,7 +18,7 @@ from herglotz.training.one_step_fit import NOISE_OF_R, best_restart, fit_one_ste
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import OneStep
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.smoothing_fit import fit_smoothing, weakest
+from herglotz.training.smoother import fit_smoothing, weakest
 from herglotz.training.task import Task, drag_starts_the_fit, with_sticking
 from herglotz.training.trajectory_fit import Chosen, fit_states, fit_trajectories
 
@@ -113,7 +113,7 @@ def fit_by_smoothing(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG
     if found is None:
         return _lost(task, model, "smoothing", sigma, "the model has no step near the data")
     problem = found.problem
-    problem.parameters.set(found.theta)
+    problem.parameters.set(problem.unpack(found.x)[0])
     notes = {"departure": weakest(task.config, model), "reason": found.result.reason, "process": problem.process,
              "robust": problem.freedom is not None, "follows_data": found.follows_data()}  # fmt: skip
     return Fitted(model, problem.states(found.x), "smoothing", problem.sigma, notes)

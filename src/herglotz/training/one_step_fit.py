@@ -9,9 +9,8 @@ from torch import Tensor
 from herglotz.data.windows import Triples
 from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
-from herglotz.training.problems.one_step import OneStep, ResidualProblem
+from herglotz.training.problems.one_step import OneStep, ResidualProblem, SupervisedProblem
 from herglotz.training.problems.prior import prior_of
-from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.solvers.adam import DECAY, adam
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.stages import Callback

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import cast
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -65,6 +65,13 @@ class ParameterVector:
         """`herglotz.mechanics.partials` of the model with parameters theta, for steps with inputs u (..., m)."""
         return cast(Partials, functional_call(self.model, self.unflatten(theta), (q0, q1, s0, h, order, u)))
 
+    def evaluated(
+        self, theta: Tensor, function: Callable[..., Any], *args: Any, buffers: Mapping[str, Tensor] | None = None
+    ) -> Any:
+        """function(model, *args) of the model with parameters theta, and with other values of some `buffers`."""
+        numbers = {f"model.{name}": x for name, x in (self.unflatten(theta) | dict(buffers or {})).items()}
+        return functional_call(_FunctionOf(self.model, function), numbers, args)
+
     def at(self, theta: Tensor, u: Tensor | None = None) -> FixedModel:
         """The discrete Lagrangian with parameters theta, for steps with inputs u."""
         return FixedModel(self, theta, u)
@@ -74,11 +81,29 @@ class ParameterVector:
         return torch.tensor([i for i, name in enumerate(self.numbers) if name.startswith(prefix)], dtype=torch.long)
 
 
-class FixedModel:
-    """A discrete Lagrangian with closed-form partials: the model at one parameter vector (and at inputs u)."""
+class _FunctionOf(nn.Module):
+    """A function of a `model` as a module, whose parameters and buffers `functional_call` reaches."""
 
-    def __init__(self, parameters: ParameterVector, theta: Tensor, u: Tensor | None = None):
-        self.parameters, self.theta, self.u = parameters, theta, u
+    def __init__(self, model: ContactLagrangian, function: Callable[..., Any]):
+        super().__init__()
+        self.model, self.function = model, function
+
+    def forward(self, *args: Any) -> Any:
+        """Its value."""
+        return self.function(self.model, *args)
+
+
+class FixedModel:
+    """A discrete Lagrangian with closed-form partials: the model at one parameter vector (and at inputs u).
+
+    `buffers` of the model may have other values; these count in `partials_increment` alone.
+    """
+
+    def __init__(
+        self, parameters: ParameterVector, theta: Tensor, u: Tensor | None = None,
+        buffers: Mapping[str, Tensor] | None = None,
+    ):  # fmt: skip
+        self.parameters, self.theta, self.u, self.buffers = parameters, theta, u, buffers
 
     @property
     def capabilities(self) -> Capabilities:
@@ -96,3 +121,8 @@ class FixedModel:
     def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
         """See `herglotz.mechanics.partials`."""
         return self.parameters.partials(self.theta, q0, q1, s0, h, order, self.u)
+
+    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
+        """See `ContactLagrangian.partials_increment`."""
+        function, args = ContactLagrangian.partials_increment, (q0, delta, s0, h, order, self.u)
+        return self.parameters.evaluated(self.theta, function, *args, buffers=self.buffers)

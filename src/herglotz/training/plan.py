@@ -29,17 +29,14 @@ class Plan:
 
     Parameters
     ----------
-    level, objective, order, features, drag, dissipation, absent, substeps, departures
-        As in `FitConfig`; the objective is residual, trajectory, smoothing or raw.
-    network
-        correction, covered (one wide layer), potential, plain or none.
+    level, objective, network, order, features, drag, dissipation, absent, substeps, departures
+        As in `FitConfig`; the objective is residual, trajectory, smoothing or raw, the network one of `build_model`.
     hold, delay, lag
         Inputs between samples (zero, first or smooth; "" without inputs); their delay and the time constant of the
         actuator, in the data's unit of time.
-    forces
-        Settings of masses and friction by name: coulomb, sticking, coupled, diagonal, alike.
-    start, fitted_before
-        Starting values of parameters by name; whether these and `sigma` come from an earlier fit of the same model.
+    forces, start, fitted_before
+        Settings of masses and friction (`FORCES`), and starting values of parameters, by name; whether these and
+        `sigma` come from an earlier fit of the same model.
     longest
         Recorded steps of the longest segments that the earlier fit followed; 0: whole trajectories.
     sigma
@@ -49,10 +46,8 @@ class Plan:
         noise, and the number of its random initialisations.
     turning
         True: angles turn. False: they are positions on a line, for example of a free spring.
-    spreads
-        Prior deviations of the waves of functions.
-    input_terms
-        Terms of the recorded inputs, which act beside the inputs.
+    spreads, input_terms
+        Prior deviations of the waves of functions; terms of the recorded inputs, which act beside the inputs.
     zeros, drifts
         Zeros of the sensors, B · n numbers, if recordings differ in them (empty: 0), and their drifts, n numbers, in
         units of q per unit of time since the start of a recording.

@@ -155,15 +155,7 @@ def predict(
         True: the sensors read 0 where the model's coordinates are 0. False: if recordings of the fit differ in their
         zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
 
-    Returns
-    -------
-    Prediction
-        `failed_steps` is above 0 if a free run fails.
-
-    Raises
-    ------
-    InputError
-        If the coordinates, units or inputs differ from those of the run, or a trajectory is too short.
+    Raise InputError if the coordinates, units or inputs differ from those of the run, or a trajectory is too short.
     """
     refuse({
         f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}":
@@ -313,7 +305,11 @@ def _started(
     """States over the warm-ups, and the zeros of smallest cost: a candidate, or the best one plus a correction."""
     ways = [_warmed_up(run, measured(data, zero), warmup) for zero in zeros]
     best = min(range(len(ways)), key=lambda i: ways[i][1])
-    if len(zeros) > 1 and any(own := _own_zeros(run, measured(data, zeros[best]), warmup)):
+    own: tuple[float, ...] = ()
+    if len(zeros) > 1:
+        parts = _warm_ups(measured(data, zeros[best]), warmup)[1]
+        own = zeros_of_one(run.model, parts, _sigma(run), run.h_range[1])
+    if any(own):
         both = tuple(a + b for a, b in zip(zeros[best] or (0.0,) * data.dof, own, strict=True))
         states, cost = _warmed_up(run, measured(data, both), warmup)
         # The correction has to lower the cost clearly: process noise can absorb a wrong zero within a warm-up.
@@ -347,11 +343,6 @@ def _warm_ups(data: Trajectories, warmup: int) -> tuple[Tensor, Trajectories]:
     return rows.reshape(-1, warmup), data.rows(rows, lengths)
 
 
-def _own_zeros(run: FittedRun, data: Trajectories, warmup: int) -> tuple[float, ...]:
-    """The correction of the zeros that the warm-ups suggest, (n,)."""
-    return zeros_of_one(run.model, _warm_ups(data, warmup)[1], _sigma(run), run.h_range[1])
-
-
 def _sigma(run: FittedRun) -> float:
     return run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
 
@@ -359,10 +350,12 @@ def _sigma(run: FittedRun) -> float:
 def _smoothed(run: FittedRun, data: Trajectories) -> tuple[Tensor, float] | None:
     """Smoothed states of warm-ups, (N, 2n+1), with the model fixed, and ½|r|²; None if a step near the data fails."""
     max_step = run.h_range[1]
-    # If the training data had outliers, new recordings may have outliers too.
-    freedom = FREEDOM if run.metrics.get("outliers") else None
-    grid, process = segment_grid(data, data.samples, max_step), process_noise(run.model, max_step)
-    # The noise is that of the fit: a coordinate that rests in a warm-up is measured no better for it.
-    settings: dict[str, Any] = {"sigma": _sigma(run), "freedom": freedom, "balance": run.data.balance.to(data.q)}
-    found = smoothed_states(problem := SmoothingProblem(run.model, data, grid, process=process, **settings))
+    # If the training data had outliers, new recordings may have outliers too. The noise is that of the fit: a
+    # coordinate that rests in a warm-up is measured no better for it.
+    problem = SmoothingProblem(
+        run.model, data, segment_grid(data, data.samples, max_step), process=process_noise(run.model, max_step),
+        sigma=_sigma(run), freedom=FREEDOM if run.metrics.get("outliers") else None,
+        balance=run.data.balance.to(data.q),
+    )  # fmt: skip
+    found = smoothed_states(problem)
     return None if found is None else (problem.states(found[0]), found[1])

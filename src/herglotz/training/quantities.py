@@ -62,7 +62,7 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
         whose = f" of {run.data.names[i]}" if len(values) == run.data.dof > 1 else ""
         # The first mass is 1 and no parameter.
         if name == "kinetic.log_diagonal":
-            words, whose = _mass(run, i + 1)
+            whose = _of_mass(run, i + 1)
         if name == INPUT_MAP and len(values) > 1:
             whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
         spread = float(std[name].reshape(-1)[i])
@@ -76,11 +76,11 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
     return found
 
 
-def _mass(run: Run, i: int) -> tuple[str, str]:
-    """C_ii² of m = C Cᵀ in words: the mass, or the effective mass while the coordinates before i are free."""
+def _of_mass(run: Run, i: int) -> str:
+    """Whose C_ii² of m = C Cᵀ is: the mass, or the effective mass while the coordinates before i are free."""
     names = run.data.names
     free = "" if run.model.config.diagonal else f" while {', '.join(names[:i])} {'is' if i == 1 else 'are'} free"
-    return WORDS["kinetic.log_diagonal"], f" of {names[i]}{free}, over that of {names[0]}"
+    return f" of {names[i]}{free}, over that of {names[0]}"
 
 
 def _unit(name: str, run: Run, i: int) -> str:

@@ -21,8 +21,7 @@ from herglotz.stepping.continuous_equation import ContinuousEquation, Fractional
 from herglotz.stepping.rollout import OneStepMethod
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
-from herglotz.training.equation import Equation, equation_of
-from herglotz.training.equation_notes import notes_of
+from herglotz.training.equation import Equation, equation_of, notes_of
 from herglotz.training.fitted_run import as_recorded
 from herglotz.training.motion import Motion, free_motion
 from herglotz.training.plan import Plan

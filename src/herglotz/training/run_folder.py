@@ -98,11 +98,8 @@ def save_run(run: Run, folder: str | Path) -> None:
     OSError
         If the folder cannot be written.
     """
-    refuse_own(
-        run.model,
-        "a run's folder",
-        "keep the module: torch.save(module.state_dict(), path), and export files of the run",
-    )
+    remedy = "keep the module: torch.save(module.state_dict(), path), and export files of the run"
+    refuse_own(run.model, "a run's folder", remedy)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = {
@@ -184,7 +181,6 @@ def load_run(folder: str | Path) -> Run:
         stored["history"], reading,
     )  # fmt: skip
     _check_sizes(run, stored["data_digest"], folder)
-    _check_metrics(run, folder / "metrics.json")
     return run
 
 
@@ -215,7 +211,7 @@ def _bound(folder: Path) -> dict[str, bytes]:
 
 
 def _check_sizes(run: Run, digest: str, folder: Path) -> None:
-    """Refuse states, lengths, box and data that do not fit together."""
+    """Refuse states, lengths, box, outlier samples, zeros of sensors and data that do not fit together."""
     N, n, path = run.data.samples, run.model.config.dof, folder / "model.pt"
     shapes = {"q": (N, n), "p": (N, n), "s": (N,)}
     bad = [name for name, x in run.states._asdict().items() if tuple(x.shape) != shapes[name]]
@@ -227,13 +223,10 @@ def _check_sizes(run: Run, digest: str, folder: Path) -> None:
     sizes = {f"{name}_{end}": 1 if name == "s" else n for name in "qps" for end in ("low", "high")}
     if {name: len(x) for name, x in run.box.items()} != sizes or not run.h > 0:
         raise InputError(f"{path}: box and h are not those of a model with dof {n}; {REMEDY}")
-
-
-def _check_metrics(run: Run, path: Path) -> None:
-    """Refuse outlier samples, or zeros of sensors, that do not fit the data."""
     outliers, zeros = run.metrics.get("outlier_samples", ()), run.metrics.get("plan", {}).get("zeros", ())
-    if not all(0 <= k < run.data.samples for k in outliers) or len(zeros) not in (0, len(run.data) * run.data.dof):
-        raise InputError(f"{path}: outlier_samples or the plan's zeros are not those of the run's data; {REMEDY}")
+    if not all(0 <= k < N for k in outliers) or len(zeros) not in (0, len(run.data) * n):
+        what = "outlier_samples or the plan's zeros are not those of the run's data"
+        raise InputError(f"{folder / 'metrics.json'}: {what}; {REMEDY}")
 
 
 def _log(history: list[dict[str, Any]]) -> bytes:

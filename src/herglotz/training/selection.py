@@ -192,8 +192,11 @@ def select(
         settings = replace(config, level=level, seed=seed)
         run = fit(data, settings, out=folder, progress=progress, resume=resume)
         if not silent:
-            done = len(candidates) * seeds + seed - config.seed + 1
-            _tell(run, done, len(ladder) * seeds, time.monotonic() - began)
+            done, rms = len(candidates) * seeds + seed - config.seed + 1, run.metrics.get("extrapolation_rms")
+            left = (time.monotonic() - began) / done * (len(ladder) * seeds - done)
+            error = "fails" if rms is None else f"{rms:.3g}"
+            text = f"fit {done} of {len(ladder) * seeds}: {run.decided.level}, seed {seed}: held-out RMS {error}"
+            tell(f"{text}; about {left:.0f} s left")
         return replace(run, reading=reading_told(reading, data.names))
 
     for level in ladder:
@@ -203,14 +206,6 @@ def select(
         errors = torch.stack([block_errors(run) for run in runs])
         candidates.append(Candidate(level, tuple(runs), errors, step_cost(runs[0])))
     return Selection(tuple(candidates), _simplest(candidates))
-
-
-def _tell(run: Run, done: int, total: int, took: float) -> None:
-    """Print one line on stderr after a fit, with the expected time of the remaining fits."""
-    rms, left = run.metrics.get("extrapolation_rms"), took / done * (total - done)
-    error = "fails" if rms is None else f"{rms:.3g}"
-    text = f"fit {done} of {total}: {run.decided.level}, seed {run.config.seed}: held-out RMS {error}"
-    tell(f"{text}; about {left:.0f} s left")
 
 
 def check_levels(levels: Sequence[str] | None) -> None:

@@ -1,9 +1,14 @@
-"""Named stages of a fit: progress, history, and a checkpoint from which an interrupted fit continues."""
+"""Named stages of a fit: progress, history, and a checkpoint from which an interrupted fit continues.
+
+TensorBoard's log (extra: `herglotz[tensorboard]`) has the same costs as history.csv.
+"""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from io import BytesIO
@@ -26,6 +31,8 @@ REMEDY = "delete it and fit from the start"
 Progress = bool | Literal["lines", "iterations"] | None
 # Iterations between two checkpoints inside a stage.
 ITERATIONS_PER_CHECKPOINT = 25
+# Seconds after which TensorBoard can read what was logged.
+SECONDS = 5
 
 
 class _Stored(TypedDict):
@@ -39,22 +46,10 @@ class _Stored(TypedDict):
 
 @dataclass
 class Callback:
-    """The callback of an optimiser: shows progress and stores the state of the optimiser in the checkpoint.
+    """The callback of an optimiser: shows progress in `bar`, and lets `store` write the state to the checkpoint.
 
-    Parameters
-    ----------
-    bar
-        The progress bar.
-    store
-        Writes the state of the optimiser to the checkpoint.
-    resumed
-        The state to continue from, or None.
-    named
-        First words of a line on stderr after each iteration; no lines if empty.
-    log
-        Called with each iteration and its cost.
-    start
-        The first cost.
+    `resumed` is the state to continue from, or None. `named` are the first words of a line on stderr after each
+    iteration; no lines if empty. `log` is called with each iteration and its cost; `start` is the first cost.
     """
 
     bar: Any
@@ -85,24 +80,8 @@ class Stages:
     is not run again, and an unfinished stage continues from the stored state of its optimiser and problem. A resumed
     fit gives the same bits as a fit without interruption.
 
-    Parameters
-    ----------
-    progress
-        True: one bar over all stages and searches. None: a bar on a terminal only. "lines": a line on stderr after
-        each stage. "iterations": also after each iteration.
-    checkpoint
-        File to write.
-    key
-        Identifies data and settings; the checkpoint of another fit is refused.
-    resume
-        Read the checkpoint if it exists.
-    log
-        TensorBoard's writer, which gets the cost of each iteration.
-
-    Raises
-    ------
-    InputError
-        If the checkpoint belongs to another fit or cannot be read.
+    `progress` is that of `fit`, `checkpoint` the file to write, which `resume` reads if it exists. `key` identifies
+    data and settings: the checkpoint of another fit is an InputError. `log` is TensorBoard's writer.
     """
 
     def __init__(
@@ -189,8 +168,7 @@ class Stages:
             result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else "", add))
             if self.lines:
                 count, seconds = result.iterations, time.monotonic() - began
-                took = f"{count} iteration{'' if count == 1 else 's'}, {seconds:.1f} s"
-                tell(f"{name}: {took}")
+                tell(f"{name}: {count} iteration{'' if count == 1 else 's'}, {seconds:.1f} s")
             self.done[name] = {**vars(result), "x": result.x.detach().cpu(), "done": True}
             self._write()
         start = len(self.history)
@@ -214,3 +192,29 @@ def _read(checkpoint: Path) -> dict[str, Any]:
         raise InputError(f"{checkpoint}: cannot be read ({type(error).__name__}); {REMEDY}") from None
     check_entries(_Stored, stored, str(checkpoint), REMEDY)
     return stored
+
+
+@contextmanager
+def tensorboard_log(folder: str | Path | None) -> Iterator[Any]:
+    """TensorBoard's writer into this folder, which it shows while the fit runs; None without a folder.
+
+    Raise InputError if TensorBoard is not installed.
+    """
+    if folder is None:
+        yield None
+        return
+    try:
+        from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPrivateImportUsage]
+    except ImportError:
+        raise InputError("a log for TensorBoard needs it: pip install 'herglotz[tensorboard]'") from None
+    with SummaryWriter(str(folder), flush_secs=SECONDS) as writer:
+        yield writer
+
+
+def log_result(writer: Any, metrics: dict[str, Any], words: dict[str, str]) -> None:
+    """What the fit reached: its numbers, and texts by name."""
+    for name, value in metrics.items():
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+            writer.add_scalar(f"metrics/{name}", value, 0)
+    for name, text in words.items():
+        writer.add_text(name, f"```\n{text}\n```")

@@ -70,11 +70,6 @@ class TrajectoryFit:
         """Samples in use, (N,) bool; None for all."""
         return None if bool(self.problem.used.all()) else self.problem.used
 
-    def loses(self, plain: TrajectoryFit) -> bool:
-        """True if this robust fit gives up samples that `plain`, by least squares, follows: these are no outliers."""
-        own, its = (float(fit.misfit.square().mean().sqrt()) for fit in (self, plain))
-        return own > NOT_THE_NOISE * its
-
     def states(self) -> Tensor:
         """The fitted trajectory at the samples, (N, 2n+1)."""
         return self.problem.grid.at_samples(self.path.x)
@@ -328,7 +323,10 @@ def _longest(
     first = stages.robust_or_not(first, known=known)
     skips_growth = known or model.potential.network is None
     last = (stages.whole(first, sigma if known else 0.0) if skips_growth else None) or stages.grow(first, sigma)
-    return (stages, last) if plain is None or not last.loses(plain) else (known_stages, plain)
+    if plain is None:
+        return stages, last
+    own, its = (float(fit.misfit.square().mean().sqrt()) for fit in (last, plain))
+    return (stages, last) if own <= NOT_THE_NOISE * its else (known_stages, plain)
 
 
 def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:

@@ -24,7 +24,7 @@ from herglotz.threads import one_thread
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
-from herglotz.training.equation_numbers import Joint
+from herglotz.training.equation_words import Joint
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
@@ -62,16 +62,19 @@ class Bands:
 
     def interval(self, level: float = 0.9, *, measured: bool = True) -> tuple[Tensor, Tensor]:
         """Lower and upper end of the central interval of a measured value, or of the true position, (N, n) each."""
-        if not 0 < level < 1:
-            raise InputError(f"level must be between 0 and 1, got {level:g}; 0.9 is usual")
-        width = NormalDist().inv_cdf(0.5 + level / 2)
-        std = (self.std.square() + self.sigma**2).sqrt() if measured else self.std
-        return self.q - width * std, self.q + width * std
+        width = quantile(level) * ((self.std.square() + self.sigma**2).sqrt() if measured else self.std)
+        return self.q - width, self.q + width
 
     def inside(self, q: Tensor, level: float = 0.9) -> Tensor:
         """Which measured positions q, (N, n), lie inside their interval; bool (N, n)."""
         low, high = self.interval(level)
         return (q >= low) & (q <= high)
+
+
+def quantile(level: float) -> float:
+    """Half the width of the central interval of this probability, in standard deviations of a normal distribution."""
+    refuse({f"level must be between 0 and 1, got {level:g}; 0.9 is usual": not 0 < level < 1})
+    return NormalDist().inv_cdf(0.5 + level / 2)
 
 
 class Laplace:
@@ -110,9 +113,8 @@ class Laplace:
 
         First order in the unknowns: dq_k = Z_k d(θ, start), with Z through every implicit step.
         """
-        data, P, d = self.run.data.unwrapped(), len(self.theta), self.problem.d
-        own = [torch.cat([torch.arange(P), torch.arange(P + b * d, P + (b + 1) * d)]) for b in range(len(data))]
-        return self._bands(data, self.path.x[:, 0], [self.covariance[i[:, None], i[None, :]] for i in own])
+        data, own = self.run.data.unwrapped(), map(self.problem.places, range(len(self.run.data)))
+        return self._bands(data, self.path.x[:, 0], [self.covariance[i[:, None], i] for i in own])
 
     def predict(self, data: Trajectories, seen: int) -> Bands:
         """Bands of new trajectories: their first `seen` samples give the start states, a free run the rest.

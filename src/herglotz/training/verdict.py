@@ -150,17 +150,9 @@ def judged(
     held_out = seen.unseen is not None and bool(seen.unseen.complete.any())
     unseen = unseen_window_errors(task, fitted, cast(Trajectories, seen.unseen)) if held_out else None
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)
-    scaled = replace(kept, q=kept.q / unit)
     if unseen is not None and free is not None and _rms(unseen / unit) > _rms(free / unit):
         unseen = free
-    in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
-    spread = _rms(scaled.q - scaled.q.mean(0))
-    named, in_degrees = (common_unit(kept.units), bool(kept.degrees)) if kept.dof == 1 else (None, False)
-    rough = (precisions(scaled) > HALF).tolist() if kept.dof > 1 else [True]
-    names = () if all(rough) else tuple(name for name, own in zip(kept.names, rough, strict=True) if own)
-    errors = Errors(
-        _rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees, int(out.sum()), names
-    )
+    errors = _errors(kept, unit, (windows, unseen, free), int(out.sum()))
     ahead = foresee(task, fitted, seen, everywhere)
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)
@@ -172,6 +164,18 @@ def judged(
     caveat = caveat_of_inputs(model, train, states)
     beyond = partial(unseen_outlier, seen, everywhere)
     return {"verdict": in_words(errors, ahead, metrics, shown, words, caveat, beyond)} | kept_numbers
+
+
+def _errors(kept: Trajectories, unit: Tensor, missed: tuple[Tensor, Tensor | None, Tensor | None], out: int) -> Errors:
+    """The errors of windows, unseen windows and the free run as RMS, over `unit` (n,); `out` samples were left out."""
+    scaled = replace(kept, q=kept.q / unit)
+    windows, unseen, free = (None if x is None else _rms(x / unit) for x in missed)
+    named, in_degrees = (common_unit(kept.units), bool(kept.degrees)) if kept.dof == 1 else (None, False)
+    rough = (precisions(scaled) > HALF).tolist() if kept.dof > 1 else [True]
+    names = () if all(rough) else tuple(name for name, own in zip(kept.names, rough, strict=True) if own)
+    assert windows is not None
+    spread = _rms(scaled.q - scaled.q.mean(0))
+    return Errors(windows, unseen, free, precision(scaled), spread, named, in_degrees, out, names)
 
 
 def unseen_outlier(seen: Look, everywhere: Tensor) -> str:
@@ -253,14 +257,17 @@ def in_words(
         return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    said = f"{_fits(errors)}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors)
-    return ". ".join(filter(None, (said, shown(True) if missed else caveat)))
+    return ". ".join(filter(None, (f"{_fits(errors)}: {errors}", shown(True) if missed else caveat)))
 
 
 def _fits(errors: Errors) -> str:
-    """That the errors are at the limit, which is the share of the spread in place of the noise if that is said."""
-    beyond = math.isfinite(errors.noise) and errors.worst > AT_THE_NOISE * errors.noise
-    return f"{FITS}, or to {EXACT_ENOUGH:g} of the spread" if beyond else FITS
+    """How well a model fits that follows the motion: to the noise, or to what replaces the noise, or worse."""
+    known = math.isfinite(errors.noise)
+    if errors.worst <= AT_THE_NOISE * errors.limit:
+        beyond = known and errors.worst > AT_THE_NOISE * errors.noise
+        return f"{FITS}, or to {EXACT_ENOUGH:g} of the spread" if beyond else FITS
+    stands = "" if known else ", for which its misfit of the training data stands,"
+    return f"{WORSE}{stands} by a factor of {errors.worst / errors.limit:.2g}"
 
 
 def _unseen_motion(errors: Errors) -> str:
@@ -270,12 +277,6 @@ def _unseen_motion(errors: Errors) -> str:
     names, verb = ",".join(errors.rough), "moves" if len(errors.rough) == 1 else "move"
     what, flag = f"{names} {verb} from sample to sample as no mass does; {errors}", shlex.quote(names)
     return f"{what}. Try --inputs {flag} where the others follow what is commanded, else --drop {flag}"
-
-
-def _worse(errors: Errors) -> str:
-    """The verdict of a model that fits with an error above the noise, or above the misfit that replaces the noise."""
-    known = "" if math.isfinite(errors.noise) else ", for which its misfit of the training data stands,"
-    return f"{WORSE}{known} by a factor of {errors.worst / errors.limit:.2g}: {errors}"
 
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[..., str]) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from printed_motion import Printed, integrated
 
-from herglotz.training.equation_notes import free_run, longest_step
+from herglotz.training.equation import free_run, longest_step
 
 
 def compared(run, text=None, parts=8):

@@ -15,7 +15,7 @@ from herglotz.models import ContactLagrangian, ModelConfig, numbers_of
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.equation import equation_of
-from herglotz.training.equation_numbers import Joint
+from herglotz.training.equation_words import Joint
 from herglotz.training.foresight import _with_absent_terms
 from herglotz.training.named_terms import NamedTerms, settings_of
 from herglotz.training.parameter_vector import ParameterVector

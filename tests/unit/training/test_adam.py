@@ -11,7 +11,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Prior, ResidualProblem, adam, fit
-from herglotz.training.problems.supervised import SupervisedProblem
+from herglotz.training.problems.one_step import SupervisedProblem
 
 
 class Line:

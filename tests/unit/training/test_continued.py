@@ -7,6 +7,7 @@ from herglotz.data import simulate
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
+from herglotz.training import free_run
 from herglotz.training.cross_validation import _left_out
 from herglotz.training.free_run import continued
 from herglotz.training.problems.grid import segment_grid
@@ -46,6 +47,20 @@ def test_a_run_that_fails_leaves_the_others_alone():
     x = continued(model, start, h, None)
     assert bool(x[1, -1].isnan().all())
     torch.testing.assert_close(x[0], continued(model, start[:1], h[:1], None)[0], rtol=0, atol=1e-11)
+
+
+def test_a_lost_run_is_not_solved_again(monkeypatch):
+    # fails if blocks of steps hold a run that is lost: none of them converges, and the others go on step by step
+    model, sizes = ContactLagrangian(ModelConfig(potential_width=0, rate=0.1)), []
+    start, h = torch.tensor([[0.8, 0.3, 0.0]] * 2, dtype=torch.float64), torch.full((2, 20), 0.05, dtype=torch.float64)
+    h[1, 5:] = 1e200
+    own = free_run.solve_path
+    monkeypatch.setattr(free_run, "solve_path", lambda L, x, *rest: sizes.append(len(x)) or own(L, x, *rest))
+    x = continued(model, start, h, None)
+    assert sizes[0] == 2
+    assert sizes[-1] == 1
+    assert bool(x[1, -1].isnan().all())
+    assert bool(x[0].isfinite().all())
 
 
 @pytest.fixture

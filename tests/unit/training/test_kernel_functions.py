@@ -11,7 +11,7 @@ from herglotz.codegen.c_compiler import SOURCE, built
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.training.kernel import COMPILER_FLAGS, RUNTIME
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.joint_masses import JointMasses
+from herglotz.training.problems.shooting import JointMasses
 
 ONES = """#define hz_N 1
 #include <math.h>

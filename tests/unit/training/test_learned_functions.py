@@ -15,8 +15,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.plots import plot_learned
 from herglotz.training import Plan, fit, laplace, learned_functions
 from herglotz.training.cross_validation import FOLDS, data_rows, foretold_errors, held_out_errors
-from herglotz.training.function_posterior import FunctionPosterior, by_numbers, function_posterior
-from herglotz.training.learned_functions import _Lines
+from herglotz.training.learned_functions import FunctionPosterior, _Lines, by_numbers, function_posterior
 from herglotz.training.parameter_vector import ParameterVector
 
 INF = float("inf")

@@ -17,8 +17,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace
-from herglotz.training.equation import equation_of
-from herglotz.training.equation_notes import _is_lost, notes_of
+from herglotz.training.equation import _is_lost, equation_of, notes_of
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.recorded_range import box_of

@@ -14,8 +14,7 @@ from herglotz.errors import InputError
 from herglotz.progress import FIRST_TERMS, MORE_TERMS, STAGES, FitBar, ProgressBar, beat, inside, part
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
-from herglotz.training.stages import Progress, Stages
-from herglotz.training.tensorboard import log_result, tensorboard_log
+from herglotz.training.stages import Progress, Stages, log_result, tensorboard_log
 
 
 def optimise(x, callback):

@@ -222,7 +222,7 @@ def test_a_prediction_finds_zeros_that_no_recording_of_the_fit_had(planted, foun
 
 def test_zeros_of_its_own_are_taken_only_where_the_warm_up_suits_no_worse(monkeypatch):
     # fails if zeros that the states over the warm-up speak against are taken off
-    monkeypatch.setattr(predict_module, "_own_zeros", lambda *_: (1.0,))
+    monkeypatch.setattr(predict_module, "zeros_of_one", lambda *_: (1.0,))
     assert run().predict(pendulums(0.0, seed=7, recordings=1), warmup=60).zeros == ()
 
 

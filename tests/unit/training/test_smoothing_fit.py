@@ -13,7 +13,7 @@ from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, SmoothingProblem, fit
 from herglotz.training.cross_validation import left_out_errors, without_rows
 from herglotz.training.problems.grid import segment_grid
-from herglotz.training.smoothing_fit import ROUNDS
+from herglotz.training.smoother import ROUNDS
 
 NOISE = 0.01
 RTOL = 1e-10  # of the largest entry; differences and closed forms differ by 2e-14 to 3e-12 (AVX-512, AVX2, SSE)

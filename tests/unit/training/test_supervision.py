@@ -8,7 +8,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import reference_solve, scene
 from herglotz.training import FitConfig, Prior, fit
-from herglotz.training.problems.supervised import SupervisedProblem
+from herglotz.training.problems.one_step import SupervisedProblem
 from tests.compared import assert_gradient
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import functional_call, jacrev, vmap
+from torch.func import jacrev, vmap
 
 from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
@@ -87,8 +87,12 @@ class Prior:
         self.grid = unit[:, : len(low)] * (high - low) + low
         self.velocity = (2 * unit[:, len(low) :] - 1) * speed
         self.typical_rate = float((speed / low.new_tensor(model.config.scale)).min())
-        force = float(self._baseline_force().square().mean().sqrt())
-        self.force = force if force > 0 else 1.0
+        with torch.no_grad():
+            own, features = model.potential.baseline(self.grid, 1).gradient, model.potential.features
+            if features is not None and not bool(own.any()):
+                own = features(self.grid, 1).gradient
+        # RMS force of the baseline.
+        self.force = float(own.square().mean().sqrt()) or 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
         self.networks = self._index(*NETWORKS).to(self.start.device)
         with torch.no_grad():
@@ -142,14 +146,6 @@ class Prior:
     def _index(self, *prefixes: str) -> Tensor:
         return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
 
-    def _baseline_force(self) -> Tensor:
-        with torch.no_grad():
-            potential = self.parameters.model.potential
-            own = potential.baseline(self.grid, 1).gradient
-            if potential.features is None or bool(own.any()):
-                return own
-            return potential.features(self.grid, 1).gradient
-
     def _departed(self, theta: Tensor, q: Tensor, v: Tensor) -> Tensor:
         """The residuals of the networks' outputs at points of the grid, (k, ...)."""
         parts = self._departures(theta, q, v)
@@ -157,8 +153,7 @@ class Prior:
 
     def _departures(self, theta: Tensor, q: Tensor, v: Tensor) -> list[Tensor]:
         """Network outputs, each relative to its natural size: forces (n, ...) and rates (1, ...)."""
-        named = {f"model.{name}": value for name, value in self.parameters.unflatten(theta).items()}
-        force, rate = functional_call(_Departures(self.parameters.model), named, (q, v))
+        force, rate = self.parameters.evaluated(theta, _departures, q, v)
         parts = [] if force is None else [force / self.force]
         return parts if rate is None else [*parts, rate[None] / self.typical_rate]
 
@@ -176,16 +171,8 @@ def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) 
     )
 
 
-class _Departures(torch.nn.Module):
-    """Force of the potential's network and rate of the damping's, as a module so that functional_call reaches them."""
-
-    def __init__(self, model: ContactLagrangian):
-        super().__init__()
-        self.model = model
-
-    def forward(self, q: Tensor, v: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        jet = self.model.potential.departure(coordinates(q, 1))
-        force = None if jet is None else jet.gradient
-        damping = self.model.damping
-        rate = damping.departure(q, v) if isinstance(damping, AffineDamping) else None
-        return force, rate
+def _departures(model: ContactLagrangian, q: Tensor, v: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Force of the potential's network, and rate of the damping's."""
+    jet, damping = model.potential.departure(coordinates(q, 1)), model.damping
+    rate = damping.departure(q, v) if isinstance(damping, AffineDamping) else None
+    return None if jet is None else jet.gradient, rate

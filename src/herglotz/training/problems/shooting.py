@@ -22,6 +22,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.noise import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
+from herglotz.models.terms import FeatureKinetic, PositionKinetic
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.arrowhead import Arrowhead, Sums, eliminated
 from herglotz.training.distributed import everywhere, world
@@ -29,7 +30,6 @@ from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid, between_nodes, between_samples
-from herglotz.training.problems.joint_masses import JointMasses
 from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.problems.prior import Gaussian
 from herglotz.training.solvers.lifted_newton import (
@@ -45,6 +45,51 @@ from herglotz.training.solvers.lifted_newton import (
 START_SAMPLES = 3
 # Largest σ over the noise: a start state that is known so well does not move.
 MAX_PRECISION_RATIO = 1e3
+# Samples over which the mass of a joint is averaged.
+MASS_SAMPLES = 8
+
+
+class JointMasses:
+    """The masses that momenta at joints are divided by: of the mass matrix, over a few of the positions q (N, n)."""
+
+    def __init__(self, parameters: ParameterVector, q: Tensor):
+        self.parameters = parameters
+        self.q = q[torch.linspace(0, len(q) - 1, MASS_SAMPLES, device=q.device).round().long()]
+        self._made: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def move(self) -> bool:
+        """Whether the masses depend on the parameters; the mass of the first coordinate is 1."""
+        return self.q.shape[1] > 1 and self.parameters.model.config.baseline
+
+    def at(self, theta: Tensor) -> Tensor:
+        """At θ, (n,), positive."""
+        return self._graph(theta)[1].detach()
+
+    def slopes(self, theta: Tensor) -> Tensor:
+        """∂ log mass / ∂θ, (n, P)."""
+        own, mass = self._graph(theta)
+        if not mass.requires_grad:
+            return theta.new_zeros(len(mass), len(theta))
+        rows = (torch.autograd.grad(x, own, retain_graph=True)[0] for x in mass)
+        return torch.stack(list(rows)) / mass.detach()[:, None]
+
+    def _graph(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """θ and the masses, as autograd remembers them; made once for a θ, which a fit asks for again."""
+        if self._made is None or not torch.equal(self._made[0], theta):
+            with torch.enable_grad():
+                theta = theta.detach().clone().requires_grad_()
+                mass = self.parameters.evaluated(theta, lambda model: _mass(model.kinetic, self.q))
+                mass = mass.diagonal(0, -2, -1).abs().mean(0).clamp_min(torch.finfo(theta.dtype).tiny ** 0.5)
+            self._made = theta, mass
+        return self._made
+
+
+def _mass(kinetic: Any, q: Tensor) -> Tensor:
+    """The mass matrix of a kinetic term at positions (k, n), (k, n, n)."""
+    if isinstance(kinetic, FeatureKinetic):
+        return _mass(kinetic.base, q) + kinetic.mass(q)
+    return kinetic.mass(q) if isinstance(kinetic, PositionKinetic) else kinetic.mass().expand(len(q), -1, -1)
 
 
 class ShootingProblem(StatesProblem):
@@ -150,6 +195,10 @@ class ShootingProblem(StatesProblem):
     def unknowns(self, theta: Tensor, path: Path) -> Tensor:
         """Flat unknowns from parameters (P,) and the states in which the segments of a path start."""
         return self.pack(theta, path.x[:, 0, : self.d])
+
+    def places(self, segment: int) -> Tensor:
+        """Places of the parameters and of the start state of a segment among the unknowns, (P + d,)."""
+        return torch.cat([torch.arange(self.P), self.P + torch.arange(segment * self.d, (segment + 1) * self.d)])
 
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Inverse of `pack`."""

@@ -59,18 +59,15 @@ class SmoothingProblem(StatesProblem):
 
     def start(self) -> Tensor:
         """Positions on straight lines between samples, momenta by FL⁻, s = 0; (P + S·M·d,) with the parameters."""
-        theta, grid, n = self.parameters.get(), self.grid, self.n
+        theta, grid, n, t, q = self.parameters.get(), self.grid, self.n, self.data.t, self.data.q
         S, K = grid.h.shape
-        x = self.data.q.new_zeros(S, K + 1, self.d)
-        for b in range(S):
-            rows = (grid.segment == b).nonzero()[:, 0]
-            node = grid.node[rows] - b * (K + 1)
-            t = torch.cat([grid.h.new_zeros(1), grid.h[b].cumsum(0)])
-            every = torch.arange(K + 1, device=node.device).clamp_max(int(grid.end[b]))
-            right = torch.searchsorted(node, every).clamp(1, len(node) - 1)
-            here, there = node[right - 1], node[right]
-            share = ((t[every] - t[here]) / (t[there] - t[here]))[:, None]
-            x[b, :, :n] = self.data.q[rows[right - 1]] * (1 - share) + self.data.q[rows[right]] * share
+        # The share of its recorded step at which each model step begins; the padding rests at the last sample.
+        share = (grid.part - grid.h / (2 * (t[grid.row + 1] - t[grid.row])))[..., None]
+        inside = torch.arange(K, device=q.device) < grid.end[:, None]
+        last = q[grid.row[:, -1:] + 1]
+        x = q.new_zeros(S, K + 1, self.d)
+        x[:, :-1, :n] = torch.where(inside[..., None], q[grid.row] * (1 - share) + q[grid.row + 1] * share, last)
+        x[:, -1:, :n] = last
         with torch.no_grad():
             _, p, _ = legendre_minus(self.parameters.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
         # The last nodes and the padding have the momentum of the last step.

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from herglotz.progress import beat
+from herglotz.training.arrowhead import Arrowhead
 from herglotz.training.distributed import everywhere, of_first
 
 # A smaller relative change of the cost is the rounding of a long sum.
@@ -21,45 +22,29 @@ GROWTH = 2.0
 NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
 
 
-class ByProducts(Protocol):
-    """A matrix JᵀJ with a structure of its own, which its products and its solver use."""
-
-    def __matmul__(self, v: Tensor, /) -> Tensor:
-        """JᵀJ v."""
-        ...
-
-    def diagonal(self) -> Tensor:
-        """Its diagonal, or an estimate of it."""
-        ...
-
-    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """(JᵀJ + diag(damping))⁻¹ b, or None if there is no finite solution."""
-        ...
+# (½|r|², JᵀJ, Jᵀr)
+Equations = tuple[Tensor, Tensor | Arrowhead, Tensor]
 
 
 class SumOfSquares(Protocol):
-    """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, possibly in chunks.
+    """A sum of squares ½|r(x)|² (inf or NaN if x is not admissible), and its (½|r|², JᵀJ, Jᵀr), perhaps in chunks.
 
     A problem with an attribute `at_once` that is true computes the normal equations in little more time than the cost.
     """
 
-    def cost(self, x: Tensor) -> Tensor:
-        """½|r|², a scalar; inf or NaN if x is not admissible."""
-        ...
-
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, ByProducts, Tensor]:
-        """(½|r|², JᵀJ, Jᵀr) at x."""
-        ...
+    def cost(self, x: Tensor) -> Tensor: ...  # noqa: D102
+    def normal_equations(self, x: Tensor) -> Equations: ...  # noqa: D102
 
 
 class Progress(Protocol):
-    """Receives the state of an optimiser; `resumed` is that state from an interrupted run (None: start from x)."""
+    """Called after each iteration; `search()` gives the state of the search as plain values.
+
+    `resumed` is that state from an interrupted run (None: start from x).
+    """
 
     resumed: dict[str, Any] | None
 
-    def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]], /) -> None:
-        """Called after each iteration; `search()` gives the state of the search as plain values."""
-        ...
+    def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], Any], /) -> None: ...  # noqa: D102
 
 
 def memory_of(problem: Any) -> dict[str, Any]:
@@ -106,17 +91,6 @@ class _Search:
         """Why the search is over; None while it is not."""
         return "converged" if self.quiet >= patience else "no_descent" if self.damping > 1e12 else None
 
-    def ends(self, predicted: float, enough: float) -> bool:
-        """True if a Newton step predicts a decrease far below the tolerance `enough`."""
-        return self.damping <= NEWTON_DAMPING and 0 <= predicted < NEGLIGIBLE * enough
-
-    @classmethod
-    def gone_on(cls, x: Tensor, cost: float, scale: Tensor, damping: float, resumed: Any) -> _Search:
-        """The search at its start x, or where it was interrupted."""
-        if resumed is None:
-            return cls(x, cost, damping, scale.clone(), [cost])
-        return cls(**{**resumed["search"], "x": x, "scale": resumed["search"]["scale"].to(x)})
-
 
 def levenberg_marquardt(
     problem: SumOfSquares,
@@ -132,7 +106,7 @@ def levenberg_marquardt(
     """Minimise ½|r(x)|² from the start x, in at most `max_iterations` accepted and rejected steps.
 
     Each iteration solves (JᵀJ + λ D) δ = −Jᵀr with D the running maximum of diag JᵀJ (Marquardt's scaling, Moré's
-    monotone version) by Cholesky, or by conjugate gradients if JᵀJ is given by products; λ starts at `damping` and
+    monotone version) by Cholesky, or by eliminating the states of an `Arrowhead`; λ starts at `damping` and
     follows the ratio of actual to predicted decrease (Nielsen's rule).
 
     The search ends after `patience` accepted steps in a row that each lower the cost by less than `atol`, or `rtol`
@@ -147,16 +121,20 @@ def levenberg_marquardt(
     cost, A, b = _of_first(problem.normal_equations(x))
     if not bool(torch.isfinite(cost)):
         return OptimiserResult(x, float(cost), "not_finite", 0)
-    at = _Search.gone_on(x, float(cost), A.diagonal(), damping, resumed)
+    at = _Search(x, float(cost), damping, A.diagonal().clone(), [float(cost)])
+    if resumed is not None:
+        at = _Search(**{**resumed["search"], "x": x, "scale": resumed["search"]["scale"].to(x)})
     rounding = max(ROUNDING, 8 * torch.finfo(cost.dtype).eps)
     while at.iteration < max_iterations and at.over(patience) is None:
         at.iteration += 1
         beat()
-        step = _damped_step(A, b, at.damping * _floored(at.scale))
+        # Parameters without influence yet, behind a layer that starts at 0, get the largest scale.
+        floor = float(at.scale.max()) or 1.0
+        step = _damped_step(A, b, at.damping * torch.where(at.scale > 0, at.scale, floor))
         new, predicted, equations = math.inf, 0.0, None
         if step is not None:
             predicted = float(-(b @ step) - 0.5 * step @ (A @ step))
-            if at.ends(predicted, max(rtol * at.best, atol)):
+            if at.damping <= NEWTON_DAMPING and 0 <= predicted < NEGLIGIBLE * max(rtol * at.best, atol):
                 at.quiet = patience
                 break
             # Most steps are accepted, unless the step before was not.
@@ -184,28 +162,16 @@ def levenberg_marquardt(
     return OptimiserResult(at.x, at.best, reason, at.iteration, at.history, memory_of(problem))
 
 
-def _floored(scale: Tensor) -> Tensor:
-    """A positive scaling for parameters without influence yet (behind a layer that starts at 0).
-
-    All others keep their scaling, however small, because it has a unit.
-    """
-    largest = float(scale.max())
-    return torch.where(scale > 0, scale, largest if largest > 0 else 1.0)
-
-
-Equations = tuple[Tensor, "Tensor | ByProducts", Tensor]
-
-
 def _of_first(equations: Equations) -> Equations:
-    """The equations of the first process; a matrix given by products is the same in every process."""
+    """The equations of the first process; an `Arrowhead` is the same in every process."""
     cost, A, b = equations
     if isinstance(A, Tensor):
-        return cast(Equations, of_first(cost, A, b))
+        (A,) = of_first(A)
     cost, b = of_first(cost, b)
     return cost, A, b
 
 
-def _damped_step(A: Tensor | ByProducts, b: Tensor, diagonal: Tensor) -> Tensor | None:
+def _damped_step(A: Tensor | Arrowhead, b: Tensor, diagonal: Tensor) -> Tensor | None:
     if not isinstance(A, Tensor):
         step = A.solve(-b, diagonal)
         return step if everywhere(step is not None) else None
