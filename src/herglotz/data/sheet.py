@@ -127,7 +127,7 @@ def _grouped(sheet: Sheet, wanted: Wanted) -> tuple[Columns, np.ndarray, list[st
     _refuse_text(sheet, columns, [i for i in texts if i not in (group, *aside)])
     if not aside and group == columns.trajectory:
         return columns, values, notes
-    if group != columns.trajectory:
+    if group is not None and group != columns.trajectory:
         notes = [
             f"warning: {columns.names[group]} is taken for the {'name' if sheet.is_text(group) else 'number'} of the "
             "recording, but by its values alone: it changes wherever time starts anew, and nowhere else; if another "

@@ -226,10 +226,10 @@ def _wrapped(left: str, terms: Sequence[str]) -> list[str]:
     return [line.replace(TOGETHER, " ") for line in lines]
 
 
-def notes_of(run: FittedRun) -> tuple[str, ...]:
-    """The notes of a run; empty ones are left out."""
+def notes_of(run: FittedRun, printed: FittedRun | None = None) -> tuple[str, ...]:
+    """The notes of a run, whose equation has the numbers of `printed`, by default its own; empty ones are left out."""
     refuse_own(run.model, "the equation", "herglotz.theory.ContinuousEquation evaluates that of any L_d")
-    return tuple(filter(None, (_inputs(run), _sensors(run), _steps(run))))
+    return tuple(filter(None, (_inputs(run), _sensors(run), _steps(run, printed or run))))
 
 
 def _inputs(run: FittedRun) -> str:
@@ -266,13 +266,14 @@ def _sensors(run: FittedRun) -> str:
     return f"a coordinate is its reading {', '.join(found)}" if found else ""
 
 
-def _steps(run: FittedRun) -> str:
+def _steps(run: FittedRun, printed: FittedRun) -> str:
     """The model's step and rule, and the distance of the exact motion of the equation from the model's motion."""
     time, model = "" if run.data.time_unit == "1" else f" {run.data.time_unit}", run.model
     what = f"the model's steps are {run.h:.7g}{time}, its rule of order {model.config.order}"
-    found = departure(run)
+    found = departure(run, printed)
     if found is None:
         return what
+    what += "" if printed is run else ", and the equation has the numbers to which its own tend as steps get shorter"
     unit = common_unit(run.data.units)
     by = f"{size(found.moved, unit, bool(run.data.degrees))}, " if unit or run.data.dof == 1 else ""
     ratio = f"{found.moved / found.missed:.2g} times what it misses the data by"
@@ -301,20 +302,22 @@ class Departure(NamedTuple):
     missed: float
 
 
-def departure(run: FittedRun) -> Departure | None:
-    """Errors of free runs of all recordings; the exact motion is extrapolated from whole and halved steps.
+def departure(run: FittedRun, printed: FittedRun | None = None) -> Departure | None:
+    """Errors of free runs of all recordings; the equation has the numbers of `printed`, by default those of the run.
 
-    None if a run fails or leaves the world, the model fits the data exactly, or the equation is not the whole model.
+    The exact motion of the equation is extrapolated from whole and halved steps. None if a run fails or leaves the
+    world, the model fits the data exactly, or the equation is not the whole model.
     """
-    data = run.data.unwrapped()
+    data, printed = run.data.unwrapped(), printed or run
     if not is_formula(run.model) or _is_lost(run):
         return None
     longest = longest_step(run)
     try:
-        whole, halved = (free_run(run, max_step) for max_step in (longest, longest / 2))
+        whole, halved = (free_run(printed, max_step) for max_step in (longest, longest / 2))
+        own = whole if printed is run else free_run(run, longest)
     except InputError:
         return None
-    changes = whole - data.q, HALVED * (halved - whole)
+    changes = own - data.q, whole + HALVED * (halved - whole) - own
     missed, moved = (float((x / data.balance).square().mean().sqrt()) for x in changes)
     return Departure(moved, missed) if missed > 0 and math.isfinite(moved) and math.isfinite(missed) else None
 

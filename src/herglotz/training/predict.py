@@ -155,7 +155,15 @@ def predict(
         True: the sensors read 0 where the model's coordinates are 0. False: if recordings of the fit differ in their
         zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
 
-    Raise InputError if the coordinates, units or inputs differ from those of the run, or a trajectory is too short.
+    Returns
+    -------
+    Prediction
+        `failed_steps` is above 0 if a free run fails.
+
+    Raises
+    ------
+    InputError
+        If the coordinates, units or inputs differ from those of the run, or a trajectory is too short.
     """
     refuse({
         f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}":

@@ -24,6 +24,7 @@ from herglotz.threads import one_thread
 from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
+from herglotz.training.equation import HALVED
 from herglotz.training.equation_words import Joint
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
@@ -101,7 +102,8 @@ class Laplace:
         self.prior = prior_of(run.model, self.base, departure)
         self.problem, self.path = self._solved(train, run.states.joined[list(data.offsets)], ~out, guess=states)
         self.theta = self.problem.parameters.get()
-        A = dense(self.problem.normal_equations(self.problem.unknowns(self.theta, self.path))[1])
+        _, A, self._slope = self.problem.normal_equations(self.problem.unknowns(self.theta, self.path))
+        A = dense(A)
         errors = held_out_errors(self.problem, self.path, self.theta, A)
         self.inflation = inflation_of(errors, self.sigma)
         self.information = A.double()
@@ -157,6 +159,26 @@ class Laplace:
             variance = torch.cat([((z @ C) * z).sum(-1) for z, C in zip(Z, joint, strict=True)])
         q, std = whole.grid.at_samples(path.x[..., : whole.n]), variance.clamp_min(0).sqrt().to(data.q)
         return Bands(q, std, self.problem.deviations)
+
+    def of_short_steps(self) -> tuple[Tensor, Tensor] | None:
+        """Parameters (P,) and start states (B, d) to which those of the fit tend as its steps get shorter.
+
+        One Gauss–Newton step with halved steps, x ← x − A⁻¹ (b₂ − b), removes the change of the fit; by Richardson's
+        rule the limit is `HALVED` times as far. None if the model cannot be run with halved steps.
+        """
+        problem, x, d = self.problem, self.problem.unknowns(self.theta, self.path), self.problem.d
+        grid = segment_grid(problem.data, max(problem.data.lengths), self.base.model_step / 2)
+        other = ShootingProblem(
+            self.run.model, problem.data, grid, sigma=self.sigma, prior=self.prior, freedom=self.freedom,
+            used=problem.used,
+        )  # fmt: skip
+        other.guess_from(problem, self.path)
+        cost, _, slope = other.normal_equations(x)
+        if not bool(torch.isfinite(cost)):
+            return None
+        moved = x.double() - HALVED * (self.covariance / self.inflation**2 @ (slope - self._slope).double())
+        P = len(self.theta)
+        return (moved[:P].to(x), moved[P:].reshape(-1, d).to(x)) if bool(torch.isfinite(moved).all()) else None
 
     def standard_deviations(self) -> dict[str, Tensor]:
         """Standard deviation of every parameter, by name, in its own units."""

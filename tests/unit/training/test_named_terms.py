@@ -17,7 +17,7 @@ from herglotz.scenes import scene
 from herglotz.training import Plan, fit, laplace
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.equation_words import number
-from herglotz.training.fit import _joint
+from herglotz.training.fit import _joint, _of_short_steps
 from herglotz.training.named_terms import candidates
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
@@ -219,15 +219,12 @@ def test_a_planet_is_found_in_noise_with_its_rotation():
 
 def test_deviations_are_no_smaller_than_rounding(duffing):
     # fails if terms of exact data that rounding has made are told from 0: `1.7e-16 ± 2e-17 x²`
-    plan, least = Plan.from_dict(duffing.metrics["plan"]), 50 * duffing.metrics["sigma"]
-    posterior = laplace(duffing)
+    posterior, least = laplace(duffing), 50 * duffing.metrics["sigma"]
     by = 50 / posterior.inflation
-    for term, wide in zip(
-        duffing.equation().terms, equation_of(duffing, _joint(duffing, plan, least)).terms, strict=True
-    ):
+    for term, wide in zip(duffing.equation().terms, equation_of(duffing, _joint(posterior, least)).terms, strict=True):
         assert wide.deviation == pytest.approx(by * term.deviation)
         assert wide.alone == pytest.approx(50 * term.alone)
-    assert equation_of(duffing, _joint(duffing, plan, 0.0)).terms == duffing.equation().terms
+    assert equation_of(_of_short_steps(duffing, posterior), _joint(posterior, 0.0)).terms == duffing.equation().terms
 
 
 def test_lines_of_an_equation_break_between_terms():

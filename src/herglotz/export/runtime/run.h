@@ -26,7 +26,7 @@ static inline void FN_run(hz_state *states, long b, int count, const hz_job *job
       if (k > 0) h[w] = job->h[sample * job->h_sample + (k - 1) * job->h_step];
 #if hz_INPUTS
       u[w] = job->u && k > 0 ? job->u + sample * job->u_sample + (k - 1) * job->u_step : 0;
-      if (flags && !status[w] && hz_BAD_U(u[w])) status[w] = hz_DIVERGED;
+      if (!status[w] && hz_BAD_U(u[w])) status[w] = hz_DIVERGED;
 #endif
     }
     if (k > 0) FN_take(&x, &track, h, hz_WITH_U(u) status, left);
