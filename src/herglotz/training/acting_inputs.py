@@ -84,13 +84,16 @@ def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
 def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:
     """A model with these terms of the inputs among its offers.
 
-    The terms join a trial that is near the data, or else the simplest model over ever longer segments.
+    The terms join a trial that is near the data. Where that is not at the noise, they also join the simplest model over
+    ever longer segments: a motion that is sensitive to its forces tells of them over short segments alone.
     """
-    other = search.driven_by(terms)
+    other, near = search.driven_by(terms), None
     if trial.near and (same := other.again(beside(trial, len(input_columns(terms))))) is not None:
-        return other.settled(other.finer(same))
+        near = other.settled(other.finer(same))
+    if near is not None and near.at_the_noise:
+        return near
     fitter = other.fitter(Variant(search.order))
-    return other.climbed(fitter, fitter.simple, {})
+    return other.better(near, other.climbed(fitter, fitter.simple, {}))
 
 
 def _of_kind(search: Search, kind: str, terms: Sequence[str], trial: Trial) -> tuple[tuple[str, ...], Trial | None]:

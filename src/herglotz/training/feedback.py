@@ -26,6 +26,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.column_roles import is_recorded_effort, is_set_point
+from herglotz.data.input_terms import saturation
 from herglotz.data.noise import precisions
 from herglotz.data.splits import leading
 from herglotz.data.units import size
@@ -121,8 +122,11 @@ def caveat_of_inputs(model: ContactLagrangian, data: Trajectories, states: Tenso
 
 def acting_set_points(model: ContactLagrangian, data: Trajectories) -> list[str]:
     """Names of set points of a controller on which a force of the model depends."""
-    labels = list(data.input_labels)
-    return [labels[k][0] for k in acting_inputs(model) if is_set_point(*labels[k])]
+    labels, units = list(data.input_labels), dict(data.input_labels)
+    # A saturation has no unit: that of its input tells a commanded voltage from a set point.
+    of = {name: found[2] for name, _ in labels if (found := saturation(name))}
+    acting = (labels[k][0] for k in acting_inputs(model))
+    return [name for name in acting if is_set_point(name, units.get(of.get(name, name), ""))]
 
 
 def _through(names: list[str]) -> str:

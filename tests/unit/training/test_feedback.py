@@ -3,6 +3,8 @@
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -172,6 +174,14 @@ def test_the_verdict_says_what_the_inputs_leave():
     lost = in_words(Errors(0.01, 0.01, 2.0, noise=0.01, spread=1.0), ahead, good, unstable)
     assert lost.startswith("does not fit beyond the recording: ")
     assert lost.endswith("It is unstable. Try shorter ones")
+
+
+@pytest.mark.parametrize(("unit", "told"), [("V", []), ("rad", ["sat(cmd/3)"])])
+def test_a_commanded_voltage_that_saturates_is_no_set_point(unit, told):
+    # fails if the saturation, which has no unit, loses the unit of its input: a voltage was said to act by a controller
+    labels = (("cmd", unit), ("sat(cmd/3)", ""))
+    model = ContactLagrangian(ModelConfig(level="forced", inputs=2, input_map=(0.0, 2.0)))
+    assert acting_set_points(model, cast(Any, SimpleNamespace(input_labels=labels))) == told
 
 
 def held_at_a_set_point(starts, gain, rate, h, seed=0):

@@ -308,8 +308,8 @@ def test_a_motion_that_leaves_the_world_has_no_departure():
 
 
 def test_the_numbers_of_an_equation_are_those_of_short_steps():
-    # fails if the numbers of the model are printed, which a rule of order 2 with steps of 0.1 s needs: over 1600 samples
-    # its stiffness is 8 deviations too small; or if the notes do not say so
+    # fails if the own numbers of the model are printed, a rule of order 2 with steps of 0.1 s: its stiffness, say,
+    # is 8 deviations of 1600 samples too small; or if the notes do not say so
     run = fit(simulate(scene("damped_pendulum"), trajectories=4, steps=400, h=0.1, noise=0.003, seed=0), progress=False)
     found = {term.what: term for term in run.equation().terms}
     own = {term.what: term.value for term in equation_of(run).terms}
