@@ -19,6 +19,7 @@ from torch import Tensor
 from herglotz.stepping.block_tridiagonal import Blocks, eliminate
 from herglotz.training.distributed import everywhere, of_first
 from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.pruning import inverse_of
 
 # (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None if T is not positive definite
 Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
@@ -92,12 +93,12 @@ class Arrowhead:
     def covariance(self) -> Tensor | None:
         """The corner of the inverse, (P, P): the covariance of parameters; None if T is not positive.
 
-        What no residual determines has the variance 0.
+        What no residual determines has a very large variance (`inverse_of`).
         """
         P, (S, d) = len(self.corner), self.border.shape[:2]
         zero = self.border.new_zeros(P + S * d, dtype=torch.float64)
         found = self._reduced(zero.new_zeros(S, d, 0), zero)
-        return None if found is None else torch.linalg.pinv(found[0], hermitian=True)
+        return None if found is None else inverse_of(found[0])
 
 
 def eliminated(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
