@@ -128,12 +128,15 @@ def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
         if one.label:
             raise Unusable(f"{where}, column '{label}': {quote(one.label)} {has}; delete it or add rows")
         raise Unusable(f"{where}: the file {has}; add rows")
-    back = ~(np.diff(t) > 0)
+    d = np.diff(t)
+    # `without_repeats` mends repeated stamps wherever no stamp decreases.
+    back = d < 0 if (d < 0).any() else ~(d > 0)
     if back.any():
         k = int(back.argmax())
+        names, unit = [columns.names[i] for i in columns.numeric], columns.units[columns.time] or "s"
         raise Unusable(
             f"{path}, row {one.at[k + 1]}, column '{clock}': {float(t[k + 1])!r} does not increase on {float(t[k])!r} "
-            f"in row {one.at[k]}; {out_of_order(one.values, back, [columns.names[i] for i in columns.numeric])}"
+            f"in row {one.at[k]}; {out_of_order(one.values, back, names, int(one.at[k + 1]), unit, label)}"
         )
     return one
 
