@@ -113,7 +113,8 @@ def from_sheet(sheet: Sheet, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
         # The rows below.
         column = sheet.column
         sheet = replace(sheet, heads=named, at=sheet.at[1:], column=lambda i: column(i)[1:])
-    columns, values, notes = _grouped(sheet, replace(wanted, hold=wanted.hold or sheet.settings.get("hold", "")))
+    hold = wanted.hold or sheet.settings.get("hold") or wanted.known_hold
+    columns, values, notes = _grouped(sheet, replace(wanted, hold=hold))
     if since := _unit_since_1970(sheet, columns):
         columns = replace(columns, units=tuple(since if i == columns.time else x for i, x in enumerate(columns.units)))
     found = from_table(sheet.path, columns, sheet.at, _labels(sheet, columns, values), values)
