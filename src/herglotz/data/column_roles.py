@@ -326,7 +326,7 @@ def name_and_unit(cell: str) -> tuple[str, str] | None:
         if kind_of(unit) and _is_timed(name) == (kind_of(unit) == "time"):
             return name, unit
     if match[2] is not None or match[3] is not None:
-        return match[1], (match[2] or match[3]).strip()
+        return match[1], (match[2] or match[3] or "").strip()
     if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
         return tight[1], tight[2]
     name, unit = _split(match[1])

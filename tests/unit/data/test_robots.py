@@ -88,6 +88,7 @@ def test_a_bad_stamp_among_large_stamps(tmp_path):  # fails if a text has the me
         ("position[0],position[1]", [("position[0]", ""), ("position[1]", "")]),
         ("position[0],effort[1]", [("position[0]", ""), ("effort[1]", "")]),
         ("x[1],y[1]", [("x", "1"), ("y", "1")]),
+        ("x[],y ()", [("x", ""), ("y", "")]),
         ("position[0][rad],position[1][rad]", [("position[0]", "rad"), ("position[1]", "rad")]),
         ("position[0][1],p_position[0]", [("position[0]", "1"), ("p_position[0]", "")]),
         ("poses[0].position.x,data[0][1],data[0][0]", [("poses[0].position.x", ""), ("data[0][1]", ""),
@@ -95,7 +96,7 @@ def test_a_bad_stamp_among_large_stamps(tmp_path):  # fails if a text has the me
     ],
 )  # fmt: skip
 def test_a_number_in_brackets_belongs_to_the_name(cells, heads):
-    # fails if an index is a unit, the unit 1 is an index, or a name with an index has no unit
+    # fails if an index is a unit, the unit 1 is an index, a name with an index has no unit, or brackets are empty
     assert heads_of(cells.split(",")) == heads
 
 
