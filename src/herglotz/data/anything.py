@@ -111,7 +111,8 @@ def as_trajectories(
         found = as_meant(data, NO_HEADER, **meant) if changed else data
     elif h is None if hasattr(data, "columns") else isinstance(data, Mapping):
         # Named columns with their own time: a dict, or a DataFrame for which no step h is given.
-        wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
+        known: dict[str, Any] = {} if like is None else {"known": like.columns, "known_hold": like.hold}
+        wanted = Wanted(time, **names, **known, positions=named_by(polar))
         found = as_meant(_table(data, wanted), wanted, **meant)
         found = finished(found if like is None else angles_like(found, like), angles, *sensors)
         tell(found.table())

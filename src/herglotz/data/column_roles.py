@@ -13,6 +13,9 @@ A unit that ends a name without brackets is one of `KINDS`. It is none where it 
 * a length behind the name of an angle: theta_m is the angle of a motor;
 * a letter or a word (`AMBIGUOUS`) behind a name that says another role than the unit, as in `tau_m` and `x_A`, or
   beside a column of the same name with an index that is no unit: `joint_A` beside `joint_B`, `F_N` beside `F_T`.
+
+A whole number in square brackets is part of the name, as in `position[0]`, except for the unit 1 of `x[1]`; beside
+such a name, `x[1]` is a name, too.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ NUMBERED = r"(_?\d+|_.*)?"
 ROLES = {
     "time": re.compile(
         r"t|times?|timestamps?|date|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
-        r"|czas|čas|aika"
+        r"|czas|čas|aika|(.+[._/])?stamp"
     ),
     "trajectory": re.compile(
         r"(trajectory|trial|run|recording|experiment|episode|versuch|lauf|messreihe|essai|ensayo|prueba|prova)"
@@ -52,7 +55,7 @@ ROLES = {
     "action": re.compile(r"s"),
     "momentum": re.compile(r"p|p_.*"),
     # Left aside, as are rates: logged velocities are usually filtered, and counters of rows are no motion.
-    "counter": re.compile(r"index|row|sample|(sub[ _]?)?frame#?|step|dt|unnamed: \d+"),
+    "counter": re.compile(r"index|row|sample|(.+[._/])?seq|(sub[ _]?)?frame#?|step|dt|unnamed: \d+"),
     "input": re.compile(rf"u{NUMBERED}|F|f(\d+|[xyz]|_.*)|i_?[qd]"),
 }
 SYMBOL = r"(?:[qxyzr]|theta|phi|psi|alpha|beta|gamma|th|θ|φ|ϕ|ψ|α|β|pos|position|angle|joint|roll|pitch|yaw)"
@@ -117,6 +120,7 @@ class Guess(NamedTuple):
 
 def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     """The role of a column by its own name and unit; `others` are the names of all columns: dx is the rate of x."""
+    name, others = plainly(name), [plainly(other) for other in others]
     guess = _own_role(name, unit, others)
     copy = COPY.fullmatch(name.casefold()) if guess.role == "q" else None
     base = copy and (copy["before"] or copy["behind"])
@@ -203,8 +207,13 @@ def is_timed(words: frozenset[str]) -> bool:
 
 def is_usual(name: str, unit: str) -> bool:
     """Whether the unit or the name is usual for coordinates."""
-    usual = KNOWN.fullmatch(name.casefold()) or words_of(name) & WORDS["position"]
+    usual = KNOWN.fullmatch(plainly(name).casefold()) or words_of(name) & WORDS["position"]
     return kind_of(unit) == "position" or bool(usual)
+
+
+def plainly(name: str) -> str:
+    """A name with its numbers out of their brackets: q[0] has the role of q0."""
+    return re.sub(r"\[(\d+)\]", r"\1", name)
 
 
 def words_of(name: str) -> frozenset[str]:
@@ -283,7 +292,9 @@ def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str
     return bool(RATE.fullmatch(key) or words & WORDS["rate"])
 
 
-CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
+CELL = re.compile(r"((?:[^\[\]]|\[\d+\])+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
+# A name that ends with a whole number in brackets.
+ELEMENT = re.compile(r"(.+)\[(\d+)\]\s*")
 # A unit without a space before the bracket, if the bracket holds a known unit: x(1) is a name.
 TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
 # A quantity over its unit: t/s, phi / °, v/(m/s).
@@ -308,12 +319,14 @@ def name_and_unit(cell: str) -> tuple[str, str] | None:
     match = CELL.fullmatch(cell)
     if not match or not cell.isprintable():
         return None
+    if (element := ELEMENT.fullmatch(cell)) and element[2] != "1":
+        return cell.strip(), ""
     if slash := SLASH.fullmatch(cell):
         name, unit = slash[1], slash[2] or slash[3]
         if kind_of(unit) and _is_timed(name) == (kind_of(unit) == "time"):
             return name, unit
     if match[2] is not None or match[3] is not None:
-        return match[1], (match[2] or match[3]).strip()
+        return match[1], (match[2] or match[3] or "").strip()
     if (tight := TIGHT.fullmatch(match[1])) and kind_of(tight[2]):
         return tight[1], tight[2]
     name, unit = _split(match[1])
@@ -325,7 +338,11 @@ def heads_of(cells: Sequence[str], known: Collection[str] = ()) -> list[tuple[st
 
     Columns keep the names that they have in another table, whose names are `known`.
     """
-    heads = [name_and_unit(cell) for cell in cells]
+    elements = [ELEMENT.fullmatch(cell) for cell in cells]
+    numbered = {element[1] for element in elements if element and element[2] != "1"}
+    # position[0][1] is position[0] in the unit 1.
+    whole = [e and numbered and (e[1] in numbered or "[" not in e[1]) for e in elements]
+    heads = [(cell.strip(), "") if own else name_and_unit(cell) for cell, own in zip(cells, whole, strict=True)]
     names = [head[0] for head in heads if head]
     heads = [head and _in_table(cell, head, names, known) for cell, head in zip(cells, heads, strict=True)]
     count = Counter(head[0] for head in heads if head)

@@ -51,6 +51,8 @@ class Wanted:
         Further coordinates, unless `coordinates` names all.
     hold
         Hold of the inputs between samples, which overrules the file's; "": the file decides.
+    known_hold
+        Hold of the other table's inputs, where neither the user nor the file gives a hold.
     motion
         False if times and inputs suffice: an input then replaces a missing coordinate.
     """
@@ -63,6 +65,7 @@ class Wanted:
     known: tuple[tuple[str, str, str], ...] = ()
     positions: tuple[str, ...] = ()
     hold: str = ""
+    known_hold: str = ""
     motion: bool = True
 
     def role(self, name: str) -> str | None:

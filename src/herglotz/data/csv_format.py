@@ -182,7 +182,9 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
 
     **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time.
-    Times may be dates in ISO 8601, which become seconds since the first row. `trajectory`, `trial`, `run`,
+    So is the stamp of a message of ROS (`header.stamp`). Times may be dates in ISO 8601, which become seconds since the
+    first row. Stamps without a unit of about 1e12, 1e15 and 1e18 are ms, us and ns since 1970; above 2^53, stamps count
+    from the first row. A number in brackets belongs to the name: `position[0]`. `trajectory`, `trial`, `run`,
     `experiment`, `Versuch`, `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a
     warning, a column that changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or
     text. Beside it text, and numbers without a unit and a usual name, that are the same in every row are left aside.

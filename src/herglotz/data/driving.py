@@ -153,7 +153,10 @@ def input_recording(
     the acting inputs, by the file's own hold, delay and lag, or else by `default`. Raise InputError if the file holds
     no inputs, has no such trajectory, or counts time in another unit.
     """
-    found = path if isinstance(path, Trajectories) else load(path, known=tuple(map(tuple, known)), motion=False)
+    if isinstance(path, Trajectories):
+        found = path
+    else:
+        found = load(path, known=tuple(map(tuple, known)), known_hold=default.hold, motion=False)
     path = found.source or "recording"
     found = acting(found if found.u is None else with_input_terms(found, input_terms_of(known)), default)
     trajectory = 0 if len(found) == 1 else trajectory

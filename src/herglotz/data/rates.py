@@ -102,7 +102,7 @@ def completed(
         return aligned, tuple(notes), hold
     filled = [_filled(one, u, straight) for one in aligned]
     names = [columns.names[i] for k, i in enumerate(columns.u) if blank[:, u.start + k].any()]
-    notes.append(_fill_note(names, straight, max(longest for _, longest in filled), unit))
+    notes.append(_fill_note(names, hold, max(longest for _, longest in filled), unit))
     sample = ~blank[:, q].any(1)
     own_rate = 2 * int(blank[sample][:, u].any(1).sum()) > int(sample.sum())
     return [one for one, _ in filled], tuple(notes), hold or ("zero" if own_rate else "")
@@ -149,14 +149,14 @@ def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]
     return Recording(one.label, one.at, values), longest
 
 
-def _fill_note(names: Sequence[str], straight: bool, longest: float, unit: str) -> str:
-    """The note on inputs that have no value in some rows."""
+def _fill_note(names: Sequence[str], hold: str, longest: float, unit: str) -> str:
+    """The note on inputs that have no value in some rows; a stated hold needs no remedy."""
     some = f"{', '.join(names)} {'has' if len(names) == 1 else 'have'} no value in some rows"
-    if straight:
+    if hold in ("first", "smooth"):
         return f"{some}; straight lines go there from the row before to the row behind"
     size = f"{longest:.3g}" if unit == "1" else f"{longest:.3g} {unit}"
-    lines = "--hold first (hold= in Python) draws straight lines"
-    return f"warning: {some}: the last one is held, for up to {size}; {lines}"
+    remedy = "" if hold else "; a fit with --hold first (hold= in Python) draws straight lines"
+    return f"warning: {some}: the last one is held, for up to {size}{remedy}"
 
 
 def filled_inputs(data: Trajectories) -> list[str]:

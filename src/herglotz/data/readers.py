@@ -157,8 +157,8 @@ def load(
         Positions are scale · (reading − zero), both in the file's units: n numbers each, or n for each recording of the
         file, one recording after the other. The comments of the file act first.
     like
-        Another recording, such as `run.data`: columns of the same name have the same role, in the same order, and the
-        same coordinates are angles, unless another argument says otherwise.
+        Another recording, such as `run.data`: columns of the same name have the same role, in the same order, the same
+        coordinates are angles, and inputs have the same hold, unless another argument or the file says otherwise.
     **columns
         Of a table: time, coordinates, inputs, drop and group, each by column names; left out, the header decides.
         hold="zero", "first" or "smooth": the hold of the inputs between samples, which overrules the file's.
@@ -175,7 +175,7 @@ def load(
         If the format is not known (the message lists the known formats), or a coordinate that the user did not name
         moves in jumps alone; and as the reader of the format does.
     """
-    columns.setdefault("known", () if like is None else like.columns)
+    columns = ({} if like is None else {"known": like.columns, "known_hold": like.hold}) | columns
     wanted = Wanted(**columns, positions=named_by(polar))
     path = Path(path)
     found = _read_folder(path, wanted) if path.is_dir() else _read(path, wanted)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, time
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,11 @@ from herglotz.data.table import from_table
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import PER_SECOND, in_seconds
 from herglotz.errors import InputError, refuse
+
+# 3000 years: a time of so many counts is not in seconds.
+MAX_SECONDS = 1e11
+# Stamps in s since 1970 have ten digits from 2001 to 2286.
+DATES = (1e9, 1e10)
 
 
 @dataclass(frozen=True)
@@ -66,8 +72,11 @@ class Sheet:
         return len(set(self.cells(i))) == 1
 
     def numbers(self, columns: Columns) -> np.ndarray:
-        """The numeric columns of all rows, (N, columns.numeric), NaN for a missing value; dates become seconds."""
-        clock = seconds(self.column(columns.time), lambda k: f"{self.path}, row {self.at[k]}")
+        """The numeric columns of all rows, (N, columns.numeric), NaN for a missing value; dates become seconds.
+
+        Stamps above 2^53 count from the first stamp.
+        """
+        clock = less_first(seconds(self.column(columns.time), lambda k: f"{self.path}, row {self.at[k]}"))
         if len(self.at) > 1 and all(map(_is_text, clock[:2].tolist())):
             where = f"{self.path}, row {self.at[0]}, column '{columns.names[columns.time]}'"
             wrong = f"{quote(str(clock[0]))} is not a number; write numbers, or dates such as 2026-03-01 12:00:00.25"
@@ -104,8 +113,13 @@ def from_sheet(sheet: Sheet, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
         # The rows below.
         column = sheet.column
         sheet = replace(sheet, heads=named, at=sheet.at[1:], column=lambda i: column(i)[1:])
-    columns, values, notes = _grouped(sheet, replace(wanted, hold=wanted.hold or sheet.settings.get("hold", "")))
+    hold = wanted.hold or sheet.settings.get("hold") or wanted.known_hold
+    columns, values, notes = _grouped(sheet, replace(wanted, hold=hold))
+    if since := _unit_since_1970(sheet, columns):
+        columns = replace(columns, units=tuple(since if i == columns.time else x for i, x in enumerate(columns.units)))
     found = from_table(sheet.path, columns, sheet.at, _labels(sheet, columns, values), values)
+    if since:
+        found = _with_time_shown(found, f"taken for {since} since 1970")
     found = _with_settings(replace(found, notes=(*sheet.notes, *found.notes, *units, *notes)), sheet.settings)
     times = sheet.column(columns.time)
     if times.dtype.kind in "Mm" or (times.dtype.kind in "OU" and not is_number(str(times[0]))):
@@ -217,8 +231,13 @@ def _with_settings(found: Trajectories, settings: Mapping[str, Any]) -> Trajecto
 
 def in_dates(found: Trajectories, unit: str = "date") -> Trajectories:
     """The set with its times in s, as dates and durations are whatever the header says; `unit` joins the table."""
+    return replace(in_seconds(_with_time_shown(found, unit)), t=found.t, time_unit="s")
+
+
+def _with_time_shown(found: Trajectories, unit: str) -> Trajectories:
+    """The set whose table of columns has this unit for the time, unless it is ""."""
     roles = ((name, role, (unit or own) if role == "time" else own) for name, role, own in found.columns)
-    return replace(in_seconds(found), t=found.t, time_unit="s", columns=tuple(roles))
+    return replace(found, columns=tuple(roles))
 
 
 def with_units(cells: Sequence[str], below: Sequence[str], where: str, wanted: Wanted) -> list[str] | None:
@@ -298,6 +317,39 @@ def seconds(column: np.ndarray, place: Callable[[int], str]) -> np.ndarray:
             raise InputError(f"{place(k)}: {what}; write it in all")
         found[k] = column[k] if date is None else (date - first).total_seconds()
     return found
+
+
+def less_first(column: np.ndarray) -> np.ndarray:
+    """Stamps above 2^53, of which float64 would lose digits, less the first; other cells and columns unchanged."""
+    first = _decimal(column[0]) if len(column) else None
+    if first is None or abs(first) < EXACT:
+        return column
+    found = column.astype(object)
+    found[:] = [x if (stamp := _decimal(x)) is None else stamp - first for x in column.tolist()]
+    return found
+
+
+def _decimal(x: Any) -> Decimal | None:
+    """The finite number in a cell, with all its digits; None for any other cell."""
+    with suppress(InvalidOperation):
+        found = Decimal(text) if "_" not in (text := str(x)) else None
+        return found if found is not None and found.is_finite() else None
+
+
+def _unit_since_1970(sheet: Sheet, columns: Columns) -> str:
+    """The unit of stamps without a unit that count from 1970: ms, us or ns; "" for any other time.
+
+    Raise InputError for a time without a unit that is far too large for seconds, and is no such stamp.
+    """
+    last = next(filter(None, map(_decimal, sheet.column(columns.time)[-1:])), None)
+    if last is None or last <= MAX_SECONDS or columns.units[columns.time]:
+        return ""
+    for unit in ("ms", "us", "ns"):
+        if DATES[0] <= float(last) / PER_SECOND[unit] < DATES[1]:
+            return unit
+    name = columns.names[columns.time]
+    what = f"{name} of {float(last):.4g} without a unit is no time in s"
+    raise InputError(f"{sheet.path}: {what}; write its unit, {name}[ms], {name}[us] or {name}[ns]")
 
 
 def _date(x: Any) -> datetime | None:

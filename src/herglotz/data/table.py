@@ -17,8 +17,6 @@ from herglotz.data.rates import Recording, completed, in_order, without_repeats
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
 
-# 3000 years: a time of so many counts milliseconds, or smaller units, since 1970.
-MAX_SECONDS = 1e11
 Item = TypeVar("Item")
 Read = TypeVar("Read")
 
@@ -130,12 +128,15 @@ def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
         if one.label:
             raise Unusable(f"{where}, column '{label}': {quote(one.label)} {has}; delete it or add rows")
         raise Unusable(f"{where}: the file {has}; add rows")
-    back = ~(np.diff(t) > 0)
+    d = np.diff(t)
+    # `without_repeats` mends repeated stamps wherever no stamp decreases.
+    back = d < 0 if (d < 0).any() else ~(d > 0)
     if back.any():
         k = int(back.argmax())
+        names, unit = [columns.names[i] for i in columns.numeric], columns.units[columns.time] or "s"
         raise Unusable(
             f"{path}, row {one.at[k + 1]}, column '{clock}': {float(t[k + 1])!r} does not increase on {float(t[k])!r} "
-            f"in row {one.at[k]}; {out_of_order(one.values, back, [columns.names[i] for i in columns.numeric])}"
+            f"in row {one.at[k]}; {out_of_order(one.values, back, names, int(one.at[k + 1]), unit, label)}"
         )
     return one
 
@@ -159,11 +160,6 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording],
     lengths = tuple(len(one.values) for one in recordings)
     widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
     t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
-    name, last = columns.names[columns.time], float(t[-1, 0])
-    since_1970 = (
-        f"{path}: {name} of {last:.4g} without a unit is no time in s; write its unit, {name}[ms] or {name}[us]"
-    )
-    refuse({since_1970: last > MAX_SECONDS and not columns.units[columns.time]})
     units = tuple(columns.units[i] or "1" for i in columns.q)
     group = "" if columns.trajectory is None else columns.names[columns.trajectory]
     return Trajectories.of(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 from torch import Tensor
@@ -53,7 +54,9 @@ class FittedRun(Protocol):
 
 
 def as_recorded(run: FittedRun, data: Any, **reading: Any) -> Trajectories:
-    """Another recording, or a file of recordings, read as the data of the run were: columns, units, angles and sensors.
+    """Another recording, or a file of recordings, read as the data of the run were.
+
+    Columns, units, angles, sensors and, unless the file states its own, the hold of the inputs are those of the run.
 
     `reading` are options of `as_trajectories`, which come before those of the run. Trajectories are positions already,
     and take no zeros and scales of the run. Raise InputError if each recording of the run has a scale of its own.
@@ -67,4 +70,6 @@ def as_recorded(run: FittedRun, data: Any, **reading: Any) -> Trajectories:
         if told:
             tell(f"{what} are those of the run, {', '.join(f'{x:.6g}' for x in told)}; for others {remedy}")
         reading[name] = told
-    return as_trajectories(data, like=run.data, **reading)
+    # Means of steps are constant over a step, whatever the hold that the recording was read with.
+    hold = run.reading.get("hold") or run.arrival.hold
+    return as_trajectories(data, like=replace(run.data, hold=hold), **reading)

@@ -8,6 +8,7 @@ null directions, may be any basis of their span; sparse vectors then describe th
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,8 @@ PART = 0.05
 EQUAL = 1e-10
 # Pivots above this share of the largest are ties, of which the first is taken: rounding must not choose.
 NEAR_LARGEST = 0.9
+# An entry of a parameter: columns of a table, in terms such as x effort[0], may have numbers in brackets, too.
+ENTRY = re.compile(r"(\w+(?:\.\w+)+)\[(\d+)\]")
 WORDS = {
     "kinetic.log_diagonal": "the mass",
     "kinetic.off_diagonal": "the coupling of masses",
@@ -81,8 +84,8 @@ def joined(trades: Sequence[Trade]) -> list[Trade]:
 
 def in_words(name: str, which: str = ", entry {}") -> str:
     """A parameter's name, `friction.viscous[1]`, as a newcomer may read it."""
-    stem, _, entry = name.partition("[")
-    return WORDS.get(stem, stem) + (which.format(int(entry[:-1]) + 1) if entry else "")
+    entry = ENTRY.fullmatch(name)
+    return WORDS.get(entry[1], entry[1]) + which.format(int(entry[2]) + 1) if entry else WORDS.get(name, name)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from herglotz.cli import main
@@ -38,6 +39,42 @@ def test_files_and_words(tiny_run, other_csv, tmp_path, capsys):
     assert "rad" in text
     assert out.read_text().startswith("trajectory,t[s],theta[rad],theta_dot[rad/s]\n")
     assert (tmp_path / "motion.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def two_rates(tmp_path_factory):
+    """Two recordings of a damped spring under a force; the force is written at other times than the position."""
+    folder, files = tmp_path_factory.mktemp("rates"), []
+    for seed in range(2):
+        t = np.arange(24_000) * 5e-4
+        draw = np.random.default_rng(seed)
+        force = np.interp(t, np.arange(60) * 0.2, draw.normal(size=60))
+        x, v, rows = 0.1, 0.0, []
+        for k, (now, f) in enumerate(zip(t, force, strict=True)):
+            if k % 10 == 0:
+                rows.append(f"{now:.4f},{f:.6f},")
+            if k % 60 == 3:
+                rows.append(f"{now:.4f},,{x + 1e-3 * draw.normal():.6f}")
+            v += 5e-4 * (f - 9 * x - 0.5 * v)
+            x += 5e-4 * v
+        files.append(folder / f"{seed}.csv")
+        files[-1].write_text("\n".join(["t[s],force[N],x[m]", *rows]) + "\n")
+    return files
+
+
+def test_blanks_of_a_slower_column_are_filled_as_in_the_fit(two_rates, tmp_path, capsys):
+    # fails if predict holds inputs where the fit drew straight lines, or offers a flag that predict does not have
+    train, other = two_rates
+    flags = ["--hold", "first", "--no-plots", "--quiet"]
+    assert main(["fit", str(train), *flags, "--out", str(tmp_path / "run")]) == 0
+    capsys.readouterr()
+    assert main(["predict", str(tmp_path / "run"), str(other), "--json"]) == 0
+    err = " ".join(capsys.readouterr().err.split())
+    assert "force has no value in some rows; straight lines go there" in err
+    assert "--hold" not in err
+    other.write_text(f"# hold: zero\n{other.read_text()}")
+    assert main(["predict", str(tmp_path / "run"), str(other), "--json"]) == 0
+    assert "force has no value in some rows: the last one is held" in " ".join(capsys.readouterr().err.split())
 
 
 def test_columns_of_other_names_are_said(tiny_run, other_csv, tmp_path, capsys):

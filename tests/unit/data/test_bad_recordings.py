@@ -179,18 +179,18 @@ def test_stacked_tables_are_one_recording(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rows", "row"),
+    ("rows", "row", "remedy"),
     [
-        ([[k // 3, 0.1 * (k % 6), k**2] for k in range(12)], 8),
-        ([[int(6 <= k < 9), 0.1 * (k % 6), k**2] for k in range(12)], 8),
-        ([[k // 6 % 2, 0.1 * (k % 6), k**2] for k in range(18)], 8),
-        ([[0, 0.0, 0], [0, 0.1, 1], [0, 0.3, 9], [1, 0.2, 4], [2, 0.15, 3], [3, 0.12, 3]], 5),
+        ([[k // 3, 0.1 * (k % 6), k**2] for k in range(12)], 8, "cut the table before row 8"),
+        ([[int(6 <= k < 9), 0.1 * (k % 6), k**2] for k in range(12)], 8, "cut the table before row 8"),
+        ([[k // 6 % 2, 0.1 * (k % 6), k**2] for k in range(18)], 8, "sort the rows"),
+        ([[0, 0.0, 0], [0, 0.1, 1], [0, 0.3, 9], [1, 0.2, 4], [2, 0.15, 3], [3, 0.12, 3]], 5, "sort the rows"),
     ],
     ids=["changes elsewhere too", "two values", "values come again", "rows out of order"],
 )
-def test_other_columns_do_not_number_recordings(tmp_path, rows, row):
+def test_other_columns_do_not_number_recordings(tmp_path, rows, row, remedy):
     # fails if a coordinate is taken for a number of recordings where only some of its values fit
-    with pytest.raises(InputError, match=f"row {row}, column 't': .* sort the rows"):
+    with pytest.raises(InputError, match=f"row {row}, column 't': .* {remedy}"):
         load(written(tmp_path, "load,t,x", rows))
 
 
@@ -219,6 +219,52 @@ def test_a_column_that_numbers_the_recordings_is_named(tmp_path):
     # One row out of order is no second recording.
     with pytest.raises(InputError, match="sort the rows, delete one, or number the trajectories"):
         load(written(tmp_path, "t,x,y", [[0.0, 1.0, 1.0], [0.2, 1.0, 2.0], [0.1, 2.0, 3.0], [0.3, 2.0, 4.0]]))
+
+
+SET_BACK = [[0.1 * k - 0.75 * (k >= 20), float(np.sin(k))] for k in range(40)]
+
+
+def test_a_clock_that_was_set_back(tmp_path):
+    # fails if rows of two motions are to be sorted into one another, or a repeated stamp is named in the place
+    repeated = [*SET_BACK[:5], SET_BACK[4], *SET_BACK[5:]]
+    table = {"t[s]": np.array(SET_BACK)[:, 0], "x[m]": np.array(SET_BACK)[:, 1]}
+    path, other = (
+        written(tmp_path, "t[s],x[m]", rows, name) for rows, name in ((SET_BACK, "a.csv"), (repeated, "b.csv"))
+    )
+    for row, read in ((22, lambda: load(path)), (23, lambda: load(other)), (20, lambda: as_trajectories(table))):
+        with pytest.raises(InputError) as error:
+            read()
+        message = str(error.value)
+        assert f"row {row}, column 't': 1.25 does not increase on 1.9" in message
+        assert "time goes back once, by 0.65 s, and goes on from there: the clock was set back, or a second" in message
+        assert (
+            f"cut the table before row {row} (two files in a folder are two recordings), or number the two in"
+            in message
+        )
+        assert "--group NAME" in message
+        assert "sort" not in message
+    rows = [["b", *row] for row in SET_BACK]
+    with pytest.raises(InputError, match="give the rows from there another value in column 'run'"):
+        load(written(tmp_path, "run,t[s],x[m]", rows))
+    load(written(tmp_path, "run,t[s],x[m]", [["ab"[k >= 20], *row] for k, row in enumerate(SET_BACK)]))
+
+
+@pytest.mark.parametrize(
+    ("t", "row"),
+    [
+        ([0.0, 0.1, 0.2, 0.3, 0.05, 0.5, 0.6, 0.7, 0.8], 6),
+        ([0.0, 0.1, 0.2, 0.9, 0.4, 0.5, 0.6, 0.7, 0.8], 6),
+        ([0.0, 0.1, 0.2, 0.6, 0.7, 0.8, 0.3, 0.4, 0.5], 8),
+        ([0.0, 0.1, 0.1, 0.3, 0.2, 0.4, 0.5, 0.6, 0.7], 6),
+    ],
+    ids=["a stamp that is too small", "one that is too large", "a block in another place", "a repeat before two rows"],
+)
+def test_rows_out_of_order_are_sorted(tmp_path, t, row):
+    # fails if a wrong stamp or rows in another place are taken for a clock that was set back
+    with pytest.raises(
+        InputError, match=rf"row {row}, column 't': .* does not increase on .*; sort the rows, delete one"
+    ):
+        load(written(tmp_path, "t,x", [[x, float(k)] for k, x in enumerate(t)]))
 
 
 def cells(*columns):

@@ -1,5 +1,6 @@
 """Two rates in one table: what is known between samples of an input, and which rows are samples of the motion."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -63,6 +64,32 @@ def test_inputs_at_their_own_times(tmp_path, capsys, told, comment, straight):
     assert f"  16 rows are left out, without a value: the first is row {3 if comment else 2}, column 'x'" in err
     assert ("warning: a.csv: u has no value in some rows: the last one is held, for up to 0.26 s" in err) != straight
     assert ("u has no value in some rows; straight lines go there" in err) == straight
+
+
+def test_blanks_are_filled_as_in_another_recording(tmp_path):
+    # fails if the hold of a recording does not fill the blanks of the next, in a file, a folder or a frame, or comes
+    # before the hold of the file or of the user, or if a hold that is stated has a remedy
+    both = merged()
+    file = written(tmp_path, both)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    written(folder, both)
+    frame = {"t[s]": both[:, 0], "x[m]": both[:, 1], "u[N]": both[:, 2]}
+    straight = mean_held(True)
+    known = replace(load(file, hold="first", show=False), hold="first")
+    for source in (file, folder, frame):
+        found = as_trajectories(source, like=known)
+        assert found.u is not None
+        assert found.u[:-1, 0].numpy() == pytest.approx(straight, abs=2e-4)
+    constant = load(file, like=known, hold="zero", show=False)
+    assert constant.u is not None
+    assert constant.u[:-1, 0].numpy() == pytest.approx(mean_held(False), abs=2e-4)
+    assert constant.notes[0].endswith("the last one is held, for up to 0.26 s")
+    open_hold = load(file, show=False)
+    assert "; a fit with --hold first (hold= in Python) draws straight lines" in open_hold.notes[0]
+    stated = load(written(tmp_path, both, before="# hold: zero\n"), like=known, show=False)
+    assert stated.u is not None
+    assert stated.u.tolist() == constant.u.tolist()
 
 
 def test_positions_that_are_slower_than_an_input(tmp_path):

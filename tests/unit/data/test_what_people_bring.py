@@ -125,12 +125,12 @@ def test_unicode_text(tmp_path):  # fails if what spreadsheets call so, UTF-16 w
         ("t;x\n0;1.250,5\n1;2,5\n2;3\n", r"row 2: '1.250,5' has a separator of thousands; write numbers without it"),
         ("t;x\n0;1,234,567\n1;2,5\n2;3\n", "row 2: '1,234,567' has a separator of thousands"),
         ("Device 7\n2026\nclock,x\n0,1\n1,2\n2,3\n", "'Device 7' is no header; delete the lines above the table"),
-        ("timestamp,x\n1700000000000,1\n1700000000050,2\n1700000000100,3\n", r"write its unit, timestamp\[ms\]"),
+        ("timestamp,x\n86000000000000,1\n86000000000050,2\n86000000000100,3\n", r"write its unit, timestamp\[ms\]"),
         ("date,time,x\n2026-03-01,12:00:00,1\n2026-03-01,12:00:01,2\n", "two time columns, date and time; choose one"),
     ],
 )
 def test_mistakes_say_what_to_do(tmp_path, text, message):
-    # fails if thousands become decimals, a title is taken for the header, or milliseconds since 1970 for seconds
+    # fails if thousands become decimals, a title is taken for the header, or another clock's large counts for seconds
     with pytest.raises(InputError, match=message):
         load(written(tmp_path, text))
 

@@ -9,7 +9,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace, traded
 from herglotz.training.recorded_range import box_of
-from herglotz.training.trades import LARGEST, in_words, sparse_basis
+from herglotz.training.trades import LARGEST, in_words, listed, sparse_basis
 
 NOISE, H = 1e-3, 0.2
 
@@ -100,3 +100,10 @@ def test_names_in_words():
     assert in_words("friction.viscous[1]") == "viscous friction, entry 2"
     assert in_words("damping.rate") == "the damping rate γ"
     assert in_words("new.thing") == "new.thing"
+
+
+def test_names_of_columns_may_have_numbers_in_brackets():
+    # fails if a term with the column effort[0], as ROS writes it, is read as an entry of a parameter, or ends the fit
+    assert listed(("friction.viscous[1]", "x effort[0]", "effort[0] q1", "mass")) == (
+        "viscous friction (2), x effort[0], effort[0] q1, mass"
+    )
