@@ -292,20 +292,7 @@ def test_interrupt_with_a_checkpoint(monkeypatch, tiny_csv, tmp_path, capsys):  
 
 def test_select(capsys, tiny_csv, tmp_path):  # fails if run, table or figure is missing, or --dtype does not arrive
     out = tmp_path / "selected"
-    arguments = [
-        "select",
-        tiny_csv,
-        "--out",
-        out,
-        "--levels",
-        "linear",
-        "--seeds",
-        1,
-        "--dtype",
-        "float32",
-        "--iterations",
-        4,
-    ]
+    arguments = ["select", tiny_csv, "--out", out, "--levels", "linear", "--seeds", 1, "--dtype", "float32"]
     code, found = run_json(capsys, *arguments)
     assert code == 0
     assert found["chosen"] == "linear"
