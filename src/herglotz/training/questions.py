@@ -141,7 +141,11 @@ class Questions:
             asked = Questions(self.unread.on_a_line(), self.holds[:-1])
             asked.how_inputs_act()
             other = read.better(other, asked.best)
-        return other is not None and (trial is None or _is_better(other, trial, read))
+        turned = {offer.name for offer in read.fitter(Variant(read.order)).offers}
+        # A weight alone is the potential of a pendulum.
+        if other is None or (not other.taken.isdisjoint(WEIGHTS) and other.taken <= turned):
+            return False
+        return trial is None or _is_better(other, trial, read)
 
     def functions(self) -> None:
         """Find a better model with learned functions."""
