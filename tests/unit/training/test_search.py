@@ -658,7 +658,7 @@ def test_zeros_are_clearly_there_and_make_the_fit_better(zero, deviation, better
     fitter = search.fitter(Variant(2))
     best = there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
     found = torch.tensor([[0.0], [zero]], dtype=torch.float64), torch.tensor([[0.0], [deviation]], dtype=torch.float64)
-    monkeypatch.setattr(search, "zeros", lambda _: found)
+    monkeypatch.setattr(search, "zeros", lambda *_: found)
     if better is not None:
         monkeypatch.setattr(type(best), "fits_better", lambda *_: better)
     assert search.with_zeros(best) == (search, best, None)
