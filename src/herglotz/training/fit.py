@@ -237,7 +237,8 @@ def _of_short_steps(run: Run, posterior: Laplace) -> Run:
     """The run with the numbers to which those of its model tend as steps get shorter, for the equation.
 
     A rule of order 2 with steps h fits a stiffness that is h² k/12 of itself too small, many standard deviations of a
-    long recording. The run itself if the exact motion of these numbers is farther from the motion of the model.
+    long recording. The run itself if the exact motion of these numbers is no nearer to the motion of the model, or
+    farther than the data are: the equation then has the rule of the step beside it, with the numbers of the model.
     """
     if (limit := posterior.of_short_steps()) is None:
         return run
@@ -247,7 +248,7 @@ def _of_short_steps(run: Run, posterior: Laplace) -> Run:
     states[first, : limit[1].shape[1]] = limit[1].to(states)
     printed = replace(run, model=model, states=state_of(states))
     found, own = departure(run, printed), departure(run)
-    return printed if found is not None and own is not None and found.moved <= own.moved else run
+    return printed if found is not None and own is not None and found.moved <= min(own.moved, own.missed) else run
 
 
 def _key(data: Trajectories, config: FitConfig, plan: Plan | None) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from copy import deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
@@ -18,11 +19,15 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, fit, laplace
-from herglotz.training.equation import _is_lost, equation_of, notes_of
+from herglotz.training.equation import Departure, _is_lost, equation_of, notes_of
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.feedback import acting_inputs
+from herglotz.training.fit import _of_short_steps
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.recorded_range import box_of
 from herglotz.training.uncertainty import joint_of
+
+fit_module = sys.modules["herglotz.training.fit"]
 
 NOISE, H = 1e-3, 0.02
 TWICE = 3**0.5  # of the misfit: a motion that is so far from the model's is twice as far from the data
@@ -320,3 +325,14 @@ def test_the_numbers_of_an_equation_are_those_of_short_steps():
     assert own["sin(theta)"] + 1.0 > 5 * (found["sin(theta)"].deviation or math.inf)
     (steps,) = [note for note in run.equation().notes if "steps are" in note]
     assert "the numbers to which its own tend as steps get shorter" in steps
+
+
+@pytest.mark.parametrize(("moved", "own", "printed"), [(0.4, 0.5, True), (0.5, 0.4, False), (2.0, 3.0, False)])
+def test_an_equation_has_the_model_s_numbers_where_short_steps_have_no_limit(monkeypatch, moved, own, printed):
+    # fails if numbers are printed whose exact motion is farther from the model's, or to which the rule of the step, which
+    # stands below the equation where the exact motion is farther than the data, does not belong
+    run = run_of(*MODELS["waves"])
+    monkeypatch.setattr(fit_module, "departure", lambda _, other=None: Departure(own if other is None else moved, 1.0))
+    theta = ParameterVector(run.model).get()
+    posterior: Any = SimpleNamespace(of_short_steps=lambda: (theta + 1.0, torch.zeros(len(run.data), 2)))
+    assert (_of_short_steps(run, posterior) is not run) is printed
