@@ -265,10 +265,6 @@ class Fitter:
         self.always, every_offer, self.simple = offers_of(
             self.model, list(self.keys.values()), bands, len(input_terms_of(data.columns))
         )
-        # Forces at rest, for which a zero of the sensor can stand.
-        own = own_terms(data.angles)
-        rest = {key for key, (parameter, _) in own.items() if parameter == TILT}
-        self.constant_forces = rest.union(key for number, key in self.keys.items() if number.startswith(TILT))
         # Positions do not determine the scale of the mass of coordinates that no term joins to the first one. Were it
         # free, a larger mass would stand, to first order, for all forces that leave.
         apart = groups(config.features, data.angles)[1:] if config.features else []
@@ -291,6 +287,12 @@ class Fitter:
         self.floor = ALIKE * EXACT["float64"] * max(base.scale)
         self.offered = len(every_offer)
         self.compared: list[Compared] = []
+
+    @property
+    def constant_forces(self) -> set[str]:
+        """Names of the offers of a force at rest, for which a zero of the sensor can stand."""
+        own = {key for key, (parameter, _) in own_terms(self.data.angles).items() if parameter == TILT}
+        return own.union(key for number, key in self.keys.items() if number.startswith(TILT))
 
     @property
     def exact(self) -> bool:

@@ -15,7 +15,7 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import saturation
 from herglotz.models import ModelConfig
 from herglotz.training import questions
-from herglotz.training.acting_inputs import _least, asked_terms, beside, offered_terms, taken_terms
+from herglotz.training.acting_inputs import _least, _with, asked_terms, beside, offered_terms, taken_terms
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import by_motion, dictionary
@@ -360,3 +360,29 @@ def test_nothing_is_looked_for_where_that_is_said():
     config = FitConfig(find_input_terms=False).resolved(data)
     missed: Any = SimpleNamespace(at_the_noise=False)
     assert asked_terms(Search(data, estimate_baseline(data), config), missed) == ()
+
+
+@pytest.mark.parametrize(("at_the_noise", "tried"), [(True, ["near"]), (False, ["near", "climbed"])])
+def test_terms_also_join_the_simplest_model_where_a_near_one_misses_the_noise(at_the_noise, tried):
+    # fails if terms join the model of whole recordings alone: a motion that is sensitive to its forces tells of them
+    # over short segments, and the saturation of a pendulum that goes over the top was missed, 130 times the noise
+    asked = []
+    near: Any = SimpleNamespace(name="near", at_the_noise=at_the_noise)
+
+    def climbed(*_):
+        asked.append("climbed")
+        return SimpleNamespace(name="climbed")
+
+    def settled(found):
+        asked.append("near")
+        return found
+
+    other = SimpleNamespace(
+        again=lambda _: near, finer=lambda x: x, settled=settled, climbed=climbed, better=lambda _, x: x,
+        fitter=lambda _: SimpleNamespace(simple=()),
+    )  # fmt: skip
+    trial: Any = SimpleNamespace(near=True, fitter=SimpleNamespace(data=SimpleNamespace(input_labels=(("u", ""),))))
+    search: Any = SimpleNamespace(driven_by=lambda _: other, order=2)
+    found = _with(search, (), trial)
+    assert found is not None
+    assert (asked, found.name) == (tried, tried[-1])  # pyright: ignore[reportAttributeAccessIssue]

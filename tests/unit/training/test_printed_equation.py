@@ -329,8 +329,8 @@ def test_the_numbers_of_an_equation_are_those_of_short_steps():
 
 @pytest.mark.parametrize(("moved", "own", "printed"), [(0.4, 0.5, True), (0.5, 0.4, False), (2.0, 3.0, False)])
 def test_an_equation_has_the_model_s_numbers_where_short_steps_have_no_limit(monkeypatch, moved, own, printed):
-    # fails if numbers are printed whose exact motion is farther from the model's, or to which the rule of the step, which
-    # stands below the equation where the exact motion is farther than the data, does not belong
+    # fails if numbers are printed whose exact motion is farther from the model's, or to which the rule of the step does
+    # not belong, which stands below the equation where the exact motion is farther than the data
     run = run_of(*MODELS["waves"])
     monkeypatch.setattr(fit_module, "departure", lambda _, other=None: Departure(own if other is None else moved, 1.0))
     theta = ParameterVector(run.model).get()
