@@ -9,6 +9,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -267,7 +268,7 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
     if not files:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
 
-    def read(file: Path) -> tuple[Path, Trajectories]:
+    def read(wanted: Wanted, file: Path) -> tuple[Path, Trajectories]:
         try:
             return file, _read(file, wanted)
         except Unusable:
@@ -275,11 +276,24 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
         except InputError as error:
             raise InputError(f"{error}; or take {file.name} out of the folder") from None
 
-    pairs, warnings = usable(path, files, read)
+    pairs, warnings = usable(path, files, partial(read, wanted))
+    # A column that is the same in every row of one file may move in another.
+    sets = [one for _, one in pairs]
+    moving = [
+        name for name in dict.fromkeys(x for one in sets for x in one.names) if all(_has(one, name) for one in sets)
+    ]
+    if any(name not in one.names for one in sets for name in moving):
+        told = replace(wanted, positions=(*wanted.positions, *moving))
+        pairs, warnings = usable(path, files, partial(read, told))
     names = f"{len(pairs)} recordings: {', '.join(file.name for file, _ in pairs)}"
     found = _joined(*zip(*pairs, strict=True))
     notes = (textwrap.shorten(names, MAX_NOTE_LENGTH), *found.notes, *warnings)
     return replace(found, source=path.resolve().name, notes=notes)
+
+
+def _has(one: Trajectories, name: str) -> bool:
+    """Whether a file has a column with this name."""
+    return any(column == name for column, *_ in one.columns)
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:

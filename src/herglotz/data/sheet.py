@@ -195,7 +195,8 @@ def _same_everywhere(
 ) -> list[int]:
     """Columns of text, and coordinates without a unit and a usual name, that are the same in every row."""
     still = [columns.numeric[k] for k in np.flatnonzero((values == values[:1]).all(0))]
-    unusual = [i for i in columns.q if i in still and not is_usual(columns.names[i], columns.units[i])]
+    # A unit, 1 as well, says that somebody meant the column.
+    unusual = [i for i in columns.q if i in still and not (columns.units[i] or is_usual(columns.names[i], ""))]
     free = [i for i in unusual if _is_free(columns, wanted, i)]
     return [*filter(sheet.is_constant, texts), *(free if len(free) < len(columns.q) else [])]
 
@@ -276,7 +277,9 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
         for x in (own[0] for own in raw if own.ndim == 1 and len(own))
     ]
     remedies = "convert it to numbers, or drop it", "drop that row"
-    return from_sheet(Sheet(where, str(where), heads, first, range(len(raw[0])), raw.__getitem__, remedies), wanted)
+    return from_sheet(
+        Sheet(where, str(where), heads, first, range(len(raw[0]) if raw else 0), raw.__getitem__, remedies), wanted
+    )
 
 
 def _two_rows(names: Sequence[Any]) -> tuple[list[str], list[str]] | None:

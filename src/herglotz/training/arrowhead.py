@@ -91,14 +91,14 @@ class Arrowhead:
         return (reduced + reduced.T) / 2, solved, taken[:, P:]
 
     def covariance(self) -> Tensor | None:
-        """The corner of the inverse, (P, P): the covariance of parameters; None if T is not positive.
+        """The corner of the inverse, (P, P): the covariance of parameters; None if the matrix is not finite.
 
         What no residual determines has a very large variance (`inverse_of`).
         """
         P, (S, d) = len(self.corner), self.border.shape[:2]
         zero = self.border.new_zeros(P + S * d, dtype=torch.float64)
         found = self._reduced(zero.new_zeros(S, d, 0), zero)
-        return None if found is None else inverse_of(found[0])
+        return inverse_of(found[0]) if found is not None and bool(torch.isfinite(found[0]).all()) else None
 
 
 def eliminated(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:

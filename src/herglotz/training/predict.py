@@ -175,10 +175,9 @@ def predict(
     every = max(1, int(high / data.typical_step + 1e-6)) if data.typical_step < low else 1
     if every > 1:
         data = data.thinned(every)
-    if windows is not None or horizon is not None:
-        data = _windows(data, warmup or WARMUP, windows, horizon)
-        warmup = warmup or WARMUP
     warmup = warmup or _usual(min(data.lengths))
+    if windows is not None or horizon is not None:
+        data = _windows(data, warmup, windows, horizon)
     _check_lengths(data, warmup, every)
     states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
     data = measured(data, zeros)

@@ -50,7 +50,7 @@ class Questions:
                 read.full, self.read, self.differ = found, read, differ
             self.best = self.read.full
             asked = self.best is not None and self.best.whole
-            if asked and any([self.zeros(), self.how_inputs_hold(by_residuals=True)]):
+            if asked and any([self.differ is None and self.zeros(), self.how_inputs_hold(by_residuals=True)]):
                 self.read.full = self.best
         self.best = self.read.run()
         # Terms that made up for zeros or another hold are searched anew.
@@ -82,7 +82,8 @@ class Questions:
             return False
         if not (hold := self.read.better_hold(self.best, self.holds, by_residuals=by_residuals)):
             return False
-        self.wanted, self.read = (x.of(replace(x.data, hold=hold)) for x in (self.wanted, self.read))
+        each = self.wanted, self.read, self.undriven
+        self.wanted, self.read, self.undriven = (x.of(replace(x.data, hold=hold)) for x in each)
         self.hold, self.best = hold, self.read.again(self.best)
         return True
 
@@ -98,7 +99,7 @@ class Questions:
         recorded = self.wanted, self.read
         # Zeros, and a hold that was found beside them, may have made up for the terms.
         if self.differ is not None and (plain := self.unread.part.run()) is not None:
-            other, more = _asked(self.unread.part, plain), (len(self.read.data) - 1) * self.read.data.dof
+            other, more = _asked(self.unread.part, plain), int((self.differ[1] > 0).sum())
             if other is not None and asked[2].gain(other[2], more) <= 0:
                 asked, recorded = other, (self.unread, self.unread.part)
                 self.differ, self.hold = None, ""

@@ -160,6 +160,8 @@ class Search:
         segments, the more linear is the motion in the zeros, too, which start at the means of the readings. They are
         asked of the simplest model, then of the whole dictionary, both without constant forces, for which zeros stand.
         """
+        if len(self.data) == 1 or self.config.find_zeros is False:
+            return self, None, None
         fitter = self.fitter(Variant(self.order))
         for offers in (fitter.simple, {offer.name for offer in fitter.offers}):
             short = self._over_the_shortest(offers - fitter.constant_forces)

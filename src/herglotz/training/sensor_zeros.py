@@ -93,9 +93,15 @@ def deviations_of(covariance: Tensor) -> Tensor:
 
 
 def means(data: Trajectories) -> Tensor:
-    """The mean positions (B, n) of each recording, about which a body on a spring moves."""
+    """The mean positions (B, n) of each recording, about which a body on a spring moves; of angles without turns."""
     each = zip(data.q.split(data.lengths), data.complete.split(data.lengths), strict=True)
-    return torch.stack([q[there].mean(0).nan_to_num() for q, there in each])
+    return without_turns(torch.stack([q[there].mean(0).nan_to_num() for q, there in each]), data)
+
+
+def without_turns(z: Tensor, data: Trajectories) -> Tensor:
+    """Zeros (..., n) of which those of angles are between −π and π."""
+    turns = (z / (2 * math.pi)).round() * z.new_tensor([float(angle) for angle in data.angles])
+    return z - 2 * math.pi * turns
 
 
 def differing_zeros(
@@ -116,7 +122,8 @@ def differing_zeros(
     told = clear(z[reference], deviations[reference])
     beside = covariance - covariance[reference]
     beside = deviations_of((beside - beside[:, :, reference, None]).reshape(B * n, B * n)).reshape(B, n)
-    return torch.where(told, z, z - z[reference]), torch.where(told, deviations, beside)
+    z = without_turns(torch.where(told, z, z - z[reference]), problem.data)
+    return z, torch.where(told, deviations, beside)
 
 
 def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
@@ -149,8 +156,11 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
 
 def in_words(z: Tensor, deviations: Tensor, reference: int) -> str:
     """The zeros and their standard deviations, as a note for the report."""
-    beside = "" if bool((deviations[reference] > 0).any()) else f" that differ from those of recording {reference}"
-    return f"zeros{beside}: {sure(z, deviations)}"
+    own = deviations[reference] > 0
+    if bool(own.all()):
+        return f"zeros: {sure(z, deviations)}"
+    some = ", of some coordinates," if bool(own.any()) else ""
+    return f"zeros that differ{some} from those of recording {reference}: {sure(z, deviations)}"
 
 
 def sure(z: Tensor, deviations: Tensor) -> str:

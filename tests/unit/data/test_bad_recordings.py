@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from herglotz.data import as_trajectories, load
+from herglotz.data.csv_format import write_csv
 from herglotz.errors import InputError
 
 
@@ -332,6 +333,13 @@ def test_a_column_that_is_the_same_in_every_row_is_left_aside(tmp_path, capsys, 
         named = load(written(tmp_path, "mode,t,x", cells([cell] * 12, t, x)), coordinates=("x", "mode"))
         assert named.names == ("x", "mode")
         assert load(written(tmp_path, "mode[m],t,x", cells([cell] * 12, t, x))).names == ("mode", "x")
+        # What is written is read again, and a joint that one file of a folder holds still is a joint.
+        (folder := tmp_path / "joints").mkdir()
+        write_csv(tmp_path / "again.csv", named)
+        assert load(tmp_path / "again.csv").names == ("x", "mode")
+        written(folder, "mode,t,x", cells([cell] * 12, t, x), "held.csv")
+        written(folder, "mode,t,x", cells(x[::-1], t, x), "moved.csv")
+        assert set(load(folder).names) == {"mode", "x"}
         assert load(written(tmp_path, "t,mode", cells(t, [cell] * 12))).names == ("mode",)
 
 

@@ -1,5 +1,6 @@
 """Zeros of sensors that differ between recordings: as unknowns, found, kept where they help, and met by predictions."""
 
+import math
 import sys
 from dataclasses import replace
 from functools import cache
@@ -20,7 +21,7 @@ from herglotz.training.predict import predict
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import drifts, zeros_of_one
+from herglotz.training.sensor_zeros import drifts, in_words, means, zeros_of_one
 from herglotz.training.stages import Stages
 from herglotz.training.structure import kept_structure
 from herglotz.training.task import build_model
@@ -100,6 +101,37 @@ def test_the_normal_equations_of_zeros_are_the_derivatives_of_the_cost(drifting)
     assert torch.allclose(covariance, torch.linalg.inv(A)[:first, :first], rtol=1e-6, atol=0)
 
 
+def test_zeros_of_angles_have_no_turns():
+    # fails if recordings that go over the top have zeros of several turns, because their readings have such means: each
+    # zero of 0.1 was 6.38
+    draw, parts, planted = np.random.default_rng(5), [], (0.1, 0.25, 0.1, -0.4)
+    for zero, speed in zip(planted, (9.0, -9.5, 8.0, 12.0), strict=True):
+        x, rows = np.array([0.0, speed]), []
+        for _ in range(SAMPLES):
+            rows.append(x[0])
+            for _ in range(8):
+                x = x + 0.00625 * rate(x + 0.003125 * rate(x))
+        parts.append(np.array(rows) + NOISE * draw.standard_normal(SAMPLES) + zero)
+    t, lengths = np.tile(np.arange(SAMPLES) * 0.05, 4), (SAMPLES,) * 4
+    data = Trajectories.of(t, np.concatenate(parts), lengths, names=("q",), units=("rad",), angles=(True,))
+    assert float(means(data).abs().max()) <= math.pi
+    assert fit(data).metrics["plan"]["zeros"] == pytest.approx(planted, abs=4 * NOISE)
+
+
+@pytest.mark.parametrize(
+    ("reference", "words"),
+    [
+        ((0.1, 0.1), "zeros: "),
+        ((0.1, 0.0), "zeros that differ, of some coordinates, from those of recording 0: "),
+        ((0.0, 0.0), "zeros that differ from those of recording 0: "),
+    ],
+)
+def test_the_note_says_what_zeros_are_beside(reference, words):
+    # fails if zeros of one coordinate are said to be beside the reference, or not, as those of another are
+    deviations = torch.tensor([reference, (0.1, 0.1)])
+    assert in_words(torch.ones(2, 2), deviations, 0).startswith(words)
+
+
 def test_the_covariance_does_not_depend_on_units():
     # fails if a direction counts as null by the size of its unit: beside x⁶ in mm a drift of 0.2077 ± 0.0035 mm/s had
     # ± 2e-5
@@ -113,6 +145,8 @@ def test_the_covariance_does_not_depend_on_units():
     found = matrix.covariance()
     assert found is not None
     assert torch.allclose(found, wanted, rtol=1e-9, atol=0)
+    # fails if a fit that ends where no step is solved ends with an internal error
+    assert replace(matrix, corner=matrix.corner * math.nan).covariance() is None
 
 
 def test_a_fit_finds_the_zero_and_says_so():
