@@ -117,7 +117,9 @@ class Judge:
         plots = ["--no-plots"] if asked.command == "fit" else []
         done = self._python([*command, *plots], self.limit, folder / "fit")
         row |= {"cpu_s": round(done.cpu, 2), "peak_mb": round(done.peak), "exit": done.code, "unit": asked.unit}
-        row |= {"error": None, "relative": None, "spread": None, "groups": {}, "trouble": "", "said": done.last}
+        row |= {"error": None, "relative": None, "spread": None, "groups": {}, "trouble": ""}
+        # Folders of this machine have no place in a table.
+        row["said"] = done.last.replace(str(folder), "FOLDER").replace(str(home), "DATA")
         # True if the row measures an error.
         row["asks"] = bool(asked.trials) or asked.later
         row["verdict"] = f"no result in {self.limit:g} s" if done.code is None else _without_run(done.code)
