@@ -101,6 +101,7 @@ def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagra
     model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device="cpu")
     with _differentiable(model.config.name):
         model.s_enters_motion = s_enters_motion(model, kept)
+    _refuse_mixed_samples(model, kept)
     seen = Look(
         data, train, unseen, kept, dropped, False, data.arrival, {}, (), (),
         noise=roughness(kept), settings=config, base=base,
@@ -120,6 +121,26 @@ def own_model(L_d: DiscreteLagrangian, data: Trajectories, base: Baseline) -> Ow
         f"{name}: {', '.join(frozen)} do not require gradients; make them buffers (register_buffer)": frozen,
     })  # fmt: skip
     return model
+
+
+def _refuse_mixed_samples(model: OwnLagrangian, data: Trajectories) -> None:
+    """Raise InputError if L_d of a batch is not that of each sample: h (...) beside q (..., n) reaches other samples."""
+    steps, u = data.steps(), step_inputs(model, data)
+    i = steps.index[torch.linspace(0, len(steps.index) - 1, 6).long()]
+    h = steps.h[:1] * torch.arange(1, 7).to(data.q)
+    samples = (data.q[i], data.q[i + 1], data.t[i] - data.t[0], h) + (() if u is None else (u[i],))
+    call = lambda q0, q1, s0, h, u=None: model(q0, q1, s0, h, 0, u)  # noqa: E731
+    with torch.no_grad():
+        each = torch.cat([call(*(x[k : k + 1] for x in samples)) for k in range(6)])
+        try:
+            L = call(*(x.unflatten(0, (3, 2)) for x in samples)).flatten()
+        except RuntimeError:
+            L = torch.full_like(each, torch.nan)
+    refuse({
+        f"{model.config.name}: L_d of several samples is not that of each: q is (..., n), s0 and h are (...), with any "
+        "leading dimensions; write h[..., None] beside q, and .sum(-1) over coordinates":
+            L.shape != each.shape or not torch.allclose(L, each, 1e-3, 1e-3 * each.abs().max().item()),
+    })  # fmt: skip
 
 
 def s_enters_motion(model: Any, data: Trajectories) -> bool:

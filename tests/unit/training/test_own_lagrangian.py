@@ -234,6 +234,10 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
         def forward(self, q0, q1, s0, h):
             return super().forward(torch.as_tensor(q0.detach().numpy()), q1, s0, h)
 
+    class Mixing(Spring):
+        def forward(self, q0, q1, s0, h):
+            return super().forward(q0 / h * h, q1, s0, h)  # h stands beside q without [..., None]
+
     frozen = Spring()
     frozen.k.requires_grad_(False)
     wrong: tuple[tuple[Any, dict[str, Any], str], ...] = (
@@ -243,6 +247,7 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
         (frozen, {}, r"L_d.k do not require gradients"),
         (Branching(), {}, "cannot differentiate it sample by sample"),
         (Normed(), {}, "Normed: torch.func cannot differentiate it .*batch norms"),
+        (Mixing(), {}, r"Mixing: L_d of several samples is not that of each.*h\[..., None\] beside q"),
         (Copied(), {}, "Copied: torch.func cannot differentiate it .* numpy"),
         (Spring(), {"level": "affine"}, "level: model= says"),
         (Spring(), {"objective": "raw"}, "not raw"),
