@@ -107,7 +107,7 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
         return found
     parameters, n, tol = ParameterVector(model), (start.shape[-1] - 1) // 2, 64 * torch.finfo(start.dtype).eps
     x = start.new_full((h.shape[0], h.shape[1] + 1, start.shape[-1]), torch.nan)
-    x[:, 0], theta, k, block, alive = start, parameters.get(), 0, 1, torch.arange(len(start))
+    x[:, 0], theta, k, block, alive = start, parameters.get(), 0, 1, torch.arange(len(start), device=start.device)
 
     def at_once(before: Tensor, now: Tensor, h_before: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:
         guess = now[:, None].repeat(1, h.shape[1] + 1, 1)

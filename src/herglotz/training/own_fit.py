@@ -123,8 +123,8 @@ def own_model(L_d: DiscreteLagrangian, data: Trajectories, base: Baseline) -> Ow
     return model
 
 
-def _refuse_mixed_samples(model: OwnLagrangian, data: Trajectories) -> None:
-    """Raise InputError if L_d of a batch is not that of each sample: h (...) beside q (..., n) reaches other samples."""
+def _refuse_mixed_samples(model: Any, data: Trajectories) -> None:
+    """Raise InputError if L_d of a batch is not that of each sample, as where h, (...), stands beside q, (..., n)."""
     steps, u = data.steps(), step_inputs(model, data)
     i = steps.index[torch.linspace(0, len(steps.index) - 1, 6).long()]
     h = steps.h[:1] * torch.arange(1, 7).to(data.q)
