@@ -65,9 +65,11 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
         "versions": {module.__name__: module.__version__ for module in (herglotz, torch, np)}
         | {"python": platform.python_version()},
     }
-    box = box_of(*state_of(fitted.states))
     h = train.typical_step / config.substeps
-    return Run(fitted.model, told, metrics, data, train.lengths, states, h, box, task.stages.history)
+    # Posterior, report and export are made on the CPU, also of a run that is loaded.
+    model, data, states = fitted.model.cpu(), data.to(device="cpu"), state_of(states.joined.cpu())
+    box = box_of(*state_of(fitted.states.cpu()))
+    return Run(model, told, metrics, data, train.lengths, states, h, box, task.stages.history)
 
 
 def unseen_errors(run: Run) -> list[Tensor]:

@@ -26,6 +26,8 @@ def test_a_fit_on_a_gpu_is_that_on_a_cpu(dtype):
         assert ours.what == other.what
         assert ours.value == pytest.approx(other.value, rel=1e-4)
     assert laplace(there).bands().q.shape == there.data.q.shape
+    # A run is on the CPU, as what predicts and exports it is.
+    assert there.stepper.rollout(*there.states_at_end(), h=0.1, steps=5).q.device.type == "cpu"
 
 
 def test_networks_are_fitted_on_a_gpu():
