@@ -144,9 +144,10 @@ class _Reader:
     def _checked(self, product: Product) -> Product:
         """The product, if its function fits the coordinates."""
         radial = product.function == "radius"
-        used = product.arm if product.degree else [True] * self.n if radial else product.form
-        if (product.power or product.degree) and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
-            raise self._error("a power of an angle is not periodic; use cos or sin")
+        used = product.arm if product.degree else [1.0] * self.n if radial else product.form
+        # A turn of all joints together leaves differences of angles as they are.
+        if (product.power or product.degree) and sum(w for w, angle in zip(used, self.angles, strict=True) if angle):
+            raise self._error("a power of an angle is not periodic; use cos or sin, or a difference (q1 - q2)^2")
         if product.phase and product.function not in ("cos", "sin"):
             raise self._error(f"a power of q + {product.phase:g} is a sum of powers; write these, or a wave")
         if radial and product.velocities:
@@ -339,6 +340,12 @@ def spherical(angles: Sequence[bool]) -> list[str]:
     return [f"cos(2q{j}) v{i} v{i}" for i, j in permutations(turning, 2)]
 
 
+def windings(angles: Sequence[bool]) -> list[str]:
+    """Torsion springs between two joints, which may turn together without end: motor and load, a flexible joint."""
+    turning = [i for i, angle in enumerate(angles, 1) if angle]
+    return [f"(q{i} - q{j})^2" for i, j in combinations(turning, 2)]
+
+
 def lengths(angles: Sequence[bool]) -> list[str]:
     """Frequent features of coordinates that are no angles, singly and in pairs.
 
@@ -398,5 +405,6 @@ LIBRARIES: dict[str, Callable[..., list[str]]] = {
     "revolute": revolute,
     "slides": slides,
     "spherical": spherical,
+    "windings": windings,
     "lengths": lengths,
 }

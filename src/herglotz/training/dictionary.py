@@ -16,7 +16,7 @@ from itertools import combinations
 from herglotz.models import ModelConfig
 from herglotz.models.config import POWERS
 from herglotz.models.drag import AIR, parse_drag
-from herglotz.models.features import expand, lengths, revolute, slides, spherical
+from herglotz.models.features import expand, lengths, revolute, slides, spherical, windings
 from herglotz.training.rates import rates_of
 from herglotz.training.waves import BRAKES, waves_of
 
@@ -81,7 +81,7 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
         return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", "|q1| q1", "|q1|^3", *WEIGHTS)
     if any(angles):
         still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
-        return (*revolute(angles), *still, *slides(angles), *spherical(angles))
+        return (*revolute(angles), *still, *slides(angles), *spherical(angles), *windings(angles))
     return tuple(name for name in lengths(angles) if not name.startswith("r^"))
 
 

@@ -19,7 +19,7 @@ from herglotz.data.noise import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
 from herglotz.models.drag import input_columns, input_forces
-from herglotz.models.features import spherical
+from herglotz.models.features import spherical, windings
 from herglotz.progress import FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
@@ -146,8 +146,12 @@ class Search:
 
     @cached_property
     def every_term(self) -> Trial | None:
-        """The model of the whole dictionary over the shortest segments."""
-        return self._over_the_shortest(offer.name for offer in self.fitter(Variant(self.order)).offers)
+        """The model of the whole dictionary over the shortest segments.
+
+        Torsion springs may join later: beside waves of the same differences they are nearly collinear.
+        """
+        every = {offer.name for offer in self.fitter(Variant(self.order)).offers}
+        return self._over_the_shortest(every - set(windings(self.data.angles)))
 
     def _over_the_shortest(self, taken: Iterable[str]) -> Trial | None:
         fitter = self.fitter(Variant(self.order))
@@ -280,10 +284,11 @@ class Search:
     def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
         """Offers, and values of all numbers, from one linear fit of smoothed accelerations; None if the fit fails.
 
-        Terms that are nearly collinear with others are left out (`special`, `spherical`).
+        Terms that are nearly collinear with others are left out (`special`, `spherical`, `windings`).
         """
         local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
-        every = every.only(set(every.names).difference(special(self.data), spherical(self.data.angles)))
+        angles = self.data.angles
+        every = every.only(set(every.names).difference(special(self.data), spherical(angles), windings(angles)))
         every = every.joined(NamedTerms(drag=self.config.drag))
         start = None if local is None else start_of(self.data, self.base, every, local)
         if start is None:

@@ -135,7 +135,7 @@ def test_mistakes_in_texts_are_named():
         with pytest.raises(InputError, match=words):
             built(LENGTHS, features=(text,))
     with pytest.raises(InputError, match="a power of an angle is not periodic"):
-        parse("(q1 - q2)^2", ANGLES)
+        parse("(q1 + q2)^2", ANGLES)
     wrong_at_4 = {
         "order 4 is for features, without networks": {"potential_width": 8},
         "order 4 takes at most two velocities a product": {"features": ("v1^3",)},
