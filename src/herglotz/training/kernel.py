@@ -162,7 +162,7 @@ class Kernel:
         self.numbers = ParameterVector(model).numbers
         self.place = {key: i for i, key in enumerate(keys_of(self.numbers, model.config))}
         self.bases = list(rates_of(terms_of(model.config)).values)
-        key = _sources() + json.dumps(model.config.to_dict(), sort_keys=True)
+        key = _sources() + OPTIMISED + json.dumps(model.config.to_dict(), sort_keys=True)
         self.library = built(key, lambda: {SOURCE: source_of(model)}, COMPILER_FLAGS)
         self.library.hz_sweep.restype = ctypes.c_long
         self.library.hz_eliminate.restype = ctypes.c_long

@@ -29,7 +29,7 @@ def written(tmp_path_factory):
     @functools.cache
     def file(name):
         model = MODELS[name]()
-        return model, export_onnx(model, tmp_path_factory.mktemp("unrolled") / "step.onnx", h=0.1, unroll=4)
+        return model, export_onnx(model, tmp_path_factory.mktemp("unrolled") / "step.onnx", h=0.1, unroll=3)
 
     return file
 
