@@ -200,7 +200,7 @@ def pushes(run: FittedRun, joint: Joint | None) -> str:
 def work_of_friction(run: FittedRun) -> Tensor:
     """The energy that friction gives to the training part, (), by the fitted motion from sample to sample.
 
-    Σ (F⁻/c + F⁺)·Δ − γ h p·v without inputs and constant loads, which are no friction; < 0 where it brakes.
+    Σ (F⁻/c + F⁺)·Δ/h − γ p·Δ without inputs and constant loads, which are no friction; < 0 where it brakes.
     """
     model, data = run.model, run.data.unwrapped()
     assert isinstance(model.damping, LinearDamping)
@@ -212,7 +212,8 @@ def work_of_friction(run: FittedRun) -> Tensor:
     work = -model.damping.rate * ((p[row] + p[row + 1]) / 2 * move).sum()
     forces = model.forces(q0, q1, torch.zeros_like(h), h)
     if forces is not None:
-        work = work + ((forces[0] / (-model.damping.rate * h).exp()[:, None] + forces[1]) * move).sum()
+        impulse = forces[0] / (-model.damping.rate * h).exp()[:, None] + forces[1]
+        work = work + (impulse / h[:, None] * move).sum()
     for g, text in enumerate(model.config.drag):
         if text.startswith("load"):
             assert model.drag is not None
