@@ -36,7 +36,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.column_roles import is_of_others
+from herglotz.data.column_roles import is_of_others, role_of
 from herglotz.data.gaps import MEANS
 from herglotz.data.noise import SAMPLES, precisions
 from herglotz.data.polar import LENGTH, with_hints
@@ -86,8 +86,7 @@ def reason_of_data(data: Trajectories) -> str:
         )
     if others := [x for x, role, unit in data.columns if role == "left aside" and is_of_others(unit, data.units)]:
         verb, they = ("was", "it is") if len(others) == 1 else ("were", "they are")
-        names = ",".join([*(x for x, role, _ in data.columns if role == "input"), *others])
-        return f"{', '.join(others)} {verb} left aside, and {they} of no coordinate. Try --inputs {shlex.quote(names)}"
+        return f"{', '.join(others)} {verb} left aside, and {they} of no coordinate. Try {_as_inputs(data, others)}"
     if names := filled_inputs(data):
         some, was, its = ("input", "was", "its") if len(names) == 1 else ("inputs", "were", "their")
         return (
@@ -102,8 +101,12 @@ def reason_of(
     data: Trajectories,
     miss: Tensor,  # (N, n) residual at the samples, in units of q
     owner: Tensor,  # (N,) free run of each sample
+    level: str = "",
 ) -> str | None:
-    """The reason of a misfit, and what to try, in sentences; "" where none is shown, None where noise hides it."""
+    """The reason of a misfit, and what to try, in sentences; "" where none is shown, None where noise hides it.
+
+    `level` is that of the model, which is not offered once more.
+    """
     at = _Parabolas(data, owner, SAMPLES)
     if len(at.rows) < FEW:
         return ""
@@ -131,8 +134,27 @@ def reason_of(
         )
     return (
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
-        "what was not recorded. Try --level full, whose action remembers, or record what else acts (--inputs)"
+        f"what was not recorded. Try {' or '.join(_ways_to_the_past(data, level))}"
     )
+
+
+def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
+    """What to try where the present state and the inputs do not give the force: only what a fit would take."""
+    ways = [] if data.u is not None or level == "full" else ["--level full, whose action remembers,"]
+    # A name that is none of a rate: the unit alone has left such a column aside.
+    others = [
+        name for name, role, unit in data.columns
+        if role == "left aside" and role_of(name, unit).role in ("rate", "dropped")
+        and role_of(name, "").role in ("q", "input")
+    ]  # fmt: skip
+    if others:
+        return [*ways, f"{_as_inputs(data, others)}, which takes {', '.join(others)}, left aside so far"]
+    return [*ways, "record what else acts (--inputs)"]
+
+
+def _as_inputs(data: Trajectories, others: list[str]) -> str:
+    """The flag that takes these columns for inputs as well."""
+    return f"--inputs {shlex.quote(','.join([*(x for x, role, _ in data.columns if role == 'input'), *others]))}"
 
 
 class _Parabolas:

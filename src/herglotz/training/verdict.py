@@ -111,7 +111,8 @@ def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:
         # A model that cannot be stepped explains nothing: what it misses is the motion.
         miss = data.q if found is None else found.problem.misfit(found.path) * data.balance
         grid = found and found.problem.grid
-        reason = reason_of(data, miss, data.trajectory if grid is None else grid.node // (grid.longest + 1))
+        owner = data.trajectory if grid is None else grid.node // (grid.longest + 1)
+        reason = reason_of(data, miss, owner, task.config.level)
         if min(train.lengths) < 2 * FIRST_SEGMENT or coarse(half := train.thinned(2)):
             break
         train, steps = half, 2 * steps
@@ -163,7 +164,8 @@ def judged(
     words = ". ".join(filter(None, (misread(kept, seen, errors.missed), *reasons)))
     caveat = caveat_of_inputs(model, train, states)
     beyond = partial(unseen_outlier, seen, everywhere)
-    return {"verdict": in_words(errors, ahead, metrics, shown, words, caveat, beyond)} | kept_numbers
+    told = metrics | {"driven": train.u is not None}
+    return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond)} | kept_numbers
 
 
 def _errors(kept: Trajectories, unit: Tensor, missed: tuple[Tensor, Tensor | None, Tensor | None], out: int) -> Errors:
@@ -310,7 +312,10 @@ def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], be
         return beyond() or other
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
-    return "A force is missing. Try --objective smoothing, another --level (herglotz select), or a --feature for it"
+    ways = [] if metrics["objective"] == "smoothing" else ["--objective smoothing"]
+    # Inputs leave one level.
+    ways += [] if metrics.get("driven") else ["another --level (herglotz select)"]
+    return f"A force is missing. Try {', or '.join([*ways, 'a --feature for it'])}"
 
 
 def _rms(x: Tensor) -> float:

@@ -219,8 +219,6 @@ def test_the_work_of_friction_has_all_its_terms_in_one_unit():
         model.friction.viscous.fill_(0.5)
     t = H * torch.arange(K, dtype=torch.float64)
     q, p = t.cos()[:, None], -t.sin()[:, None]
-    run = SimpleNamespace(
-        model=model, data=Trajectories.of(t, q), train_lengths=(K,), states=SimpleNamespace(q=q, p=p)
-    )
+    run = SimpleNamespace(model=model, data=Trajectories.of(t, q), train_lengths=(K,), states=SimpleNamespace(q=q, p=p))
     expected = -0.2 * float((q.diff(dim=0).square() / H).sum())
     assert float(work_of_friction(cast(Any, run)).detach()) == pytest.approx(expected, rel=1e-3)
