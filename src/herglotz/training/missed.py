@@ -72,6 +72,9 @@ FOLDS, PIECES = 8, 16
 # Most samples of a regression: an inverse takes about 5 ms.
 MOST_PREDICTED = 400
 
+# The start of the reason of a law that changes with time.
+OF_TIME = "What is missed changes with time where positions, velocities and inputs are alike"
+
 
 def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
@@ -129,8 +132,8 @@ def reason_of(
         return None if hidden > OTHER else ""
     if by_time < min(by_past, HALF * by_state):
         return (
-            "What is missed changes with time where positions, velocities and inputs are alike, as where a mass grows "
-            "or leaks. Try shorter recordings, each with a fit of its own, or what changes as an input (--inputs)"
+            f"{OF_TIME}, as where a mass grows or leaks. Try shorter recordings, each with a fit of its own, or what "
+            "changes as an input (--inputs)"
         )
     return (
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "

@@ -44,9 +44,9 @@ from herglotz.training.feedback import (
 from herglotz.training.flow import motion
 from herglotz.training.following import HALF
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
-from herglotz.training.left_out import beside
+from herglotz.training.left_out import LeftOut, beside
 from herglotz.training.look import Look
-from herglotz.training.missed import MOST, reason_of, reason_of_data
+from herglotz.training.missed import MOST, OF_TIME, reason_of, reason_of_data
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
 from herglotz.training.problems.robust import FEW, FREEDOM, far_out, scale_of
@@ -117,6 +117,16 @@ def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:
             break
         train, steps = half, 2 * steps
     return reason or ""
+
+
+def changes_with_time(task: Task, fitted: Fitted, seen: Look, outlying: tuple[LeftOut, ...]) -> bool:
+    """Whether a model misses what changes with time, in the recordings that are not `outlying`, too.
+
+    Such a law, of a mass that grows, misses one recording most and is the law of all.
+    """
+    out = {one.recording for one in outlying}
+    train = seen.train.select([b for b in range(len(seen.train)) if b not in out])
+    return _reason_of_residuals(task, fitted, replace(seen, train=train)).startswith(OF_TIME)
 
 
 def _gross(windows: Tensor, data: Trajectories) -> Tensor:
