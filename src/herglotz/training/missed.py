@@ -152,7 +152,7 @@ def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
     ]  # fmt: skip
     if others:
         return [*ways, f"{_as_inputs(data, others)}, which takes {', '.join(others)}, left aside so far"]
-    return [*ways, "record what else acts (--inputs)"]
+    return [*ways, "a record of what else acts (--inputs)"]
 
 
 def _as_inputs(data: Trajectories, others: list[str]) -> str:

@@ -95,7 +95,7 @@ def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: flo
 def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: str = "") -> str:
     """The reason that the inputs, and residuals above the noise (`missed`), show, or ""; `longer` is a remedy too."""
     known = fitted.states[~seen.spikes]
-    reason = reason_of_inputs(fitted.model, task.data, known, task.base.model_step, longer)
+    reason = reason_of_inputs(fitted.model, task.data, known, task.base.model_step, longer, not missed)
     return ". ".join(filter(None, (reason, _reason_of_residuals(task, fitted, seen) if missed else "")))
 
 

@@ -75,6 +75,8 @@ def test_the_reason_is_what_is_measured(stiffness, moved, expected):
     assert reason.startswith(expected)
     assert bool(reason) == bool(expected)
     if stiffness < 0:
+        # fails if a model that does not fit says of the motion what is true of the model alone
+        assert reason_of_inputs(model, data, states, H, fits=False).startswith("The model, and maybe the motion, is un")
         # exp(2.95 t)/2 = spread / noise
         t = math.log(2 * float(data.q.std(correction=0)) / NOISE) / 2.95
         said = float(re.findall(r"within ([\d.]+)", reason)[0])

@@ -78,12 +78,12 @@ def test_what_a_residual_shows(what):
 @pytest.mark.parametrize(
     ("driven", "level", "columns", "ways"),
     [
-        (False, "forced", (), "--level full, whose action remembers, or record what else acts (--inputs)"),
-        (False, "full", (), "record what else acts (--inputs)"),
-        (True, "forced", (), "record what else acts (--inputs)"),
+        (False, "forced", (), "--level full, whose action remembers, or a record of what else acts (--inputs)"),
+        (False, "full", (), "a record of what else acts (--inputs)"),
+        (True, "forced", (), "a record of what else acts (--inputs)"),
         (True, "forced", (("wind", "left aside", "m/s"),), "--inputs volt,wind, which takes wind, left aside so far"),
-        (True, "forced", (("x_ref", "left aside", "mm"),), "record what else acts (--inputs)"),
-        (True, "forced", (("speed", "left aside", "m/s"), ("dx", "left aside", "m/s")), "record what else acts"),
+        (True, "forced", (("x_ref", "left aside", "mm"),), "a record of what else acts (--inputs)"),
+        (True, "forced", (("speed", "left aside", "m/s"), ("dx", "left aside", "m/s")), "a record of what else acts"),
     ],
 )
 def test_a_remedy_would_run(driven, level, columns, ways):
@@ -148,7 +148,7 @@ def test_steps_so_short_that_noise_hides_a_force_are_thinned(hidden, start, nois
     data = {"t[s]": t, "x[m]": q, "force[N]": u}
     run = fit(data, level="forced", features="q1^2", objective="trajectory", progress=False)
     assert run.metrics["window_rms"] > 1.5 * noise
-    assert ("record what else acts" in run.metrics["verdict"]) is hidden, run.metrics["verdict"]
+    assert ("a record of what else acts" in run.metrics["verdict"]) is hidden, run.metrics["verdict"]
 
 
 def test_a_model_that_cannot_be_stepped_is_judged_by_the_motion(monkeypatch):
