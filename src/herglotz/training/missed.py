@@ -1,9 +1,10 @@
 """`reason_of`: why a model does not fit, as far as the residual shows, in words.
 
 Free runs of 20 recorded steps, whose starts are fitted, leave a residual. The curvature of parabolas through nine
-samples of the residual is the acceleration that the model lacks, known to the noise of the data. Six reasons are
+samples of the residual is the acceleration that the model lacks, known to the noise of the data. Seven reasons are
 looked for:
 
+* samples that are noise, or too far apart for the motion;
 * positions on a circle, which one angle gives, or a distance from its centre that changes; counts of an encoder;
 * inputs that were recorded more often than the motion, and changed within its steps;
 * an acceleration of something else, a crane's trolley, that was left aside;
@@ -78,6 +79,11 @@ OF_TIME = "What is missed changes with time where positions, velocities and inpu
 
 def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
+    if _is_white(data):
+        return (
+            "Neighbouring samples tell nothing of each other: they are too far apart for the motion, or noise. Try a "
+            "recording with more samples in the same time"
+        )
     if hints := with_hints(replace(data, notes=())).notes:
         return hints[0].removeprefix("warning: ")
     if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note or COUNTS in note]:
@@ -98,6 +104,14 @@ def reason_of_data(data: Trajectories) -> str:
             "was recorded"
         )
     return ""
+
+
+def _is_white(data: Trajectories) -> bool:
+    """Whether the noise of every coordinate is of the size of its spread; an angle that turns has one on the circle."""
+    turning = torch.tensor(data.angles, device=data.q.device)
+    q = torch.cat([data.q[:, ~turning], data.q[:, turning].sin(), data.q[:, turning].cos()], 1)
+    noise = precisions(Trajectories.of(data.t, q, data.lengths)).to(q)
+    return bool((torch.isfinite(noise) & (noise > HALF * q.std(0))).all())
 
 
 def reason_of(

@@ -209,6 +209,17 @@ def test_what_was_warned_of_when_the_table_was_read_is_the_reason():
     assert reason_of_data(counts).startswith("Whole numbers without a unit, wheel may be counts of an encoder: if")
 
 
+@pytest.mark.parametrize("angle", [False, True])
+@pytest.mark.parametrize(("step", "told"), [(1, False), (60, True)])
+def test_samples_that_are_too_far_apart(angle, step, told):
+    # fails if a force is missing from a model of samples without a neighbour; or if an angle that turns, whose spread
+    # grows for ever, is not told; or if finer samples of the same motion are
+    t = torch.arange(500, dtype=torch.float64) * step
+    q = 2 * (0.11 * t + 1.5 * torch.sin(0.071 * t) + 1.1 * torch.sin(0.0317 * t + 1))
+    found = reason_of_data(Trajectories.of(t, (q if angle else torch.sin(q))[:, None], angles=(angle,)).unwrapped())
+    assert found.startswith("Neighbouring samples tell nothing of each other") is told, found
+
+
 def test_neighbours_that_are_far_tell_nothing():
     # fails if the states of eight coordinates, none of which comes twice, are taken for alike
     speeds = torch.linspace(0.5, 2.1, 8, dtype=torch.float64).sqrt()
