@@ -79,11 +79,6 @@ OF_TIME = "What is missed changes with time where positions, velocities and inpu
 
 def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
-    if _is_white(data):
-        return (
-            "Neighbouring samples tell nothing of each other: they are too far apart for the motion, or noise. Try a "
-            "recording with more samples in the same time"
-        )
     if hints := with_hints(replace(data, notes=())).notes:
         return hints[0].removeprefix("warning: ")
     if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note or COUNTS in note]:
@@ -102,6 +97,11 @@ def reason_of_data(data: Trajectories) -> str:
             f"The {some} {', '.join(names)} {was} recorded more slowly than the motion and filled in, and {its} steps "
             "act at times between rows. Try the records of both before they were merged, or blank cells where nothing "
             "was recorded"
+        )
+    if _is_white(data):
+        return (
+            "Neighbouring samples tell nothing of each other: they are too far apart for the motion, or noise. Try a "
+            "recording with more samples in the same time"
         )
     return ""
 
