@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.training import load_run
     from herglotz.training.fitted_run import as_recorded
-    from herglotz.training.predict import missed_from_best_start
+    from herglotz.training.predict import longer_warmup, missed_from_best_start
 
     result = load_run(arguments.source)
     data = as_recorded(result, arguments.data, **columns_of(arguments))
@@ -103,6 +103,9 @@ def run(arguments: argparse.Namespace) -> int:
         if written:
             print(f"Written: {', '.join(map(str, written))}")
     _tell_of_limits(found, result)
+    if best is not None and (count := longer_warmup(found, best)) is not None:
+        why = f"the start that {found.warmup} samples tell misses, and not the model"
+        say(f"herglotz: note: {why}; try --warmup {count}", sys.stderr)
     return 0
 
 

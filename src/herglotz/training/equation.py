@@ -32,6 +32,7 @@ from herglotz.training.equation_words import BESIDE, UNKNOWN, Joint, Numbers, nu
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import run_on
+from herglotz.training.sensor_zeros import CENTRE
 
 # Columns of a line; the screen has two blanks before each line.
 WIDTH = 78
@@ -253,16 +254,17 @@ def _inputs(run: FittedRun) -> str:
 def _sensors(run: FittedRun) -> str:
     """How the reading of a sensor becomes a coordinate of the equation."""
     names, found, plan = run.data.names, [], run.metrics.get("plan") or {}
+    centred = plan.get("reasons", {}).get("zeros", "").startswith(CENTRE)
     for of, numbers in (
-        ("times the scale", run.reading.get("sensor_scales")),
-        ("less the zero", run.reading.get("sensor_zeros")),
-        ("less the zero", plan.get("zeros")),
-        ("less t since its recording began times the drift", plan.get("drifts")),
+        ("times the scale of its sensor", run.reading.get("sensor_scales")),
+        ("less the zero of its sensor", run.reading.get("sensor_zeros")),
+        ("less the place that terms are about" if centred else "less the zero of its sensor", plan.get("zeros")),
+        ("less t since its recording began times the drift of its sensor", plan.get("drifts")),
     ):
         values = [plain(float(x), DIGITS) for x in numbers or ()]
         each = [f"{name} {', '.join(values[i :: len(names)])}" for i, name in enumerate(names)] if values else []
         several = ", recording after recording" if len(values) > len(names) else ""
-        found += [f"{of} of its sensor ({'; '.join(each)}{several})"] if values else []
+        found += [f"{of} ({'; '.join(each)}{several})"] if values else []
     return f"a coordinate is its reading {', '.join(found)}" if found else ""
 
 

@@ -57,10 +57,12 @@ def reason_of_inputs(
     states: Tensor,  # (N, 2n+1) of the fit at the samples
     max_step: float,
     longer: str = "",
+    fits: bool = True,
 ) -> str:
     """The fact in the head of this module that the training part shows, and what to try, in sentences; "" for none.
 
-    `longer` is a recording, in words, that would tell as well what inputs do that follow.
+    `longer` is a recording, in words, that would tell as well what inputs do that follow. A model that does not fit
+    (`fits`) says nothing about the motion.
     """
     if data.u is None or not model.inputs or not bool(torch.isfinite(states).all()):
         return ""
@@ -68,11 +70,13 @@ def reason_of_inputs(
     lost, unit = growth >= 1, "" if data.time_unit == "1" else data.time_unit
     if bool(lost.any()) and leaves_without_inputs(model, data, states, max_step):
         since = data.t - data.t[list(data.offsets)][data.trajectory]
+        own = "The model, and maybe the motion, is unstable"
+        what = "The motion is unstable and its inputs hold it" if fits else own
         return (
-            "The motion is unstable and its inputs hold it: with the inputs as recorded an error of the start as small "
-            f"as the noise grows to the spread of the motion within {size(float(since[lost].min()), unit, digits=2)}, "
-            "and longer runs tell a wrong start from a wrong force no more. Try several recordings, each no longer "
-            "than that"
+            f"{what}: with the inputs as recorded an error of the start as small as the noise grows to the spread of "
+            f"the motion within {size(float(since[lost].min()), unit, digits=2)}, and longer runs tell a wrong start "
+            f"from a wrong force no more. {'Try' if fits else 'If the motion is unstable, try'} several recordings, "
+            "each no longer than that"
         )
     if (left := unexplained(data, states)) < HALF:
         ways = filter(None, (*SIGNALS, longer))
@@ -200,7 +204,7 @@ def pushes(run: FittedRun, joint: Joint | None) -> str:
 def work_of_friction(run: FittedRun) -> Tensor:
     """The energy that friction gives to the training part, (), by the fitted motion from sample to sample.
 
-    Σ (F⁻/c + F⁺)·Δ − γ h p·v without inputs and constant loads, which are no friction; < 0 where it brakes.
+    Σ (F⁻/c + F⁺)·Δ/h − γ p·Δ without inputs and constant loads, which are no friction; < 0 where it brakes.
     """
     model, data = run.model, run.data.unwrapped()
     assert isinstance(model.damping, LinearDamping)
@@ -212,7 +216,8 @@ def work_of_friction(run: FittedRun) -> Tensor:
     work = -model.damping.rate * ((p[row] + p[row + 1]) / 2 * move).sum()
     forces = model.forces(q0, q1, torch.zeros_like(h), h)
     if forces is not None:
-        work = work + ((forces[0] / (-model.damping.rate * h).exp()[:, None] + forces[1]) * move).sum()
+        impulse = forces[0] / (-model.damping.rate * h).exp()[:, None] + forces[1]
+        work = work + (impulse / h[:, None] * move).sum()
     for g, text in enumerate(model.config.drag):
         if text.startswith("load"):
             assert model.drag is not None

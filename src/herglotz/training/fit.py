@@ -41,6 +41,7 @@ from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages, log_result, tensorboard_log
 from herglotz.training.summary import left_out_of, outlying_of
 from herglotz.training.uncertainty import Laplace, joint_of, laplace
+from herglotz.training.verdict import changes_with_time
 
 # Multiple of the σ of exact data. Smaller changes of the data are rounding.
 ROUNDING = 3.0
@@ -193,7 +194,8 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         fitted = OBJECTIVES[plan.objective](task, seen, plan)
-        seen = replace(seen, outlying=() if left_out else outlying(seen, fitted.model, fitted.sigma))
+        one = () if left_out else outlying(seen, fitted.model, fitted.sigma)
+        seen = replace(seen, outlying=() if one and changes_with_time(task, fitted, seen, one) else one)
         found["outlying"] = [one.as_dict() for one in seen.outlying]
         _tell_outlying(found, data)
         run = evaluate(task, seen, plan, fitted, config)

@@ -1,9 +1,10 @@
 """`reason_of`: why a model does not fit, as far as the residual shows, in words.
 
 Free runs of 20 recorded steps, whose starts are fitted, leave a residual. The curvature of parabolas through nine
-samples of the residual is the acceleration that the model lacks, known to the noise of the data. Six reasons are
+samples of the residual is the acceleration that the model lacks, known to the noise of the data. Seven reasons are
 looked for:
 
+* samples that are noise, or too far apart for the motion;
 * positions on a circle, which one angle gives, or a distance from its centre that changes; counts of an encoder;
 * inputs that were recorded more often than the motion, and changed within its steps;
 * an acceleration of something else, a crane's trolley, that was left aside;
@@ -36,7 +37,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.column_roles import is_of_others
+from herglotz.data.column_roles import is_of_others, role_of
 from herglotz.data.gaps import MEANS
 from herglotz.data.noise import SAMPLES, precisions
 from herglotz.data.polar import LENGTH, with_hints
@@ -72,6 +73,9 @@ FOLDS, PIECES = 8, 16
 # Most samples of a regression: an inverse takes about 5 ms.
 MOST_PREDICTED = 400
 
+# The start of the reason of a law that changes with time.
+OF_TIME = "What is missed changes with time where positions, velocities and inputs are alike"
+
 
 def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
@@ -86,8 +90,7 @@ def reason_of_data(data: Trajectories) -> str:
         )
     if others := [x for x, role, unit in data.columns if role == "left aside" and is_of_others(unit, data.units)]:
         verb, they = ("was", "it is") if len(others) == 1 else ("were", "they are")
-        names = ",".join([*(x for x, role, _ in data.columns if role == "input"), *others])
-        return f"{', '.join(others)} {verb} left aside, and {they} of no coordinate. Try --inputs {shlex.quote(names)}"
+        return f"{', '.join(others)} {verb} left aside, and {they} of no coordinate. Try {_as_inputs(data, others)}"
     if names := filled_inputs(data):
         some, was, its = ("input", "was", "its") if len(names) == 1 else ("inputs", "were", "their")
         return (
@@ -95,15 +98,32 @@ def reason_of_data(data: Trajectories) -> str:
             "act at times between rows. Try the records of both before they were merged, or blank cells where nothing "
             "was recorded"
         )
+    if _is_white(data):
+        return (
+            "Neighbouring samples tell nothing of each other: they are too far apart for the motion, or noise. Try a "
+            "recording with more samples in the same time"
+        )
     return ""
+
+
+def _is_white(data: Trajectories) -> bool:
+    """Whether the noise of every coordinate is of the size of its spread; an angle that turns has one on the circle."""
+    turning = torch.tensor(data.angles, device=data.q.device)
+    q = torch.cat([data.q[:, ~turning], data.q[:, turning].sin(), data.q[:, turning].cos()], 1)
+    noise = precisions(Trajectories.of(data.t, q, data.lengths)).to(q)
+    return bool((torch.isfinite(noise) & (noise > HALF * q.std(0))).all())
 
 
 def reason_of(
     data: Trajectories,
     miss: Tensor,  # (N, n) residual at the samples, in units of q
     owner: Tensor,  # (N,) free run of each sample
+    level: str = "",
 ) -> str | None:
-    """The reason of a misfit, and what to try, in sentences; "" where none is shown, None where noise hides it."""
+    """The reason of a misfit, and what to try, in sentences; "" where none is shown, None where noise hides it.
+
+    `level` is that of the model, which is not offered once more.
+    """
     at = _Parabolas(data, owner, SAMPLES)
     if len(at.rows) < FEW:
         return ""
@@ -126,13 +146,32 @@ def reason_of(
         return None if hidden > OTHER else ""
     if by_time < min(by_past, HALF * by_state):
         return (
-            "What is missed changes with time where positions, velocities and inputs are alike, as where a mass grows "
-            "or leaks. Try shorter recordings, each with a fit of its own, or what changes as an input (--inputs)"
+            f"{OF_TIME}, as where a mass grows or leaks. Try shorter recordings, each with a fit of its own, or what "
+            "changes as an input (--inputs)"
         )
     return (
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
-        "what was not recorded. Try --level full, whose action remembers, or record what else acts (--inputs)"
+        f"what was not recorded. Try {' or '.join(_ways_to_the_past(data, level))}"
     )
+
+
+def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
+    """What to try where the present state and the inputs do not give the force: only what a fit would take."""
+    ways = [] if data.u is not None or level == "full" else ["--level full, whose action remembers,"]
+    # A name that is none of a rate: the unit alone has left such a column aside.
+    others = [
+        name for name, role, unit in data.columns
+        if role == "left aside" and role_of(name, unit).role in ("rate", "dropped")
+        and role_of(name, "").role in ("q", "input")
+    ]  # fmt: skip
+    if others:
+        return [*ways, f"{_as_inputs(data, others)}, which takes {', '.join(others)}, left aside so far"]
+    return [*ways, "a record of what else acts (--inputs)"]
+
+
+def _as_inputs(data: Trajectories, others: list[str]) -> str:
+    """The flag that takes these columns for inputs as well."""
+    return f"--inputs {shlex.quote(','.join([*(x for x, role, _ in data.columns if role == 'input'), *others]))}"
 
 
 class _Parabolas:

@@ -21,6 +21,7 @@ from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import MARGIN
+from herglotz.training.errors_of_runs import APART, EXACT_ENOUGH
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import run_on
 from herglotz.training.problems.grid import segment_grid
@@ -210,6 +211,18 @@ def missed_from_best_start(run: FittedRun, data: Trajectories) -> tuple[float, .
     with torch.no_grad():
         missed = (found.problem.misfit(found.path) * data.balance)[data.complete]
     return tuple(missed.square().mean(0).sqrt().tolist())
+
+
+def longer_warmup(found: Prediction, best: tuple[float, ...]) -> int | None:
+    """The warm-up whose start would miss about what the `best` start does, if a coordinate is far from that; else None.
+
+    The error of a velocity, σ √12 / (T √K), falls with K to the power 3/2. Half of the recording is left to predict.
+    """
+    spreads = found.data.q.std(0, correction=0).tolist()
+    each = zip(found.rms_per_coordinate or (), best, spreads, strict=False)
+    ratio = max((error / least for error, least, size in each if error > EXACT_ENOUGH * size and least), default=0.0)
+    count = min(math.ceil(found.warmup * ratio ** (2 / 3)), min(found.data.lengths) // 2)
+    return count if ratio > APART and count > found.warmup else None
 
 
 def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:

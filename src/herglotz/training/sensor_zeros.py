@@ -30,6 +30,8 @@ from herglotz.training.trajectory_fit import STAGE
 
 # Fits of a drift, one after the other.
 DRIFT_FITS = 5
+# The start of the note on zeros that agree: a model has no reason to take them for those of sensors.
+CENTRE = "alike in all recordings, so that the terms of the model are about them: "
 # Least size of a significant zero, in standard deviations.
 SIGNIFICANT = 5.0
 # Strides in the parts of a recording whose zeros are fitted: all parts, or every m-th if some cannot be followed.
@@ -158,7 +160,8 @@ def in_words(z: Tensor, deviations: Tensor, reference: int) -> str:
     """The zeros and their standard deviations, as a note for the report."""
     own = deviations[reference] > 0
     if bool(own.all()):
-        return f"zeros: {sure(z, deviations)}"
+        differ = bool(clear(z - z.mean(0), deviations).any())
+        return f"{'zeros: ' if differ else CENTRE}{sure(z, deviations)}"
     some = ", of some coordinates," if bool(own.any()) else ""
     return f"zeros that differ{some} from those of recording {reference}: {sure(z, deviations)}"
 

@@ -44,9 +44,9 @@ from herglotz.training.feedback import (
 from herglotz.training.flow import motion
 from herglotz.training.following import HALF
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
-from herglotz.training.left_out import beside
+from herglotz.training.left_out import LeftOut, beside
 from herglotz.training.look import Look
-from herglotz.training.missed import MOST, reason_of, reason_of_data
+from herglotz.training.missed import MOST, OF_TIME, reason_of, reason_of_data
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
 from herglotz.training.problems.robust import FEW, FREEDOM, far_out, scale_of
@@ -95,7 +95,7 @@ def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: flo
 def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: str = "") -> str:
     """The reason that the inputs, and residuals above the noise (`missed`), show, or ""; `longer` is a remedy too."""
     known = fitted.states[~seen.spikes]
-    reason = reason_of_inputs(fitted.model, task.data, known, task.base.model_step, longer)
+    reason = reason_of_inputs(fitted.model, task.data, known, task.base.model_step, longer, not missed)
     return ". ".join(filter(None, (reason, _reason_of_residuals(task, fitted, seen) if missed else "")))
 
 
@@ -111,11 +111,22 @@ def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:
         # A model that cannot be stepped explains nothing: what it misses is the motion.
         miss = data.q if found is None else found.problem.misfit(found.path) * data.balance
         grid = found and found.problem.grid
-        reason = reason_of(data, miss, data.trajectory if grid is None else grid.node // (grid.longest + 1))
+        owner = data.trajectory if grid is None else grid.node // (grid.longest + 1)
+        reason = reason_of(data, miss, owner, task.config.level)
         if min(train.lengths) < 2 * FIRST_SEGMENT or coarse(half := train.thinned(2)):
             break
         train, steps = half, 2 * steps
     return reason or ""
+
+
+def changes_with_time(task: Task, fitted: Fitted, seen: Look, outlying: tuple[LeftOut, ...]) -> bool:
+    """Whether a model misses what changes with time, in the recordings that are not `outlying`, too.
+
+    Such a law, of a mass that grows, misses one recording most and is the law of all.
+    """
+    out = {one.recording for one in outlying}
+    train = seen.train.select([b for b in range(len(seen.train)) if b not in out])
+    return _reason_of_residuals(task, fitted, replace(seen, train=train)).startswith(OF_TIME)
 
 
 def _gross(windows: Tensor, data: Trajectories) -> Tensor:
@@ -163,7 +174,8 @@ def judged(
     words = ". ".join(filter(None, (misread(kept, seen, errors.missed), *reasons)))
     caveat = caveat_of_inputs(model, train, states)
     beyond = partial(unseen_outlier, seen, everywhere)
-    return {"verdict": in_words(errors, ahead, metrics, shown, words, caveat, beyond)} | kept_numbers
+    told = metrics | {"driven": train.u is not None}
+    return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond)} | kept_numbers
 
 
 def _errors(kept: Trajectories, unit: Tensor, missed: tuple[Tensor, Tensor | None, Tensor | None], out: int) -> Errors:
@@ -310,7 +322,10 @@ def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], be
         return beyond() or other
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
-    return "A force is missing. Try --objective smoothing, another --level (herglotz select), or a --feature for it"
+    ways = [] if metrics["objective"] == "smoothing" else ["--objective smoothing"]
+    # Inputs leave one level.
+    ways += [] if metrics.get("driven") else ["another --level (herglotz select)"]
+    return f"A force is missing. Try {', or '.join([*ways, 'a --feature for it'])}"
 
 
 def _rms(x: Tensor) -> float:

@@ -41,6 +41,14 @@ def test_files_and_words(tiny_run, other_csv, tmp_path, capsys):
     assert (tmp_path / "motion.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_a_longer_warm_up_is_named(tiny_run, other_csv, capsys, monkeypatch):
+    # fails if the warm-up that would do stays with the program
+    monkeypatch.setattr("herglotz.training.predict.longer_warmup", lambda *_: 37)
+    assert main(["predict", str(tiny_run), str(other_csv)]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the start that 20 samples tell misses, and not the model; try --warmup 37" in said
+
+
 @pytest.fixture(scope="module")
 def two_rates(tmp_path_factory):
     """Two recordings of a damped spring under a force; the force is written at other times than the position."""

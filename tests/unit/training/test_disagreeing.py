@@ -18,6 +18,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.disagreeing import _bends, _followed
 from herglotz.training.left_out import LeftOut, reach, since
+from herglotz.training.missed import OF_TIME
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
@@ -280,3 +281,22 @@ def test_the_whole_dictionary_is_asked_whether_a_recording_bends_the_model(monke
     seen: Any = SimpleNamespace(kept=data, data=data, settings=settings)
     assert not disagreeing._bends(seen, 0)
     assert asked == ([(0, 0)] if offers is None else [offers] if offers else [])
+
+
+def test_a_law_that_changes_with_time_is_that_of_all_recordings():
+    # fails if the recording that a mass that grows bends the model of most is said to be of something else
+    of, t = torch.Generator().manual_seed(0), 0.02 * torch.arange(400).double()
+
+    def swings(growth):
+        """(1 + growth t) q″ = −30 q − (0.3 + growth) q′ from three starts."""
+        x, q = torch.tensor([[0.1, 0.08, 0.06], [0.0, 0.0, 0.0]], dtype=torch.float64), []
+        for now in t:
+            q.append(x[0])
+            mass = 1 + growth * float(now)
+            x = step(lambda x, m=mass: torch.stack([x[1], (-30 * x[0] - (0.3 + growth) * x[1]) / m]), x, 0.02)
+        read = torch.stack(q, 1).reshape(-1) + 1e-4 * torch.randn(3 * len(t), generator=of, dtype=torch.float64)
+        return Trajectories.of(t.repeat(3), read, (len(t),) * 3, units=("m",), names=("x",))
+
+    run = fit(swings(0.05), plan=fit(swings(0.0), progress=False), progress=False)
+    assert run.metrics["outlying"] == []
+    assert OF_TIME in run.metrics["verdict"], run.metrics["verdict"]

@@ -22,6 +22,7 @@ from herglotz.training.feedback import (
     leaves_without_inputs,
     reason_of_inputs,
     reason_of_set_points,
+    work_of_friction,
 )
 from herglotz.training.following import unexplained
 from herglotz.training.foresight import Foresight
@@ -74,6 +75,8 @@ def test_the_reason_is_what_is_measured(stiffness, moved, expected):
     assert reason.startswith(expected)
     assert bool(reason) == bool(expected)
     if stiffness < 0:
+        # fails if a model that does not fit says of the motion what is true of the model alone
+        assert reason_of_inputs(model, data, states, H, fits=False).startswith("The model, and maybe the motion, is un")
         # exp(2.95 t)/2 = spread / noise
         t = math.log(2 * float(data.q.std(correction=0)) / NOISE) / 2.95
         said = float(re.findall(r"within ([\d.]+)", reason)[0])
@@ -208,3 +211,16 @@ def test_the_law_of_machine_and_controller_competes():
     assert said.startswith("does not fit: "), said
     assert "and the model has no effect of theirs: its equation is that of the machine with the controller" in said
     assert exit_code(run) == 3
+
+
+def test_the_work_of_friction_has_all_its_terms_in_one_unit():
+    # fails if forces are impulses beside the power of damping: −0.3 θ′ + 1.5 tanh θ′ was said to drive the motion
+    one = (1.0,)
+    model = ContactLagrangian(ModelConfig((False,), "forced", one, one, one, (0.0,), potential_width=0, rate=-0.3))
+    with torch.no_grad():
+        model.friction.viscous.fill_(0.5)
+    t = H * torch.arange(K, dtype=torch.float64)
+    q, p = t.cos()[:, None], -t.sin()[:, None]
+    run = SimpleNamespace(model=model, data=Trajectories.of(t, q), train_lengths=(K,), states=SimpleNamespace(q=q, p=p))
+    expected = -0.2 * float((q.diff(dim=0).square() / H).sum())
+    assert float(work_of_friction(cast(Any, run)).detach()) == pytest.approx(expected, rel=1e-3)

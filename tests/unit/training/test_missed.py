@@ -75,6 +75,41 @@ def test_what_a_residual_shows(what):
         assert ("Try " in (found or "")) is bool(said)
 
 
+@pytest.mark.parametrize(
+    ("driven", "level", "columns", "ways"),
+    [
+        (False, "forced", (), "--level full, whose action remembers, or a record of what else acts (--inputs)"),
+        (False, "full", (), "a record of what else acts (--inputs)"),
+        (True, "forced", (), "a record of what else acts (--inputs)"),
+        (True, "forced", (("wind", "left aside", "m/s"),), "--inputs volt,wind, which takes wind, left aside so far"),
+        (True, "forced", (("x_ref", "left aside", "mm"),), "a record of what else acts (--inputs)"),
+        (True, "forced", (("speed", "left aside", "m/s"), ("dx", "left aside", "m/s")), "a record of what else acts"),
+    ],
+)
+def test_a_remedy_would_run(driven, level, columns, ways):
+    # fails if the level full is offered where it takes no inputs, or was tried; or if a column that its unit alone left
+    # aside is not named, or one is that the user dropped or that is a rate of the motion
+    u = torch.randn(N, 1, generator=MAKE, dtype=torch.float64) if driven else None
+    columns = (("x", "coordinate", "mm"), *((("volt", "input", "V"),) if driven else ()), *columns)
+    data = Trajectories.of(T, noisy()[:, None], u=u, names=("x",), units=("mm",), columns=columns)
+    found = reason_of(data, left(0.2 * Q.roll(40)), OWNER, level) or ""
+    assert f"not recorded. Try {ways}" in found, found
+
+
+@pytest.mark.parametrize(
+    ("driven", "objective", "ways"),
+    [
+        (False, "trajectory", "--objective smoothing, or another --level (herglotz select), or a --feature for it"),
+        (True, "smoothing", "a --feature for it"),
+    ],
+)
+def test_what_was_tried_and_what_inputs_leave_no_choice_of_is_no_remedy(driven, objective, ways):
+    # fails if another level is offered for inputs, which one level takes, or the objective that missed
+    metrics = {"follows_data": True, "objective": objective, "driven": driven}
+    text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, metrics)
+    assert text.endswith(f"A force is missing. Try {ways}"), text
+
+
 def test_neighbours_are_of_other_times():
     # fails if the samples before and behind, which lack the same as all that changes slowly does, are the neighbours
     q = torch.sin(0.3 * T) + 0.6 * torch.sin(0.3 * math.sqrt(2.3) * T + 1)
@@ -113,7 +148,7 @@ def test_steps_so_short_that_noise_hides_a_force_are_thinned(hidden, start, nois
     data = {"t[s]": t, "x[m]": q, "force[N]": u}
     run = fit(data, level="forced", features="q1^2", objective="trajectory", progress=False)
     assert run.metrics["window_rms"] > 1.5 * noise
-    assert ("record what else acts" in run.metrics["verdict"]) is hidden, run.metrics["verdict"]
+    assert ("a record of what else acts" in run.metrics["verdict"]) is hidden, run.metrics["verdict"]
 
 
 def test_a_model_that_cannot_be_stepped_is_judged_by_the_motion(monkeypatch):
@@ -133,7 +168,7 @@ def test_residuals_are_in_units_of_q(monkeypatch):
     grid = SimpleNamespace(node=torch.arange(N), longest=N)
     problem, asked = SimpleNamespace(misfit=lambda _: torch.ones(N, 2), grid=grid), []
     monkeypatch.setattr(verdict, "with_own_starts", lambda *_: SimpleNamespace(problem=problem, path=None))
-    monkeypatch.setattr(verdict, "reason_of", lambda _, miss, __: asked.append(miss) or "")
+    monkeypatch.setattr(verdict, "reason_of", lambda _, miss, *__: asked.append(miss) or "")
     data = Trajectories.of(T, torch.stack([Q, 100 * Q], -1), units=("rad", "mm"))
     seen: Any = SimpleNamespace(train=data, outlying=())
     fitted: Any = None
@@ -172,6 +207,17 @@ def test_what_was_warned_of_when_the_table_was_read_is_the_reason():
     assert "if a length changes: --polar x,y,X,Y,r" in reason_of_data(swing)
     counts = with_angles_in_degrees(Trajectories.of(T, (900 * Q).round(), names=("wheel",)), None, None, None)
     assert reason_of_data(counts).startswith("Whole numbers without a unit, wheel may be counts of an encoder: if")
+
+
+@pytest.mark.parametrize("angle", [False, True])
+@pytest.mark.parametrize(("step", "told"), [(1, False), (60, True)])
+def test_samples_that_are_too_far_apart(angle, step, told):
+    # fails if a force is missing from a model of samples without a neighbour; or if an angle that turns, whose spread
+    # grows for ever, is not told; or if finer samples of the same motion are
+    t = torch.arange(500, dtype=torch.float64) * step
+    q = 2 * (0.11 * t + 1.5 * torch.sin(0.071 * t) + 1.1 * torch.sin(0.0317 * t + 1))
+    found = reason_of_data(Trajectories.of(t, (q if angle else torch.sin(q))[:, None], angles=(angle,)).unwrapped())
+    assert found.startswith("Neighbouring samples tell nothing of each other") is told, found
 
 
 def test_neighbours_that_are_far_tell_nothing():

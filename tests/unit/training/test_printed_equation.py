@@ -25,6 +25,7 @@ from herglotz.training.feedback import acting_inputs
 from herglotz.training.fit import _of_short_steps
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.recorded_range import box_of
+from herglotz.training.sensor_zeros import CENTRE
 from herglotz.training.uncertainty import joint_of
 
 fit_module = sys.modules["herglotz.training.fit"]
@@ -223,6 +224,9 @@ def test_delay_and_lag_stand_below_the_equation(monkeypatch):
     assert "acting 0.02 s later, through a lag T = 0.05 s" in notes
     assert "being what acts, taken as exact in the deviations above" in notes
     assert "less the zero of its sensor (x 0.01; theta 0.02)" in notes
+    # fails if the place of a bend of the law is said to be the zero of a sensor
+    run.metrics["plan"]["reasons"] = {"zeros": f"{CENTRE}0.01 ± 0.001"}
+    assert "less the place that terms are about (x 0.01; theta 0.02)" in " ".join(notes_of(run))
 
 
 def test_networks_are_said_to_be_no_formula():

@@ -21,7 +21,7 @@ from herglotz.training.predict import predict
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import drifts, in_words, means, zeros_of_one
+from herglotz.training.sensor_zeros import CENTRE, drifts, in_words, means, zeros_of_one
 from herglotz.training.stages import Stages
 from herglotz.training.structure import kept_structure
 from herglotz.training.task import build_model
@@ -119,17 +119,19 @@ def test_zeros_of_angles_have_no_turns():
 
 
 @pytest.mark.parametrize(
-    ("reference", "words"),
+    ("reference", "other", "words"),
     [
-        ((0.1, 0.1), "zeros: "),
-        ((0.1, 0.0), "zeros that differ, of some coordinates, from those of recording 0: "),
-        ((0.0, 0.0), "zeros that differ from those of recording 0: "),
+        ((0.1, 0.1), 3.0, "zeros: "),
+        ((0.1, 0.1), 1.2, CENTRE),
+        ((0.1, 0.0), 1.0, "zeros that differ, of some coordinates, from those of recording 0: "),
+        ((0.0, 0.0), 1.0, "zeros that differ from those of recording 0: "),
     ],
 )
-def test_the_note_says_what_zeros_are_beside(reference, words):
-    # fails if zeros of one coordinate are said to be beside the reference, or not, as those of another are
+def test_the_note_says_what_zeros_are_beside(reference, other, words):
+    # fails if zeros of one coordinate are said to be beside the reference, or not, as those of another are; or if what
+    # all recordings have alike, where a bend of the law lies, is said to be the zero of a sensor
     deviations = torch.tensor([reference, (0.1, 0.1)])
-    assert in_words(torch.ones(2, 2), deviations, 0).startswith(words)
+    assert in_words(torch.tensor([[1.0, 1.0], [1.0, other]]), deviations, 0).startswith(words)
 
 
 def test_the_covariance_does_not_depend_on_units():
