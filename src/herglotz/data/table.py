@@ -38,7 +38,7 @@ def from_table(
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     columns, values = _without_blank(columns, values)
     recordings = _recordings(path, labels, np.asarray(at), values)
-    recordings, repairs = _with_clocks(recordings, bool(np.isnan(values).any()), columns.units[columns.time] or "s")
+    recordings, repairs = _with_clocks(recordings, bool(np.isnan(values).any()), columns)
     recordings, unordered = usable(path, recordings, lambda one: _in_time(path, columns, one))
     recordings, filled, hold = completed(recordings, columns, columns.hold)
     recordings, too_few = usable(path, recordings, lambda one: _with_enough(path, columns, one))
@@ -76,12 +76,12 @@ def _without_blank(columns: Columns, values: np.ndarray) -> tuple[Columns, np.nd
     return replace(columns, q=q, notes=(*columns.notes, note)), values[:, kept]
 
 
-def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:
+def _with_clocks(recordings: list[Recording], blank: bool, columns: Columns) -> tuple[list[Recording], list[str]]:
     """The recordings sorted by time, without repeated stamps, and a note on the first repair and the number of others.
 
     Only rows with blank cells may be stacked tables, whose rows have to be sorted.
     """
-    made = [without_repeats(in_order(one) if blank else one, unit) for one in recordings]
+    made = [without_repeats(in_order(one) if blank else one, columns) for one in recordings]
     notes = [note for _, note in made if note]
     more = f", and so of {len(notes) - 1} more recordings" if len(notes) > 1 else ""
     return [one for one, _ in made], [f"{note}{more}" for note in notes[:1]]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from herglotz.data import as_trajectories, load
+from herglotz.data.clocks import numbers_of_rows
 from herglotz.data.csv_format import write_csv
 from herglotz.errors import InputError
 
@@ -89,9 +90,59 @@ def test_stamps_that_count_too_slowly_are_a_clock(tmp_path, capsys, rate, way):
     assert np.diff(found) == pytest.approx(np.full(299, 1 / rate), rel=2e-3)
     assert np.abs(found - t).max() < 1.1e-3
     said = (
-        f"warning: a.csv: stamps repeat in counts of 0.001 s; rows are taken to be {np.diff(found).mean():.4g} s apart"
+        f"warning: a.csv: {300 - len(np.unique(stamps))} of 300 rows have the stamp of the row before: stamps count "
+        f"0.001 s, and rows are taken to be {np.diff(found).mean():.4g} s apart, as their number says"
     )
     assert said in capsys.readouterr().err
+
+
+def lossy(rate, n, share, start=0.3, seed=0):
+    """Times and stamps in counts of 1 of samples of a clock that loses this share of them."""
+    kept = np.random.default_rng(seed).random(n) >= share
+    t = (np.arange(n)[kept] + start) / rate
+    return t, np.floor(t)
+
+
+@pytest.mark.parametrize(("rate", "share"), [(2.5, 0.1), (2.5, 0.3), (np.pi, 0.1), (1.37, 0.05)])
+def test_rows_that_are_missing_leave_a_clock(tmp_path, capsys, rate, share):
+    # fails if a lost row makes a stamp of all the rows that have it, a row whose tick is unknown has a position, or
+    # the inputs of such a row are lost
+    t, stamps = lossy(rate, 3000, share)
+    path = written(tmp_path, "t[ms],x,u", np.column_stack([stamps, t * t, t]).tolist())
+    data = load(path)
+    found, x = 1e3 * data.t.numpy(), data.q[:, 0].numpy()
+    late = found - t[np.isin(t * t, x)]
+    assert np.ptp(late) < 0.01
+    assert abs(late.mean()) < 1
+    at, rows = np.unique(stamps, return_counts=True)
+    ticks = np.array([((np.arange(3000) + 0.3) / rate // 1 == k).sum() for k in at])
+    # Of the ticks at 1.37 in a count, one of 137 is at the end of a count.
+    assert data.samples == pytest.approx(rows[rows == ticks].sum(), rel=1e-2)
+    err = capsys.readouterr().err
+    assert "rows have the stamp of the row before: stamps count 1 ms, and rows are taken to be" in err
+    assert f"{len(t) - data.samples} rows, whose stamps do not tell beside which rows, have no position" in err
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        np.repeat(np.arange(1000), 1 + (np.random.default_rng(0).random(1000) < 0.1)),
+        np.sort(np.random.default_rng(0).integers(0, 400, 1000)),
+        np.sort(np.floor(np.arange(1000) / 2.5 + 0.2 * np.random.default_rng(0).standard_normal(1000))),
+        np.repeat(10 * np.arange(100), 10),
+        np.floor(lossy(1.37, 3000, 0.05)[0] + 0.02 * np.sin(np.arange(2840))),
+    ],
+    ids=[
+        "rows at random",
+        "times at random",
+        "stamps that jitter",
+        "batches",
+        "the reflection of a clock that jitters",
+    ],
+)
+def test_stamps_that_show_no_clock(stamps):
+    # fails if a clock is read into stamps that none made
+    assert numbers_of_rows(stamps.astype(float), 1e-3) is None
 
 
 def test_stamps_in_milliseconds(tmp_path):  # fails if counts are looked for in seconds alone
