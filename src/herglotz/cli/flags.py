@@ -216,7 +216,8 @@ READING = (
          type=names, metavar="NAMES"),
     flag("--polar", "positions of a body on a circle that become one angle: x,y (centre and radius by least squares), "
          "x,y,X,Y with the centre in numbers or columns, x,y,X,Y,r keeps the distance r; x,-y where y grows "
-         "downwards; again for the next body of a chain; none to leave positions as they are",
+         "downwards, -Y of the centre's column too; again for the next body of a chain; none to leave positions "
+         "as they are",
          action="append", metavar="X,Y"),
     flag("--input-terms", "terms of inputs that act beside them, with commas: V^2, |V|, V', sat(V/2) or tanh(V/2) "
          "of an input V, 2 being the level at which it saturates (default: those that the data ask for)",
