@@ -48,7 +48,11 @@ def data_of(arguments: argparse.Namespace, columns: dict[str, Any]) -> tuple[Tra
         kept = ", ".join(f"{name} {_in_words(x)}" for name, x in before.items() if reading[name] is x)
         say(f"herglotz: note: read as {arguments.config} says: {kept or 'nothing, flags stand over it'}", sys.stderr)
     data = load(arguments.data, **{name: x for name, x in reading.items() if name != "every"})
-    return data.thinned(reading.get("every", 1)), reading
+    every = reading.get("every", 1)
+    if every != 1 and (count := int((~data.complete).sum())):
+        say(f"herglotz: note: --every counts complete samples: {count} that miss a position are left out", sys.stderr)
+    # Each sample may be asked for where some miss a position, which has no weight in a fit.
+    return data if every == 1 else data.thinned(every), reading
 
 
 def _in_words(value: Any) -> str:
@@ -212,7 +216,8 @@ READING = (
          type=names, metavar="NAMES"),
     flag("--polar", "positions of a body on a circle that become one angle: x,y (centre and radius by least squares), "
          "x,y,X,Y with the centre in numbers or columns, x,y,X,Y,r keeps the distance r; x,-y where y grows "
-         "downwards; again for the next body of a chain; none to leave positions as they are",
+         "downwards, -Y of the centre's column too; again for the next body of a chain; none to leave positions "
+         "as they are",
          action="append", metavar="X,Y"),
     flag("--input-terms", "terms of inputs that act beside them, with commas: V^2, |V|, V', sat(V/2) or tanh(V/2) "
          "of an input V, 2 being the level at which it saturates (default: those that the data ask for)",

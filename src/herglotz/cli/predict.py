@@ -155,6 +155,9 @@ def _report(found: Prediction, arguments: argparse.Namespace, best: tuple[float,
     if found.zeros:
         zeros = zip(found.data.names, found.zeros, found.data.units, strict=True)
         rows.append(("sensors at 0", ", ".join(f"{name} {size(x, unit, name in degrees)}" for name, x, unit in zeros)))
+    for name, turns in zip(found.data.names, zip(*found.turns, strict=True), strict=False):
+        if any(turns):
+            rows.append(("whole turns", f"{name} {', '.join(f'{k:+d}' for k in turns)}, added as the warm-up asks"))
     rows += [("steps", steps)] if (steps := _steps(found)) else []
     print_table(rows)
 

@@ -248,41 +248,33 @@ def numbers_runs(column: np.ndarray, anew: np.ndarray, again: bool = False) -> b
     return constant and (again or len(np.unique(column)) == len(runs)) and float(np.median(runs)) >= MIN_SAMPLES
 
 
-def out_of_order(
-    values: np.ndarray, anew: np.ndarray, names: Sequence[str], row: int, unit: str, group: str = ""
-) -> str:
-    """The remedy for times that do not increase where `anew` (N - 1,) is true, first at `row` of the table.
+def out_of_order(values: np.ndarray, anew: np.ndarray, names: Sequence[str]) -> str:
+    """The remedy for times that do not increase where `anew` (N - 1,) is true, and that begin no recordings there.
 
-    A column that changes there and nowhere else numbers the recordings. Time that falls once, to go on from there, is
-    a clock that was set back, or a second recording: sorted rows would mix the two motions. `names` are those of the
-    columns, time first; `group` is the column that numbers the recordings, "" for none.
+    A column that changes there and nowhere else numbers the recordings. `names` are those of the columns, time first.
     """
-    numbered = [name for name, own in zip(names, values.T, strict=True) if numbers_runs(own, anew)]
-    if numbered:
-        return f"column '{numbered[0]}' changes wherever time starts anew: --group {numbered[0]} (group= in Python)"
-    if _goes_on(values[:, 0], anew):
-        size = f"{-float(np.diff(values[:, 0]).min()):.4g}" + ("" if unit == "1" else f" {unit}")
-        remedy = f"give the rows from there another value in column '{group}'" if group else (
-            "number the two in a column and give --group NAME (group= in Python)"
-        )  # fmt: skip
-        return (
-            f"time goes back once, by {size}, and goes on from there: the clock was set back, or a second recording "
-            f"begins; cut the table before row {row} (two files in a folder are two recordings), or {remedy}"
-        )
-    return (
+    return numbering(values, anew, names) or (
         "sort the rows, delete one, or number the trajectories in a column 'trajectory' (another name: --group NAME, "
         "group= in Python)"
     )
 
 
-def _goes_on(t: np.ndarray, anew: np.ndarray) -> bool:
-    """Whether times (N,) fall once, and those before and behind overlap by as many rows as a recording has at least.
+def numbering(values: np.ndarray, anew: np.ndarray, names: Sequence[str]) -> str:
+    """The words on a column that changes wherever `anew` (N - 1,) is true, and nowhere else; "" for no column."""
+    found = [name for name, own in zip(names, values.T, strict=True) if numbers_runs(own, anew)]
+    if not found:
+        return ""
+    return f"column '{found[0]}' changes wherever time starts anew: --group {found[0]} (group= in Python)"
 
-    A single wrong stamp overlaps on one side only, and a block of rows in another place does not overlap.
+
+def begins_anew(before: np.ndarray, behind: np.ndarray) -> bool:
+    """Whether a clock fell back between two runs of increasing times: they are passed twice, or come before all others.
+
+    The runs overlap by as many rows as a recording has at least, in either of them, or all these rows of the second run
+    are earlier than the first run. A single wrong stamp overlaps on one side only, and a block of rows in another place
+    does not overlap.
     """
-    falls = np.flatnonzero(anew)
-    if len(falls) != 1:
-        return False
-    before, behind = np.split(t, falls + 1)
     twice = (before >= behind[0]) & (before <= behind[-1]), behind <= before[-1]
-    return min(int(rows.sum()) for rows in twice) >= MIN_SAMPLES
+    overlap = min(int(rows.sum()) for rows in twice)
+    earlier = behind[-1] < before[0] and min(len(before), len(behind)) >= MIN_SAMPLES
+    return overlap >= MIN_SAMPLES or bool(earlier)

@@ -26,7 +26,7 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 from unicodedata import combining, normalize
 
-ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|Grad|degrés|grados|gradi|gon|revs?|turns?|arcmin|arcsec")
+ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|[Gg]rad|degrés|grados|gradi|gon|revs?|turns?|arcmin|arcsec")
 # Kinds of units, in the order of trial. With other units, such as counts or 1, the name decides the role.
 KINDS = {
     "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch(es)?|ft|feet|mils?|thou|px|pixels?"),
@@ -310,7 +310,7 @@ ENDS = (
 # What a unit of two parts begins with, beside lengths and angles: turns in French and German, litres, newtons.
 PARTS = re.compile(r"tr|U|m?[lL]|[km]?N")
 # Units that are letters of bodies or words as well.
-AMBIGUOUS = re.compile(r"[mNAV]|cm|km|psi|bar")
+AMBIGUOUS = re.compile(r"[mNAV]|cm|km|psi|bar|grad")
 INDEX = re.compile(r"[^\W_]|\d+")
 
 

@@ -187,7 +187,8 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     from the first row. A number in brackets belongs to the name: `position[0]`. `trajectory`, `trial`, `run`,
     `experiment`, `Versuch`, `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a
     warning, a column that changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or
-    text. Beside it text, and numbers without a unit and a usual name, that are the same in every row are left aside.
+    text. A clock that falls back within such a group, or without one, begins a recording, with a warning. Text, and
+    numbers without a unit and a usual name, that are the same in every row are left aside beside other coordinates.
     `s` is the action, `p`/`p_*` are momenta. Of other columns the unit decides before the name
     (`herglotz.data.column_roles`): rad, deg, m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs; m/s, rad/s, rpm
     rates; rates are left aside, and so are °C, Pa, W, and, unless no other column is a coordinate, Wb, T, H and F. A

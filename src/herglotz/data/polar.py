@@ -24,6 +24,8 @@ from herglotz.least_squares import least_squares
 
 # Begins the remedy for a distance that changes.
 LENGTH = "if a length changes: "
+# Part of the warning of a pair that stays on a circle, by which the warning is found among notes.
+CIRCLE = "stay on a circle about"
 # Role, in the table of columns, of an angle that was computed from positions.
 POLAR = "polar"
 # More samples do not change a circle.
@@ -40,8 +42,9 @@ ROUNDING = 1e-12
 class Pair:
     """Two columns that hold the position of a body, and the centre of its circle.
 
-    A sign is −1 if its axis grows the other way. The centre is two columns, two numbers in the unit of the columns, or
-    None: to be found. `inherited` marks a centre from another recording; `distance`: r is a coordinate too.
+    A sign is −1 if its axis grows the other way, that of the centre's column too. The centre is two columns, two
+    numbers in the unit of the columns, or None: to be found. `inherited` marks a centre from another recording;
+    `distance`: r is a coordinate too.
     """
 
     x: str
@@ -99,7 +102,11 @@ def _pair(text: str) -> Pair:
     refuse({f"polar: {text!r}: give both numbers of the centre, or both columns": len(set(numbers)) > 1})
     if not numbers:
         return Pair(x, y, signs)  # type: ignore[arg-type]
-    heads = [(name_and_unit(part) or (part, ""))[0] for part in parts[2:]]
+    own = [part if numbers[0] else part.removeprefix("-") for part in parts[2:]]
+    other = [f"-{name}" for name, part, sign in zip(own, parts[2:], signs, strict=True) if name != part and sign > 0]
+    refuse({f"polar: {text!r}: {', '.join(other)} of the centre has a sign that its axis has not; an axis that grows "
+            "the other way has it at the position": other})  # fmt: skip
+    heads = [(name_and_unit(part) or (part, ""))[0] for part in own]
     centre = tuple(map(float, parts[2:])) if numbers[0] else tuple(heads)
     return Pair(x, y, signs, centre, distance=distance)  # type: ignore[arg-type]
 
@@ -224,7 +231,8 @@ def _note(data: Trajectories, pair: Pair, name: str, where: str, r: Tensor, angl
     unit, x = _unit(data, pair), pair.axes()[0]
     size = f"{float(r.mean()):.4g}{unit} to within {float(r.std(correction=0)):.2g}{unit}"
     other = replace(pair, signs=(pair.signs[0], -pair.signs[1]))
-    over = f"; if {pair.y} grows the other way: --polar {other.spec(())}" if float(angle.cos().mean()) < 0 else ""
+    centre = pair.centre if pair.centre and not pair.inherited else ()
+    over = f"; if {pair.y} grows the other way: --polar {other.spec(centre)}" if float(angle.cos().mean()) < 0 else ""
     zero = f"0 towards {other.axes()[1]}, growing towards {x}{over}"
     return f"{name} is the angle of {pair.x}, {pair.y} about {where}, at {size}; {zero}"
 
@@ -290,43 +298,72 @@ def _variance(arm: Tensor) -> float:
     return float(_radii(arm).var(correction=0))
 
 
-def with_hints(data: Trajectories) -> Trajectories:
-    """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
-    found = circles(data)
-    notes = [f"warning: {one.description}; one body on an arm? {one.remedy} makes one angle of it" for one in found]
+def with_hints(data: Trajectories, recorded: Trajectories | None = None, pairs: Sequence[Pair] = ()) -> Trajectories:
+    """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm.
+
+    The positions are those of the set as `recorded`, less those of which `pairs` made angles.
+    """
+    found = [one for one in circles(recorded or data) if {one.pair.x, one.pair.y} <= set(data.names)]
+    notes = [f"warning: {hint([one], pairs)}" for one in found]
     return replace(data, notes=(*data.notes, *notes)) if notes else data
 
 
 class Circle(NamedTuple):
     """A pair of coordinates that stays on a circle.
 
-    `error` is the standard deviation of the distances from the centre, `columns` the places among the coordinates.
+    `pair` has its centre where this is another pair, `beside` is the circle of that pair if it stays on one. `error` is
+    the standard deviation of the distances from the centre, `columns` the places among the coordinates.
     """
 
     description: str
-    remedy: str
+    pair: Pair
+    beside: Circle | None
     error: float
     columns: tuple[int, int]
+
+    def pairs(self) -> list[Pair]:
+        """The pair, behind that of its centre."""
+        return [*(self.beside.pairs() if self.beside else []), self.pair]
+
+
+def hint(found: Sequence[Circle], given: Sequence[Pair] = ()) -> str:
+    """These circles in words with a remedy, beside the pairs that the user gave."""
+    flags, many = remedy(found, given)
+    what = (
+        f"bodies on arms? {flags} makes one angle of each"
+        if many
+        else f"one body on an arm? {flags} makes one angle of it"
+    )
+    return f"{', and '.join(one.description for one in found)}; {what}"
+
+
+def remedy(found: Sequence[Circle], given: Sequence[Pair] = ()) -> tuple[str, bool]:
+    """The flags that make angles of these pairs, beside the pairs that the user gave, and whether there are several."""
+    known = {(pair.x, pair.y) for pair in given}
+    every = dict.fromkeys(pair for one in found for pair in one.pairs() if (pair.x, pair.y) not in known)
+    old, new = (" ".join(f"--polar {pair.spec(pair.centre or ())}" for pair in pairs) for pairs in (given, every))
+    return f"{new} (polar= in Python)" + (f" beside {old}" if old else ""), len(every) > 1
 
 
 def circles(data: Trajectories) -> list[Circle]:
     """The pairs of positions x, y that stay on a circle, about a fixed centre or about an earlier pair."""
-    found, earlier, read = [], [], complete(data)
+    found, earlier, read = {}, [], complete(data)
     for x, y in _pairs_by_name(data):
         pair = Pair(x, y)
         body = _positions(read, pair, (x, y))[:: -(-read.samples // MAX_SAMPLES)]
         fixed = circle(body)
-        centres = [(fixed, _words(data, pair, fixed)[1]), *((other, f"{one.x}, {one.y}") for one, other in earlier)]
+        others = [(other, f"{one.x}, {one.y}", (one.x, one.y)) for one, other in earlier]
+        centres = [(fixed, _words(data, pair, fixed)[1], None), *others]
         earlier.append((pair, body))
-        centre, where = min(centres, key=lambda one: _variance(body - one[0]))
+        centre, where, names = min(centres, key=lambda one: _variance(body - one[0]))
         error = _variance(body - centre) ** 0.5
         line = float(torch.linalg.svdvals(body - body.mean(0))[-1]) / math.sqrt(len(body))
         if error < ON_A_CIRCLE * line:
             r = f"{float(_radii(body - centre).mean()):.4g}{_unit(data, pair)}"
-            words, remedy = f"{x}, {y} stay on a circle about {where}, at {r}", f"--polar {x},{y} (polar= in Python)"
             places = data.names.index(x), data.names.index(y)
-            found.append(Circle(words, remedy, error, places))
-    return found
+            pair, beside = replace(pair, centre=names), None if names is None else found.get(names)
+            found[x, y] = Circle(f"{x}, {y} {CIRCLE} {where}, at {r}", pair, beside, error, places)
+    return list(found.values())
 
 
 def _pairs_by_name(data: Trajectories) -> list[tuple[str, str]]:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from herglotz.data.checks import MIN_SAMPLES
+from herglotz.data.clocks import numbers_of_rows
 from herglotz.data.csv_columns import Columns
 from herglotz.data.holds import CUBIC_POINTS, between
 from herglotz.data.trajectories import Trajectories
@@ -55,32 +56,56 @@ def in_order(one: Recording) -> Recording:
     return Recording(one.label, one.at[kept], values[kept])
 
 
-def without_repeats(one: Recording, unit: str) -> tuple[Recording, str]:
+def without_repeats(one: Recording, columns: Columns) -> tuple[Recording, str]:
     """The recording with increasing stamps, and a note on the repair; unchanged if no stamp repeats or some decrease.
 
-    If all stamps are whole counts, and equal steps miss no stamp by more than a count, the samples were taken in equal
-    steps: the number of a sample gives its time. Otherwise the first row of each stamp is kept.
+    If all stamps are whole counts, and a clock of equal steps misses no stamp by more than a count, the number of a row
+    on the clock gives its time. Rows may be lost (`herglotz.data.clocks`); where the stamps do not tell beside which
+    rows, the row keeps its inputs alone. Otherwise the first row of each stamp is kept.
     """
-    t = one.values[:, 0]
+    t, unit = one.values[:, 0], columns.units[columns.time] or "s"
     d = np.diff(t)
     if not (d == 0).any() or (d < 0).any() or not (d > 0).any():
         return one, ""
-    count, steps = float(d[d > 0].min()), np.arange(len(t)) - (len(t) - 1) / 2
-    h = float(steps @ (t - t.mean()) / (steps @ steps))
-    even, counts = t.mean() + h * steps, (t - t[0]) / count
-    whole = bool((np.abs(counts - counts.round()) <= COUNT_TOLERANCE).all()) and bool((np.abs(even - t) <= count).all())
-    twice = d == 0
+    count, twice = float(d[d > 0].min()), d == 0
     # Whether each of these rows is that before it, written twice.
     same = np.array_equal(one.values[1:][twice], one.values[:-1][twice], equal_nan=True)
-    if whole and int(twice.sum()) >= MIN_SAMPLES and not same:
-        values = np.column_stack([even, one.values[:, 1:]])
+    if int(twice.sum()) >= MIN_SAMPLES and not same and (found := _on_a_clock(t, count)) is not None:
+        times, h, known = found
+        values = np.column_stack([times, one.values[:, 1:]])
+        values[~known, 1 : values.shape[1] - len(columns.u)] = np.nan
         size, step = (f"{x:.4g}" + ("" if unit == "1" else f" {unit}") for x in (count, h))
-        note = f"warning: stamps repeat in counts of {size}; rows are taken to be {step} apart, as their number says"
-        return Recording(one.label, one.at, values), note
+        how = "as their number says" if known.all() else (
+            f"and some are missing: {int((~known).sum())} rows, whose stamps do not tell beside which rows, "
+            "have no position"
+        )  # fmt: skip
+        return Recording(one.label, one.at, values), (
+            f"warning: {int(twice.sum())} of {len(t)} rows have the stamp of the row before: stamps count {size}, and "
+            f"rows are taken to be {step} apart, {how}"
+        )
     kept, rows = np.concatenate([[True], ~twice]), one.at[1:][twice]
     some = "a row is" if len(rows) == 1 else f"{len(rows)} rows are"
     note = f"warning: {some} left out, with the stamp of the row before: the first is row {rows[0]}"
     return Recording(one.label, one.at[kept], one.values[kept]), note
+
+
+def _on_a_clock(t: np.ndarray, count: float) -> tuple[np.ndarray, float, np.ndarray] | None:
+    """The times (N,) of rows on a clock of equal steps, the step, and whether the number of a row is known, (N,) bool.
+
+    None if the stamps are no whole counts, or no clock meets all of them to within a count.
+    """
+    counts = (t - t[0]) / count
+    if not bool((np.abs(counts - counts.round()) <= COUNT_TOLERANCE).all()):
+        return None
+    every = np.ones(len(t), dtype=bool)
+    for clock in (lambda: (np.arange(len(t)), every), lambda: numbers_of_rows(counts.round(), COUNT_TOLERANCE)):
+        if (found := clock()) is not None:
+            number, known = found
+            x, y = number - number[known].mean(), t - t[known].mean()
+            h = float(x[known] @ y[known] / (x[known] @ x[known]))
+            if bool((np.abs(h * x - y) <= count).all()):
+                return t[known].mean() + h * x, h, known
+    return None
 
 
 def completed(

@@ -203,8 +203,9 @@ def as_meant(
     Raise InputError if a coordinate that the user did not name moves in jumps alone.
     """
     pairs = pairs_of(polar, like)
-    chosen = polar is not None or wanted.coordinates is not None or wanted.known
-    found = in_polar(found, pairs) if pairs or chosen else with_hints(found)
+    recorded, found = found, in_polar(found, pairs)
+    if not (wanted.coordinates is not None or wanted.known or (polar is not None and not pairs)):
+        found = with_hints(found, recorded, pairs)
     refuse_jumps(found, wanted)
     if input_terms is None and like is not None:
         input_terms = input_terms_of(like.columns)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
-from herglotz.data.checks import MIN_SAMPLES, Unusable, out_of_order, quote
+from herglotz.data.checks import MIN_SAMPLES, Unusable, begins_anew, numbering, out_of_order, quote
 from herglotz.data.csv_columns import Columns
 from herglotz.data.gaps import with_missing
 from herglotz.data.rates import Recording, completed, in_order, without_repeats
@@ -19,6 +20,8 @@ from herglotz.errors import refuse
 
 Item = TypeVar("Item")
 Read = TypeVar("Read")
+# Rows at which a clock falls back that the warning names.
+MAX_ROWS = 4
 
 
 def from_table(
@@ -32,13 +35,14 @@ def from_table(
 
     A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). Rows without any coordinate are
     left out, and a note gives their number: the step over these rows is longer, with the mean of the inputs
-    (`herglotz.data.rates`). A trajectory that is too short, or whose time does not increase, is left out with a
-    warning. Raise InputError, which begins with `path`, if most trajectories are unusable.
+    (`herglotz.data.rates`). A clock that falls back begins another trajectory, with a warning. A trajectory that is too
+    short, or whose time does not increase, is left out with a warning. Raise InputError, which begins with `path`, if
+    most trajectories are unusable.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     columns, values = _without_blank(columns, values)
     recordings = _recordings(path, labels, np.asarray(at), values)
-    recordings, repairs = _with_clocks(recordings, bool(np.isnan(values).any()), columns.units[columns.time] or "s")
+    recordings, repairs = _with_clocks(recordings, bool(np.isnan(values).any()), columns)
     recordings, unordered = usable(path, recordings, lambda one: _in_time(path, columns, one))
     recordings, filled, hold = completed(recordings, columns, columns.hold)
     recordings, too_few = usable(path, recordings, lambda one: _with_enough(path, columns, one))
@@ -76,15 +80,46 @@ def _without_blank(columns: Columns, values: np.ndarray) -> tuple[Columns, np.nd
     return replace(columns, q=q, notes=(*columns.notes, note)), values[:, kept]
 
 
-def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:
-    """The recordings sorted by time, without repeated stamps, and a note on the first repair and the number of others.
+def _with_clocks(recordings: list[Recording], blank: bool, columns: Columns) -> tuple[list[Recording], list[str]]:
+    """The recordings sorted by time, cut where their clock falls back, and without repeated stamps; with notes.
 
-    Only rows with blank cells may be stacked tables, whose rows have to be sorted.
+    Only rows with blank cells may be stacked tables, whose rows have to be sorted. A note on the first repaired stamps
+    counts the other recordings with such stamps.
     """
-    made = [without_repeats(in_order(one) if blank else one, unit) for one in recordings]
+    ordered = [in_order(one) if blank else one for one in recordings]
+    parts = [_parts(one) for one in ordered]
+    made = [without_repeats(part, columns) for own in parts for part in own]
     notes = [note for _, note in made if note]
     more = f", and so of {len(notes) - 1} more recordings" if len(notes) > 1 else ""
-    return [one for one, _ in made], [f"{note}{more}" for note in notes[:1]]
+    cuts = [part.at[0] for own in parts for part in own[1:]]
+    return [one for one, _ in made], [*_note_of_cuts(ordered, cuts, columns), *(f"{x}{more}" for x in notes[:1])]
+
+
+def _parts(one: Recording) -> list[Recording]:
+    """The recordings that begin where the clock falls back; the rows as they are if some falls begin none."""
+    ends = [*(np.flatnonzero(np.diff(one.values[:, 0]) < 0) + 1).tolist(), len(one.at)]
+    runs = [slice(first, last) for first, last in pairwise([0, *ends])]
+    if not all(begins_anew(one.values[a, 0], one.values[b, 0]) for a, b in pairwise(runs)) or len(runs) < 2:
+        return [one]
+    names = [f"{one.label} ({k + 1})" if k else one.label for k in range(len(runs))]
+    if not one.label:
+        names = [f"rows {one.at[run][0]} to {one.at[run][-1]}" for run in runs]
+    return [Recording(name, one.at[run], one.values[run]) for name, run in zip(names, runs, strict=True)]
+
+
+def _note_of_cuts(recordings: Sequence[Recording], cuts: Sequence[int], columns: Columns) -> list[str]:
+    """The warning of clocks that fall back at these rows, with the column that numbers the recordings, if one does."""
+    if not cuts:
+        return []
+    rows = [*map(str, cuts[:MAX_ROWS]), *([f"{len(cuts) - MAX_ROWS} more"] if len(cuts) > MAX_ROWS else [])]
+    values = np.concatenate([one.values for one in recordings])
+    numbered = numbering(values, np.diff(values[:, 0]) < 0, [columns.names[i] for i in columns.numeric])
+    remedy = numbered or "a column that numbers the recordings is given by --group NAME (group= in Python)"
+    where = f"row {rows[0]}, and a new recording begins" if len(cuts) == 1 else (
+        f"rows {', '.join(rows)}, and a new recording begins at each"
+    )  # fmt: skip
+    clock = columns.names[columns.time]
+    return [f"warning: {clock} falls back at {where}; if it is one recording, sort the rows; {remedy}"]
 
 
 def usable(path: Path, items: Sequence[Item], read: Callable[[Item], Read]) -> tuple[list[Read], tuple[str, ...]]:
@@ -119,13 +154,12 @@ def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.nd
 
 def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
     """The recording; raise Unusable unless it has three rows, in order of time."""
-    t, label, clock = one.values[:, 0], "", columns.names[columns.time]
-    if columns.trajectory is not None:
-        label = columns.names[columns.trajectory]
+    t, clock = one.values[:, 0], columns.names[columns.time]
     if len(t) < MIN_SAMPLES:
         has = f"has {len(t)} sample{'s' if len(t) > 1 else ''}, at least {MIN_SAMPLES} are needed"
         where = f"{path}, row {one.at[0]}"
-        if one.label:
+        if columns.trajectory is not None and one.label:
+            label = columns.names[columns.trajectory]
             raise Unusable(f"{where}, column '{label}': {quote(one.label)} {has}; delete it or add rows")
         raise Unusable(f"{where}: the file {has}; add rows")
     d = np.diff(t)
@@ -133,10 +167,10 @@ def _in_time(path: Path, columns: Columns, one: Recording) -> Recording:
     back = d < 0 if (d < 0).any() else ~(d > 0)
     if back.any():
         k = int(back.argmax())
-        names, unit = [columns.names[i] for i in columns.numeric], columns.units[columns.time] or "s"
+        names = [columns.names[i] for i in columns.numeric]
         raise Unusable(
             f"{path}, row {one.at[k + 1]}, column '{clock}': {float(t[k + 1])!r} does not increase on {float(t[k])!r} "
-            f"in row {one.at[k]}; {out_of_order(one.values, back, names, int(one.at[k + 1]), unit, label)}"
+            f"in row {one.at[k]}; {out_of_order(one.values, back, names)}"
         )
     return one
 
@@ -162,6 +196,7 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording],
     t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
     units = tuple(columns.units[i] or "1" for i in columns.q)
     group = "" if columns.trajectory is None else columns.names[columns.trajectory]
+    labels = [one.label for one in recordings]
     return Trajectories.of(
         t[:, 0],
         q,
@@ -176,5 +211,5 @@ def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording],
         hold=hold if columns.u else "",
         source=path.name,
         columns=columns.roles(),
-        recordings=[f"{group} {one.label}" for one in recordings] if group else (),
+        recordings=[f"{group} {one.label}".lstrip() for one in recordings] if any(labels) else (),
     )

@@ -22,7 +22,9 @@ from herglotz.errors import check_coordinates, refuse
 
 # Stands in place of a unit that is missing in the header, or wrong.
 TAKEN_FOR_DEGREES = "taken for deg"
-DEGREES = ("deg", "°", "degree", "degrees", "Grad", "degrés", "grados", "gradi", TAKEN_FOR_DEGREES)
+# German for degrees, and the name of a four-hundredth of a turn elsewhere.
+GRAD = "grad"
+DEGREES = ("deg", "°", "degree", "degrees", "Grad", GRAD, "degrés", "grados", "gradi", TAKEN_FOR_DEGREES)
 # A step longer than this many typical (median) steps is a gap.
 GAP = 1.5
 # Standard deviation of the steps over their median: the clocks of loggers stay below 0.02.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from herglotz.data.column_roles import is_angular
 from herglotz.data.csv_columns import Names, as_names
-from herglotz.data.trajectories import DEGREES, TAKEN_FOR_DEGREES, Trajectories
+from herglotz.data.trajectories import DEGREES, GRAD, TAKEN_FOR_DEGREES, Trajectories
 from herglotz.errors import check_coordinates
 
 # How many of each unit of time make a second.
@@ -26,6 +26,9 @@ PER_SECOND = {
 
 def in_radians_and_seconds(data: Trajectories) -> Trajectories:
     """Return the set with coordinates in degrees as angles in rad, and a time in ms, µs, ns, min or h in s."""
+    if found := [name for name, unit in zip(data.names, data.units, strict=True) if unit == GRAD]:
+        note = f"warning: {', '.join(found)} in {GRAD}: taken for degrees, 360 in a turn; with 400 in a turn, write gon"
+        data = replace(data, notes=(*data.notes, note))
     degrees = [unit in DEGREES for unit in data.units]
     angles = tuple(turned or angle for turned, angle in zip(degrees, data.angles, strict=True))
     return in_seconds(replace(_converted(data, degrees, math.pi / 180, "rad"), angles=angles) if any(degrees) else data)

@@ -265,7 +265,13 @@ def _sensors(run: FittedRun) -> str:
         each = [f"{name} {', '.join(values[i :: len(names)])}" for i, name in enumerate(names)] if values else []
         several = ", recording after recording" if len(values) > len(names) else ""
         found += [f"{of} ({'; '.join(each)}{several})"] if values else []
-    return f"a coordinate is its reading {', '.join(found)}" if found else ""
+    angles = [name for name, unit in zip(names, run.data.units, strict=True) if unit == "rad"]
+    words = [f"a coordinate is its reading {', '.join(found)}"] if found else []
+    words += [] if plan.get("turning", True) else [
+        f"the readings of {', '.join(angles)} count turns from the first sample of a recording: the turn in which a "
+        "sensor that wraps begins is not recorded, and herglotz predict finds that of another recording"
+    ]  # fmt: skip
+    return "; ".join(words)
 
 
 def _steps(run: FittedRun, printed: FittedRun) -> str:

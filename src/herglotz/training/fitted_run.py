@@ -72,4 +72,7 @@ def as_recorded(run: FittedRun, data: Any, **reading: Any) -> Trajectories:
         reading[name] = told
     # Means of steps are constant over a step, whatever the hold that the recording was read with.
     hold = run.reading.get("hold") or run.arrival.hold
-    return as_trajectories(data, like=replace(run.data, hold=hold), **reading)
+    # Angles that the fit found to be positions on a line were read as angles, whose turns are counted.
+    turning = (run.metrics.get("plan") or {}).get("turning", True)
+    angles = run.data.angles if turning else tuple(unit == "rad" for unit in run.data.units)
+    return as_trajectories(data, like=replace(run.data, hold=hold, angles=angles), **reading)

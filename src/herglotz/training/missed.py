@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -40,7 +39,7 @@ from herglotz.data import Trajectories
 from herglotz.data.column_roles import is_of_others, role_of
 from herglotz.data.gaps import MEANS
 from herglotz.data.noise import SAMPLES, precisions
-from herglotz.data.polar import LENGTH, with_hints
+from herglotz.data.polar import CIRCLE, LENGTH, circles, hint
 from herglotz.data.rates import filled_inputs
 from herglotz.data.smoothing import slopes
 from herglotz.data.units import COUNTS, size
@@ -79,8 +78,10 @@ OF_TIME = "What is missed changes with time where positions, velocities and inpu
 
 def reason_of_data(data: Trajectories) -> str:
     """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
-    if hints := with_hints(replace(data, notes=())).notes:
-        return hints[0].removeprefix("warning: ")
+    if found := circles(data):
+        return hint(found)
+    if left := [note.removeprefix("warning: ") for note in data.notes if CIRCLE in note]:
+        return left[0]
     if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note or COUNTS in note]:
         return changes[0][0].upper() + changes[0][1:]
     if any(MEANS in note for note in data.notes):

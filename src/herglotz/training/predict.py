@@ -43,7 +43,8 @@ class Prediction:
     `states` are smoothed in the `warmup` leading samples of each trajectory, then a free run; NaN after a failed step.
     `every` is the stride by which the recording was thinned, `most_substeps` the largest number of model steps in a
     recorded step, `outside` the share of model steps shorter or longer than those of the training data. `zeros` of the
-    sensors were subtracted (empty: none). `beyond` lists what leaves the range of the fit, farthest first.
+    sensors were subtracted (empty: none), and whole `turns` added to the readings of each recording (empty: none).
+    `beyond` lists what leaves the range of the fit, farthest first.
     """
 
     data: Trajectories
@@ -55,6 +56,7 @@ class Prediction:
     zeros: tuple[float, ...] = ()  # (n,)
     beyond: tuple[Beyond, ...] = ()
     v: Tensor | None = None  # (N, n) velocities, in units of q over that of t
+    turns: tuple[tuple[int, ...], ...] = ()  # (B, n)
 
     def __repr__(self) -> str:
         rms = "failed" if self.rms is None else f"{self.rms:.3g}"
@@ -120,6 +122,7 @@ class Prediction:
             "most_substeps": self.most_substeps,
             "steps_outside_training": self.outside,
             "zeros": dict(zip(self.data.names, self.zeros, strict=True)) if self.zeros else None,
+            "turns": [list(each) for each in self.turns] or None,
             "beyond": [asdict(each) for each in self.beyond],
         }
 
@@ -177,6 +180,9 @@ def predict(
     if every > 1:
         data = data.thinned(every)
     warmup = warmup or _usual(min(data.lengths))
+    turns = whole_turns(run, data, warmup)
+    shift = torch.tensor(turns).to(data.q) if turns else data.q.new_zeros(len(data), data.dof)
+    data = replace(data, q=data.q + 2 * math.pi * shift[data.trajectory])
     if windows is not None or horizon is not None:
         data = _windows(data, warmup, windows, horizon)
     _check_lengths(data, warmup, every)
@@ -193,7 +199,31 @@ def predict(
     v = velocities(run.model, x, torch.tensor(run.h if most == 1 else float(h.median())))
     rows = [(data.trajectory == b).nonzero()[:, 0] for b in range(len(data))]
     beyond = farthest(quantities_outside(run.box, data, data.t[r], x.q[r], x.p[r]) for r in rows)
-    return Prediction(data, x, warmup, every, most, outside, zeros, beyond, v)
+    return Prediction(data, x, warmup, every, most, outside, zeros, beyond, v, turns)
+
+
+def whole_turns(run: FittedRun, data: Trajectories, warmup: int) -> tuple[tuple[int, ...], ...]:
+    """Whole turns to be added to the angles of each recording, (B, n); () for none.
+
+    Where a fit found angles to be positions on a line, as of a spring, the turn in which a sensor that wraps begins is
+    not in the recording. Of the turns that take a warm-up into the range of the fit, those are added whose states
+    smoothed with the model cost least, if they clearly cost less than the states of the reading.
+    """
+    if (run.metrics.get("plan") or {}).get("turning", True) or min(data.lengths) < warmup:
+        return ()
+    low, high = run.data.q.amin(0), run.data.q.amax(0)
+    found = [[0] * data.dof for _ in data]
+    for one, turns in zip(data, found, strict=True):
+        part = _warm_ups(one, warmup)[1]
+        best = _warmed_up(run, part, warmup)[1]
+        for i in (i for i, unit in enumerate(run.data.units) if unit == "rad"):
+            x = part.q[:, i]
+            first, last = float((low[i] - x.max()) / (2 * math.pi)), float((high[i] - x.min()) / (2 * math.pi))
+            for k in range(math.ceil(first), math.floor(last) + 1):
+                moved = replace(part, q=part.q + 2 * math.pi * torch.tensor([*turns[:i], k, *turns[i + 1 :]]).to(x))
+                if k and MARGIN**2 * (cost := _warmed_up(run, moved, warmup)[1]) < best:
+                    turns[i], best = k, cost
+    return tuple(map(tuple, found)) if any(map(any, found)) else ()
 
 
 def missed_from_best_start(run: FittedRun, data: Trajectories) -> tuple[float, ...] | None:

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.noise import AT_THE_NOISE, coarse, precision, precisions, relative_spread
-from herglotz.data.polar import circles
+from herglotz.data.polar import Circle, circles, remedy
 from herglotz.data.sensors import measured
 from herglotz.data.splits import enough, leading
 from herglotz.data.units import common_unit
@@ -226,17 +226,25 @@ def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
 
 
 def bound(data: Trajectories) -> str:
-    """Two positions that stay on a circle within their precision, in words with a remedy; "" if there are none.
+    """Pairs of positions that stay on circles within their precision, in words with a remedy; "" if there are none.
 
-    They have one degree of freedom. The constraint force is not recorded, and a free run leaves the circle.
+    A pair has one degree of freedom. The constraint force is not recorded, and a free run leaves the circle.
     """
     noise, size = precisions(data).to(data.q) * data.balance, data.q.std(0, correction=0)
-    for one in circles(replace(data, notes=())):
+
+    def is_kept(one: Circle) -> bool:
         at = list(one.columns)
-        if one.error <= AT_THE_NOISE * float(noise[at].maximum(EXACT_ENOUGH * size[at]).square().mean().sqrt()):
-            kept = f"The positions {one.description}, and what holds them there was not recorded"
-            return f"{kept}. Try {one.remedy}, which makes one angle of it, or motions that leave it"
-    return ""
+        return one.error <= AT_THE_NOISE * float(noise[at].maximum(EXACT_ENOUGH * size[at]).square().mean().sqrt())
+
+    found = [one for one in circles(replace(data, notes=())) if is_kept(one)]
+    if not found:
+        return ""
+    kept = (
+        f"The positions {', and '.join(one.description for one in found)}, and what holds them there was not recorded"
+    )
+    flags, many = remedy(found)
+    one, other = ("each", "them") if many else ("it", "it")
+    return f"{kept}. Try {flags}, which makes one angle of {one}, or motions that leave {other}"
 
 
 def in_words(

@@ -2,6 +2,7 @@
 
 import json
 import re
+from argparse import Namespace
 from dataclasses import replace
 from functools import partial
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from herglotz.cli import main
+from herglotz.cli.flags import data_of
 from herglotz.data import load, save, simulate
 from herglotz.export import between
 from herglotz.models.numbers import lines
@@ -98,6 +100,19 @@ def test_the_data_are_read_the_same_way(driven, capsys):
     assert one.reading == other.reading == {
         "time": "clock", "coordinates": ["x"], "inputs": ["drive"], "every": 2, "hold": "first",
     }  # fmt: skip
+
+
+def test_samples_that_miss_a_position_are_fitted(tmp_path, capsys):
+    # fails if a fit without --every leaves out samples of the faster of two coordinates, or --every does in silence
+    rows = [f"{k},{k**2},{k**3 if k % 4 == 0 else ''}" for k in range(41)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,x[m],y[m]", *rows]))
+    plain = Namespace(config=None, data=tmp_path / "a.csv")
+    data, reading = data_of(plain, {})
+    assert (data.samples, reading) == (41, {})
+    assert "--every" not in capsys.readouterr().err
+    assert data_of(Namespace(**vars(plain), every=2), {})[0].samples == 6
+    said = "note: --every counts complete samples: 30 that miss a position are left out"
+    assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_flags_stand_over_what_was_read(driven):  # fails if a flag beside --config is not heard

@@ -88,6 +88,18 @@ def test_degrees_have_a_name_in_each_language(tmp_path, head):
     assert float(data.q[0, 0]) == pytest.approx(math.radians(25))
 
 
+@pytest.mark.parametrize(("head", "name"), [("winkel [grad]", "winkel"), ("auslenkung_grad", "auslenkung")])
+def test_grad_is_taken_for_degrees_with_a_word(tmp_path, capsys, head, name):
+    # fails if a pendulum in grad is a length of 25, or that a fourth of a turn has 90 of them is not said
+    rows = "".join(f"{k / 10},{25 - k},{k**2}\n" for k in range(9))
+    (tmp_path / "a.csv").write_text(f"t [s],{head},temp_grad\n{rows}")
+    data = load(tmp_path / "a.csv")
+    assert (data.names, data.units, data.angles, data.degrees) == ((name,), ("rad",), (True,), (name,))
+    assert float(data.q[0, 0]) == pytest.approx(math.radians(25))
+    said = f"warning: a.csv: {name} in grad: taken for degrees, 360 in a turn; with 400 in a turn, write gon"
+    assert said in capsys.readouterr().err
+
+
 def test_degrees_are_reported_and_written_back(tmp_path):
     # fails if a file in degrees is written in radians, the archive forgets what the columns were, or a table written
     # in degrees is read as another motion

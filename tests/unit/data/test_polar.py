@@ -193,8 +193,32 @@ def test_a_body_on_a_circle_is_said(tmp_path, capsys):
     assert lines[0].startswith("warning: a.csv: ax, ay stay on a circle about (")
     assert lines[0].endswith("one body on an arm? --polar ax,ay (polar= in Python) makes one angle of it")
     assert "bx, by stay on a circle about ax, ay, at " in lines[1]
+    assert lines[1].endswith(
+        "bodies on arms? --polar ax,ay --polar bx,by,ax,ay (polar= in Python) makes one angle of each"
+    )
+    # The first is told.
+    load(tmp_path / "a.csv", polar="ax,ay")
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("warning"))
+    assert line.endswith("--polar bx,by,ax,ay (polar= in Python) beside --polar ax,ay makes one angle of it")
+    load(tmp_path / "a.csv", polar=["ax,ay", "bx,by"])
+    assert "stay on a circle" not in capsys.readouterr().err
     as_trajectories({"t": T, "x": ONE[:, 0], "y": ONE[:, 1]})
     assert "warning: dict: x, y stay on a circle" in capsys.readouterr().err
+
+
+def test_a_centre_that_moves_is_part_of_the_remedy(tmp_path, capsys):
+    # fails if the flag finds a fixed centre where the sentence has another one, or its axis has no sign
+    pivot = np.column_stack([np.cos(1.7 * T), 0.1 * np.sin(0.3 * T)])
+    path = written(tmp_path, "px[m],py[m],bx[m],by[m]", pivot + NOISE[0], pivot + arm(A) * [1, -1])
+    load(path)
+    said = "bx, by stay on a circle about px, py, at 0.8 m; one body on an arm? --polar bx,by,px,py (polar= in Python)"
+    assert said in capsys.readouterr().err
+    assert load(path, polar="bx,by,px,py").names == ("theta",)
+    assert "if by grows the other way: --polar bx,-by,px,py" in capsys.readouterr().err
+    for told in ("bx,-by,px,py", "bx,-by,px,-py"):
+        close(load(path, polar=told, show=False).q[:, 0], A, 0.006)
+    with pytest.raises(InputError, match="-py of the centre has a sign that its axis has not"):
+        load(path, polar="bx,by,px,-py")
 
 
 MOTIONS = {

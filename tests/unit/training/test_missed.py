@@ -205,6 +205,8 @@ def test_what_was_warned_of_when_the_table_was_read_is_the_reason():
     arm = torch.stack([Q.sin(), -Q.cos()], 1) * (1 + 0.2 * torch.sin(0.7 * T))[:, None]
     swing = in_polar(Trajectories.of(T, arm, names=("x", "y"), units=("m", "m")), pairs_of("x,y"))
     assert "if a length changes: --polar x,y,X,Y,r" in reason_of_data(swing)
+    pair = "warning: x2, y2 stay on a circle about x1, y1, at 252; one body on an arm? --polar x2,y2,x1,y1"
+    assert reason_of_data(replace(data, notes=(pair,))).startswith("x2, y2 stay on a circle about x1, y1, at 252")
     counts = with_angles_in_degrees(Trajectories.of(T, (900 * Q).round(), names=("wheel",)), None, None, None)
     assert reason_of_data(counts).startswith("Whole numbers without a unit, wheel may be counts of an encoder: if")
 

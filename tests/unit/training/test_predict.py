@@ -14,9 +14,10 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
+from herglotz.training.fitted_run import as_recorded
 from herglotz.training.free_run import near_data
 from herglotz.training.kernel import kernel_of
-from herglotz.training.predict import longer_warmup, missed_from_best_start, predict
+from herglotz.training.predict import longer_warmup, missed_from_best_start, predict, whole_turns
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.recorded_range import MARGIN
 from herglotz.training.smoother import process_noise
@@ -414,3 +415,39 @@ def test_a_run_that_a_kernel_loses_is_solved_from_the_data(monkeypatch):
     assert stepped is not None
     assert solved is not None
     torch.testing.assert_close(solved, stepped)
+
+
+def of_a_spring(model, turns=(0, 0)) -> tuple[Run, Trajectories]:
+    """A run whose angle is a position on a line, and another recording that begins so many turns off."""
+    own, other = (replace(recording(model, seed=seed), angles=(False,), units=("rad",)) for seed in (0, 1))
+    run = run_of(model)
+    run = replace(run, data=replace(own, q=6 * own.q), metrics={**run.metrics, "plan": {"turning": False}})
+    shift = 2 * torch.pi * torch.tensor(turns, dtype=torch.float64)
+    return run, replace(other, q=other.q + shift[other.trajectory][:, None])
+
+
+@pytest.mark.parametrize("turns", [(0, 0), (1, 0), (-1, 2)])
+def test_the_turn_in_which_a_recording_begins_is_found(monkeypatch, turns):
+    # fails if a torsion spring is predicted whole turns off where its sensor wraps, or all recordings are moved by one
+    run, other = of_a_spring(model_of("linear"), turns)
+    fitted: Any = SimpleNamespace(model=run.model, data=run.data, metrics=run.metrics, h_range=(H, H))
+    expected = tuple((-k,) for k in turns) if any(turns) else ()
+    assert whole_turns(fitted, other, 20) == expected
+    # An angle that turns has no turn to find.
+    fitted.metrics = {"sigma": 1e-8}
+    assert whole_turns(fitted, other, 20) == ()
+    monkeypatch.setattr(predict_module, "whole_turns", lambda *_: expected)
+    found = predict(replace(run, metrics=fitted.metrics), other)
+    assert found.metrics()["turns"] == ([[-k] for k in turns] if any(turns) else None)
+    assert (found.rms or 1) < 1e-6
+
+
+def test_angles_on_a_line_are_read_as_angles(tmp_path):
+    # fails if a sensor that wraps is not unwrapped where the fit found positions on a line
+    run, other = of_a_spring(model_of("linear"))
+    wrapped = torch.remainder(other.q[:81, 0] - other.q[40, 0], 2 * torch.pi)
+    rows = (f"{t},{x}\n" for t, x in zip(other.t[:81].tolist(), wrapped.tolist(), strict=True))
+    (tmp_path / "a.csv").write_text("t[s],q[rad]\n" + "".join(rows))
+    read = as_recorded(run, tmp_path / "a.csv")
+    assert float(wrapped.diff().abs().max()) > 6
+    assert float(read.q.diff(dim=0).abs().max()) < 1

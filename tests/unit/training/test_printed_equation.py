@@ -19,7 +19,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, fit, laplace
-from herglotz.training.equation import Departure, _is_lost, equation_of, notes_of
+from herglotz.training.equation import Departure, _is_lost, _sensors, equation_of, notes_of
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.fit import _of_short_steps
@@ -195,6 +195,17 @@ def driven(**more):
 def test_what_moves_the_model_beside_its_equation_stands_below_it(more, words):
     # fails if nobody can know what an input is between samples, or that a coordinate is not what the sensor reads
     assert words in driven(**more)
+
+
+def test_the_turn_of_an_angle_on_a_line_is_not_known():
+    # fails if the zero of a torsion spring that is whole turns off stands in the equation without a word
+    run = run_of(*MODELS["joints"], count=2, steps=20)
+    run = replace(run, data=replace(run.data, angles=(False, False), units=("m", "rad")))
+    said = (
+        "the readings of theta count turns from the first sample of a recording: the turn in which a sensor that wraps"
+    )
+    assert said in _sensors(replace(run, metrics={"plan": {"turning": False}}))
+    assert _sensors(run) == ""
 
 
 def test_an_input_without_effect_is_said_to_be_one():

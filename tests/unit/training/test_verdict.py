@@ -164,6 +164,18 @@ def test_what_one_circle_does_not_tell(stretched, said):
     assert judged.startswith("does not fit: " if said else "fits to the noise: ")
 
 
+def test_all_pairs_on_circles_are_named():
+    # fails if the verdict names the first body of a chain alone, or the second without its centre
+    t = torch.arange(300, dtype=torch.float64) / 30
+    one, two = 1.1 * (3.5 * t).cos(), 0.9 * (2.3 * t).sin()
+    first = torch.stack([one.sin(), -one.cos()], 1)
+    q = torch.cat([first, first + torch.stack([two.sin(), -two.cos()], 1)], 1)
+    q = q + 1e-3 * torch.randn(300, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    text = verdict.bound(replace(Trajectories.of(t, q), names=("x1", "y1", "x2", "y2"), units=("m",) * 4))
+    assert ", and x2, y2 stay on a circle about x1, y1, at 1 m, and what holds them there" in text
+    assert "Try --polar x1,y1 --polar x2,y2,x1,y1 (polar= in Python), which makes one angle of each" in text
+
+
 def test_a_drift_hides_no_circle():
     # fails if the circle is looked for in positions less a drift, which made up for the force that holds a body on it
     t = 0.05 * torch.arange(200, dtype=torch.float64)
