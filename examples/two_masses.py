@@ -24,8 +24,9 @@ table, header = np.c_[h * np.arange(1000), angles, torque], "t[s],motor[rad],loa
 np.savetxt("drive.csv", table, "%.7g", ",", header=header, comments="")
 
 # %% [markdown]
-# Columns in rad are taken for angles on a circle, on which a spring would be a sine. These two can be wound against
-# each other without an end: `angles=()` reads both as positions on a line (`--angles none`).
+# Columns in rad are taken for angles on a circle, whose spring between two that turn together is found as well.
+# Nothing holds this drive at an angle: `angles=()` reads both as positions on a line (`--angles none`), where the
+# damper is one term, too.
 
 # %%
 import herglotz as hz
