@@ -72,7 +72,7 @@ def offers_of(
             always.append(number)
         elif stem not in no_offers:
             found.append(_offer(number, key, stem, numbers))
-            if (stem in SIMPLE and number not in of_terms) or key in springs or key == WEIGHTS[0]:
+            if (stem in SIMPLE and number not in of_terms) or key in springs or (key == WEIGHTS[0] and not bands):
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
     found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]
