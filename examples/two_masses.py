@@ -25,8 +25,7 @@ np.savetxt("drive.csv", table, "%.7g", ",", header=header, comments="")
 
 # %% [markdown]
 # Columns in rad are taken for angles on a circle, whose spring between two that turn together is found as well.
-# Nothing holds this drive at an angle: `angles=()` reads both as positions on a line (`--angles none`), where the
-# damper is one term, too.
+# Nothing holds this drive at an angle: `angles=()` reads both as positions on a line (`--angles none`).
 
 # %%
 import herglotz as hz

@@ -64,8 +64,18 @@ def is_formula(model: ContactLagrangian) -> bool:
 def newtonian(model: ContactLagrangian) -> bool:
     """True if every coordinate has its own equation: one mass each, and no action s in the motion."""
     made_of, config = model.capabilities, model.config
-    alone = made_of.constant_mass and (config.dof == 1 or config.diagonal or config.alike)
-    return config.baseline and alone and not made_of.carries_s
+    if not config.baseline or not made_of.constant_mass or made_of.carries_s:
+        return False
+    if config.dof == 1 or config.diagonal or config.alike:
+        return True
+    mass = _masses_of(model)
+    return mass is not None and torch.equal(mass, mass.diagonal().diag())
+
+
+def _masses_of(model: ContactLagrangian) -> Tensor | None:
+    """The constant mass matrix (n, n), to which features may be added; None for a mass that is a network."""
+    kinetic = getattr(model.kinetic, "base", model.kinetic)
+    return kinetic.mass() if isinstance(kinetic, Kinetic) else None
 
 
 class Reader:
@@ -105,9 +115,9 @@ class Reader:
         return found
 
     def _masses(self) -> Tensor:
-        kinetic = getattr(self.model.kinetic, "base", self.model.kinetic)
-        assert isinstance(kinetic, Kinetic)
-        return kinetic.mass()
+        mass = _masses_of(self.model)
+        assert mass is not None
+        return mass
 
     def _kinetic(self) -> Iterator[Line]:
         """½ vᵀ M v with a constant M, and features with velocities, if L is printed as one function."""
@@ -145,12 +155,17 @@ class Reader:
         parts = [] if model.friction is None else [-model.friction.viscous[i]]
         if self.newton and isinstance(model.damping, LinearDamping):
             parts.append(-model.damping.rate * self._masses()[i, i])
-        if parts:
-            yield Line(left, f"{self.names[i]}′", per_time, torch.stack(parts).sum())
         if model.coupling is not None:
             between = model.coupling.matrix()
-            others = (j for j in range(len(self.names)) if j != i)
-            yield from (Line(left, f"{self.names[j]}′", per_time, -between[i, j]) for j in others)
+            for j in (j for j in range(len(self.names)) if j != i):
+                # A damper between two separate masses acts by the difference of their speeds.
+                damper = self.newton and float(between[i, j].detach()) < 0
+                a, b = (self.names[k] for k in sorted((i, j)))
+                what, sign = (f"({a}′ − {b}′)", 1.0 if i < j else -1.0) if damper else (f"{self.names[j]}′", -1.0)
+                yield Line(left, what, per_time, sign * between[i, j])
+                parts += [-between[i, j]] if damper else []
+        if parts:
+            yield Line(left, f"{self.names[i]}′", per_time, torch.stack(parts).sum())
 
     def _drag(self) -> Iterator[Line]:
         """Drag of one coordinate, between two, or of a body in air, and inputs that act through the position."""
