@@ -169,7 +169,7 @@ def test_libraries_stand_for_lists_of_features():
     assert expand(["chain", "q1^2", "q1^2"], (False,) * 3)[0] == "(q1)^2 + (q2 - q1)^2 + (q3 - q2)^2 + (-q3)^2"
     assert expand(["q1^2", "q1^2"], LENGTHS) == ["q1^2"]
     for name in LIBRARIES:
-        turning = name in ("harmonics", "pendulums", "revolute", "slides", "spherical")
+        turning = name in ("harmonics", "pendulums", "revolute", "slides", "spherical", "windings")
         for angles in ((False, True, True), (True, False, True)) if turning else (LENGTHS, (False,) * 5):
             names = expand([name], angles)
             assert len(set(names)) == len(names) > 0
