@@ -284,10 +284,11 @@ class Search:
     def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
         """Offers, and values of all numbers, from one linear fit of smoothed accelerations; None if the fit fails.
 
-        Terms that are nearly collinear with others are left out (`special`, `spherical`).
+        Terms that are nearly collinear with others are left out (`special`, `spherical`, `windings`).
         """
         local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
-        every = every.only(set(every.names).difference(special(self.data), spherical(self.data.angles)))
+        angles = self.data.angles
+        every = every.only(set(every.names).difference(special(self.data), spherical(angles), windings(angles)))
         every = every.joined(NamedTerms(drag=self.config.drag))
         start = None if local is None else start_of(self.data, self.base, every, local)
         if start is None:
