@@ -20,17 +20,21 @@ with locked(sys.argv[1]):
     print("held", flush=True)
     time.sleep(600)
 """
+# A signal that comes just before a sleep begins is heard after the sleep: many short ones.
 WAIT = """
 import sys, time, types
 import herglotz.cli as cli
+def wait():
+    for _ in range(6000):
+        time.sleep(0.1)
 def run(arguments):
     try:
         print("ready", flush=True)
-        time.sleep(600)
+        wait()
     finally:
         print("tidied", flush=True)
         if sys.argv[1] == "twice":
-            time.sleep(600)
+            wait()
 cli.build_parser = lambda: types.SimpleNamespace(parse_args=lambda argv: types.SimpleNamespace(run=run))
 sys.exit(cli.main([]))
 """
