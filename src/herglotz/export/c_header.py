@@ -310,7 +310,7 @@ def _own_inputs(entries: Mapping[str, Any]) -> str:
 
 def _in_comment(text: str) -> str:
     """A text without characters that could end a comment of C, or go on with it on the next line."""
-    return re.sub(r"[^A-Za-z0-9_.,()\[\] -]", "_", text)
+    return re.sub(r"[^A-Za-z0-9_.,()\[\] '/^|+-]", "_", text)
 
 
 def _top(model: ContactLagrangian, entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:

@@ -130,15 +130,16 @@ def test_the_example_in_the_comment_runs(tmp_path, start):
 
 @needs_compiler
 def test_the_example_gives_a_step_inputs_of_the_caller(tmp_path):
-    # fails if the example of a model with inputs passes none, or the name of an input ends the comment
+    # fails if the example of a model with inputs passes none, the name of an input ends the comment, or the sign of a
+    # rate is lost
     size, acting = (1.0,), {"inputs": 2, "input_map": (3.0, -1.0)}
     model = ContactLagrangian(ModelConfig((True,), "forced", size, size, size, (0.0,), potential_width=0, **acting))
-    columns = [("motor */ x", "input", "N m"), ("hz_load", "input", "")]
+    columns = [("motor */ x", "input", "N m"), ("hz_load'", "input", "A/s")]
     metadata = {"columns": columns, "input_low": [0.1, 0.0], "input_high": [0.3, 1.0]}
     path = export_c(model, tmp_path / "stepper.h", h=0.1, name="arm", metadata=metadata)
     comment = path.read_text().split("*/")[0]
     code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
-    assert "arm_real u[arm_M] = {0.2, 0.5};  // your inputs, set for each step: motor __ x [N m], hz_load [-]" in code
+    assert "arm_real u[arm_M] = {0.2, 0.5};  // your inputs, set for each step: motor _/ x [N m], hz_load' [A/s]" in code
     (tmp_path / "example.c").write_text(code)
     command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
     built = subprocess.run(command, capture_output=True, text=True, check=False)
