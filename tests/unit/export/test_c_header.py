@@ -139,7 +139,9 @@ def test_the_example_gives_a_step_inputs_of_the_caller(tmp_path):
     path = export_c(model, tmp_path / "stepper.h", h=0.1, name="arm", metadata=metadata)
     comment = path.read_text().split("*/")[0]
     code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
-    assert "arm_real u[arm_M] = {0.2, 0.5};  // your inputs, set for each step: motor _/ x [N m], hz_load' [A/s]" in code
+    assert (
+        "arm_real u[arm_M] = {0.2, 0.5};  // your inputs, set for each step: motor _/ x [N m], hz_load' [A/s]" in code
+    )
     (tmp_path / "example.c").write_text(code)
     command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
     built = subprocess.run(command, capture_output=True, text=True, check=False)
