@@ -49,6 +49,9 @@ print(f"damper                {unit * number['(motor′ − load′)']:.4f} N·m
 # Two things need a second look. The factor of s is a damping rate of both shafts together, and the friction of the load
 # is the difference to it. And the fit took small terms beside those of the truth, which it says are hard to tell apart:
 # read none of them as physics.
+#
+# Behind a gear of ratio i the spring is one of motor / i − load: give the motor's angle at the load's side,
+# `sensor_scales=(1 / i, 1)` (`--sensor-scales`).
 
 # %%
 run.plot()
