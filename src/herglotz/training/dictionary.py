@@ -39,7 +39,8 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
         c = replace(c, diagonal=False)
     # All forces by position of the inputs that the model has some of.
     inputs = {k + 1 for text in c.drag if (k := parse_drag(text, c.angles).input) is not None}
-    features, drag = features_of(c.angles), (*drag_of(c.angles), *by_motion(c.angles, sorted(inputs)))
+    features = (*features_of(c.angles), *windings(c.angles))
+    drag = (*drag_of(c.angles), *by_motion(c.angles, sorted(inputs)))
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
     whole = replace(
         c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
@@ -81,7 +82,7 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
         return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", "|q1| q1", "|q1|^3", *WEIGHTS)
     if any(angles):
         still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
-        return (*revolute(angles), *still, *slides(angles), *spherical(angles), *windings(angles))
+        return (*revolute(angles), *still, *slides(angles), *spherical(angles))
     return tuple(name for name in lengths(angles) if not name.startswith("r^"))
 
 

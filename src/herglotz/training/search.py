@@ -136,7 +136,7 @@ class Search:
     @cached_property
     def first(self) -> Trial | None:
         """The model grown from the simplest: offers join over short segments and ever longer ones."""
-        return self.begun and self._grown(self.begun)
+        return self.begun and self.wound(self._grown(self.begun))
 
     @cached_property
     def full(self) -> Trial | None:
@@ -146,12 +146,8 @@ class Search:
 
     @cached_property
     def every_term(self) -> Trial | None:
-        """The model of the whole dictionary over the shortest segments.
-
-        Torsion springs may join later: beside waves of the same differences they are nearly collinear.
-        """
-        every = {offer.name for offer in self.fitter(Variant(self.order)).offers}
-        return self._over_the_shortest(every - set(windings(self.data.angles)))
+        """The model of the whole dictionary over the shortest segments."""
+        return self._over_the_shortest(offer.name for offer in self.fitter(Variant(self.order)).offers)
 
     def _over_the_shortest(self, taken: Iterable[str]) -> Trial | None:
         fitter = self.fitter(Variant(self.order))
@@ -233,6 +229,22 @@ class Search:
         found = with_sticking(self, without_injecting_friction(self, self.finalist(best, ends)))
         return with_dissipation(self, found, best)
 
+    def wound(self, found: Trial) -> Trial:
+        """The model with torsion springs between joints in place of waves of their differences, if that is better.
+
+        k (1 − cos x) is k x²/2 for small x; joints that turn together without end may wind up farther.
+        """
+        waves = {f"cos{text.removesuffix('^2')}": text for text in windings(self.data.angles)}
+        taken = found.taken & waves.keys()
+        if found.at_the_noise or not taken:
+            return found
+        fitter = self.fitter(replace(found.fitter.variant, windings=True))
+        values, number = fitter.values_of(found), {key: name for name, key in fitter.keys.items()}
+        values |= {number[waves[wave]]: -values[number[wave]] / 2 for wave in taken}
+        springs = {waves[wave] for wave in taken}
+        other = fitter.fit((found.taken - taken) | springs, values, found.length, found, 2 * ITERATIONS)
+        return self.better(found, other and self._grown(self.finer(other))) or found
+
     def of_part(self, found: Trial | None, differ: tuple[Tensor, Tensor] | None) -> Zeroed:
         """The model found in `part`, fitted to all data and settled there.
 
@@ -284,11 +296,10 @@ class Search:
     def linear_start(self, fitter: Fitter) -> tuple[list[str], dict[str, float]] | None:
         """Offers, and values of all numbers, from one linear fit of smoothed accelerations; None if the fit fails.
 
-        Terms that are nearly collinear with others are left out (`special`, `spherical`, `windings`).
+        Terms that are nearly collinear with others are left out (`special`, `spherical`).
         """
         local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
-        angles = self.data.angles
-        every = every.only(set(every.names).difference(special(self.data), spherical(angles), windings(angles)))
+        every = every.only(set(every.names).difference(special(self.data), spherical(self.data.angles)))
         every = every.joined(NamedTerms(drag=self.config.drag))
         start = None if local is None else start_of(self.data, self.base, every, local)
         if start is None:

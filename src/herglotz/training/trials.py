@@ -19,6 +19,7 @@ from herglotz.data import Trajectories
 from herglotz.data.input_terms import input_terms_of
 from herglotz.data.noise import AT_THE_NOISE, coarse, precision, relative_spread
 from herglotz.data.smoothing import slopes, smoothed
+from herglotz.models.features import windings
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.coupled_pairs import groups
@@ -69,7 +70,8 @@ class Variant:
     """Order and steps of the rule, kind of dry friction, and the dictionary of a model.
 
     `functions` are bands of learned functions beside the named terms. `dissipation` are powers of s in L. `kept` are
-    named terms that stay offers although functions can replace them.
+    named terms that stay offers although functions can replace them. With `windings` torsion springs between joints
+    are offers.
     """
 
     order: int
@@ -78,6 +80,7 @@ class Variant:
     functions: tuple[Band, ...] = ()
     dissipation: tuple[str, ...] = ()
     kept: frozenset[str] = frozenset()
+    windings: bool = False
 
     def crossing(self, ratio: float) -> Variant:
         """The variant with model steps of about the same length for recorded steps that are `ratio` times as long."""
@@ -250,6 +253,7 @@ class Fitter:
         self.data, self.variant, self.freedom = data, variant, freedom
         bands = variant.functions
         terms = NamedTerms(config.features) if config.features else candidates(data, config.translations)
+        terms = terms.joined(NamedTerms(tuple(windings(data.angles)))) if variant.windings else terms
         terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
