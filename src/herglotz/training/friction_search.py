@@ -69,7 +69,8 @@ def with_dissipation(search: Any, found: Trial, best: Trial) -> Trial:
     if found.at_the_noise or search.config.translations or search.config.sticking:
         return found
     part(MORE_TERMS)
-    fitter, lowest = search.fitter(Variant(2, dissipation=tuple(POWERS))), next(iter(POWERS))
+    variant = Variant(2, dissipation=tuple(POWERS), windings=best.fitter.variant.windings)
+    fitter, lowest = search.fitter(variant), next(iter(POWERS))
     asked = fitter.fit(best.taken | {lowest}, best.values, best.length, best, 2 * ITERATIONS)
     if best.whole and (asked is None or not asked.replaces(best)):
         return found
