@@ -68,14 +68,8 @@ def newtonian(model: ContactLagrangian) -> bool:
         return False
     if config.dof == 1 or config.diagonal or config.alike:
         return True
-    mass = _masses_of(model)
-    return mass is not None and torch.equal(mass, mass.diagonal().diag())
-
-
-def _masses_of(model: ContactLagrangian) -> Tensor | None:
-    """The constant mass matrix (n, n), to which features may be added; None for a mass that is a network."""
-    kinetic = getattr(model.kinetic, "base", model.kinetic)
-    return kinetic.mass() if isinstance(kinetic, Kinetic) else None
+    # Masses between coordinates that a search has left out.
+    return sum("off_diagonal" in name for name in config.absent) == config.dof * (config.dof - 1) // 2
 
 
 class Reader:
@@ -115,9 +109,9 @@ class Reader:
         return found
 
     def _masses(self) -> Tensor:
-        mass = _masses_of(self.model)
-        assert mass is not None
-        return mass
+        kinetic = getattr(self.model.kinetic, "base", self.model.kinetic)
+        assert isinstance(kinetic, Kinetic)
+        return kinetic.mass()
 
     def _kinetic(self) -> Iterator[Line]:
         """½ vᵀ M v with a constant M, and features with velocities, if L is printed as one function."""
