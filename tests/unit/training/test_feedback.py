@@ -218,7 +218,7 @@ def test_the_work_of_friction_has_all_its_terms_in_one_unit():
     one = (1.0,)
     model = ContactLagrangian(ModelConfig((False,), "forced", one, one, one, (0.0,), potential_width=0, rate=-0.3))
     with torch.no_grad():
-        model.friction.viscous.fill_(0.5)
+        model.get_parameter("friction.viscous").fill_(0.5)
     t = H * torch.arange(K, dtype=torch.float64)
     q, p = t.cos()[:, None], -t.sin()[:, None]
     run = SimpleNamespace(model=model, data=Trajectories.of(t, q), train_lengths=(K,), states=SimpleNamespace(q=q, p=p))

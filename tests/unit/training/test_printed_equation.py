@@ -236,7 +236,7 @@ def test_delay_and_lag_stand_below_the_equation(monkeypatch):
     assert "being what acts, taken as exact in the deviations above" in notes
     assert "less the zero of its sensor (x 0.01; theta 0.02)" in notes
     # fails if the place of a bend of the law is said to be the zero of a sensor
-    run.metrics["plan"]["reasons"] = {"zeros": f"{CENTRE}0.01 ± 0.001"}
+    run.metrics["plan"] = {"zeros": (0.01, 0.02), "reasons": {"zeros": f"{CENTRE}0.01 ± 0.001"}}
     assert "less the place that terms are about (x 0.01; theta 0.02)" in " ".join(notes_of(run))
 
 
