@@ -45,8 +45,8 @@ not fit: ..." with what to try; then the exit code is 3.
 
 DATA is .csv (header t[s],theta[rad],...; a column trajectory, or one that changes wherever time starts anew, groups
 the rows, and a clock that falls back begins a recording), .npz (arrays t, q), a Schmidt & Lipson .txt, or with the
-extra "tables" .parquet, .h5 or .mat; or a folder of such files, a recording each. Steps may
-differ, and samples may be missing.
+extra "tables" .parquet, .h5 or .mat; or a folder of such files, a recording each. Steps may differ, and samples may be
+missing.
 
 examples:
   herglotz fit pendulum.csv --out runs/pendulum
