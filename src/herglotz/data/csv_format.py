@@ -199,7 +199,8 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     left aside; every other column is a coordinate. A coordinate in rad is taken for an angle. A warning names every
     role that is a guess.
 
-    **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row
+    **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`), and neither
+    has a number that stands for a missing reading, such as -999 among millimetres (`herglotz.data.marks`). A row
     without any coordinate, or without s or a momentum, is left out; the step over that row has the mean of the inputs.
     An empty input is held from the row before, or interpolated linearly if the hold is "first" or "smooth". Rows of
     stacked tables are sorted by time, and rows of equal time joined.
