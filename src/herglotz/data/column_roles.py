@@ -42,11 +42,15 @@ KINDS = {
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|VA|m?[AW]h|bool"),
 }
 NUMBERED = r"(_?\d+|_.*)?"
+# Words of a time that name its unit, as Arduino's millis() and micros() do.
+UNITS_OF_TIME = {"millis": "ms", "milliseconds": "ms", "ms": "ms"} | dict.fromkeys(
+    ("micros", "microseconds", "us", "µs", "μs"), "us"
+)
 # Names that have a role whatever their words, unless the unit is of another kind.
 ROLES = {
     "time": re.compile(
         r"t|times?|timestamps?|date|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
-        r"|czas|čas|aika|(.+[._/])?stamp"
+        r"|czas|čas|aika|(.+[._/])?stamp|millis|micros|milliseconds|microseconds|ms|us|µs|μs"
     ),
     "trajectory": re.compile(
         r"(trajectory|trial|run|recording|experiment|episode|versuch|lauf|messreihe|essai|ensayo|prueba|prova)"
@@ -201,8 +205,13 @@ def is_recorded_effort(name: str, unit: str) -> bool:
 
 
 def is_timed(words: frozenset[str]) -> bool:
-    """Whether a word of a name, longer than a letter, is that of a time: `elapsed_time`."""
-    return any(len(word) > 1 and ROLES["time"].fullmatch(word) for word in words)
+    """Whether a word of a name is that of a time: `elapsed_time`, but neither a letter nor `us_distance`."""
+    return any(len(word) > 2 and ROLES["time"].fullmatch(word) for word in words)
+
+
+def unit_of_time(name: str) -> str:
+    """The unit that the name of a time says, `millis` and `elapsed_us`; "" if the name says none."""
+    return next((unit for word, unit in UNITS_OF_TIME.items() if word in words_of(name)), "")
 
 
 def is_usual(name: str, unit: str) -> bool:
@@ -231,6 +240,8 @@ def words_of(name: str) -> frozenset[str]:
 def _whole(key: str, kind: str) -> str:
     """The role of a name as a whole, unless its unit is of another kind; "" for no role."""
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "")
+    if key in UNITS_OF_TIME:
+        return role if kind in ("", "time") else ""
     if role in ("action", "momentum"):
         return "" if kind in ("position", "pressure", "other") else role
     if role == "trajectory":
@@ -256,6 +267,9 @@ def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
     """The role of a column with a unit that no position has."""
     if kind == "acceleration" and words & (WORDS["excitation"] | WORDS["support"]):
         return Guess("input", BY_NAME)
+    # The width of a pulse commands a servo.
+    if kind == "time" and words & {*WORDS["effort"], "pulse"} and not is_timed(words):
+        return Guess("input")
     if kind in ("effort", "electric"):
         read = words & WORDS["reading"] and not words & (WORDS["effort"] | WORDS["attribute"])
         read = read or re.fullmatch(SYMBOL + r"_?\d*", key)

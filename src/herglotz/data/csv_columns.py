@@ -21,6 +21,7 @@ from herglotz.data.column_roles import (
     is_usual,
     kind_of,
     role_of,
+    unit_of_time,
     words_of,
 )
 from herglotz.errors import InputError, refuse
@@ -150,12 +151,14 @@ def assign(
     where: str,
     wanted: Wanted = HEADER_DECIDES,
     is_constant: Callable[[int], bool] | None = None,
+    increases: Callable[[int], bool] | None = None,
 ) -> Columns:
     """Give every column of a header its role; the cells are `name` or `name[unit]`.
 
     Of several columns with the name of a group, those that are the same in every row (`is_constant`) are left aside;
-    without `is_constant` the first is taken. Raise InputError, which begins with `where` (file and row), if a cell
-    cannot be read, a name comes twice, time or all coordinates are missing, a named column is absent, or several
+    without `is_constant` the first is taken. Of several times those are meant that increase (`increases`). A time whose
+    name says its unit, as `millis`, has this unit. Raise InputError, which begins with `where` (file and row), if a
+    cell cannot be read, a name comes twice, time or all coordinates are missing, a named column is absent, or several
     columns group the rows.
     """
     names, units = _parse(cells, where, wanted)
@@ -169,7 +172,11 @@ def assign(
     })  # fmt: skip
     guesses = _guesses(names, units, wanted)
     roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
-    clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))
+    clocks = roles["time"] or _other_clocks(names, units, roles)
+    if increases is not None and len(clocks) > 1:
+        clocks = [i for i in clocks if increases(i)] or clocks
+    clock = _clock(where, names, clocks)
+    units = (*units[:clock], units[clock] or unit_of_time(names[clock]), *units[clock + 1 :])
     u = wanted.in_order(roles["input"], names)
     if wanted.coordinates is None:
         q = wanted.in_order(roles["q"], names)

@@ -181,16 +181,17 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5` make
     q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
 
-    **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time.
-    So is the stamp of a message of ROS (`header.stamp`). Times may be dates in ISO 8601, which become seconds since the
-    first row. Stamps without a unit of about 1e12, 1e15 and 1e18 are ms, us and ns since 1970; above 2^53, stamps count
-    from the first row. A number in brackets belongs to the name: `position[0]`. `trajectory`, `trial`, `run`,
-    `experiment`, `Versuch`, `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a
-    warning, a column that changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or
-    text. A clock that falls back within such a group, or without one, begins a recording, with a warning. Text, and
-    numbers without a unit and a usual name, that are the same in every row are left aside beside other coordinates.
-    `s` is the action, `p`/`p_*` are momenta. Of other columns the unit decides before the name
-    (`herglotz.data.column_roles`): rad, deg, m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs; m/s, rad/s, rpm
+    **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` `millis`, `micros`, which say their unit, or the only
+    column in a unit of time is the time; of several such columns, the one that increases. So is the stamp of a message
+    of ROS (`header.stamp`). Times may be dates in ISO 8601, which become seconds since the first row. Stamps without a
+    unit of about 1e12, 1e15 and 1e18 are ms, us and ns since 1970; above 2^53, stamps count from the first row. A
+    number in brackets belongs to the name: `position[0]`. `trajectory`, `trial`, `run`, `experiment`, `Versuch`,
+    `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a warning, a column that
+    changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or text. A clock that
+    falls back within such a group, or without one, begins a recording, with a warning. Text, and numbers without a unit
+    and a usual name, that are the same in every row are left aside beside other coordinates. `s` is the action,
+    `p`/`p_*` are momenta. Of other columns the unit decides before the name (`herglotz.data.column_roles`): rad, deg,
+    m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs, and so is a pulse width (`pwm [us]`); m/s, rad/s, rpm
     rates; rates are left aside, and so are °C, Pa, W, and, unless no other column is a coordinate, Wb, T, H and F. A
     set value of a motion is an input in any unit: goal, target, set point, desired, reference, command, soll; so is
     what shakes a mechanism: road, ground, excitation, Erregung. Without a unit `u`, `u1`, `u_*`, `F`, force, torque,

@@ -1,8 +1,9 @@
 """Numbers that a logger writes where a reading is missing, such as -999, 9999, 1e30 and 65535.
 
 A mark repeats exactly, and lies farther from the readings than these from one another. A mechanism does not jump there
-and back; only a sensor that wraps does, from one reading to the next, and its jumps all begin and end at the other end
-of its range. Inputs jump, as pulses do: of these a mark also has to be a number that loggers write (`is_usual`).
+and back, again and again; only a sensor that wraps does, and its jumps all begin and end at the other end of its range.
+A number that loggers write (`is_usual`) may stand in one place alone. Inputs jump, as pulses do: their marks have to be
+such numbers.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def marks_of(
     part = np.concatenate([[0], np.cumsum(~together)])[known]
     x, pair = x[known], np.diff(part) == 0
     low, high = float(x.min()), float(x.max())
-    return next((sorted(own) for own in ({low}, {high}, {low, high}) if _are_marks(x, pair, own, is_input)), [])
+    # Numbers near the largest of float64 have infinite differences.
+    with np.errstate(over="ignore"):
+        return next((sorted(own) for own in ({low}, {high}, {low, high}) if _are_marks(x, pair, own, is_input)), [])
 
 
 def _are_marks(x: np.ndarray, pair: np.ndarray, marks: set[float], is_input: bool) -> bool:
@@ -41,9 +44,10 @@ def _are_marks(x: np.ndarray, pair: np.ndarray, marks: set[float], is_input: boo
     rest = x[~at]
     if not len(rest) or (is_input and not all(map(is_usual, marks))):
         return False
-    step = float(np.abs(np.diff(x))[pair & ~at[1:] & ~at[:-1]].max(initial=0.0))
+    steps = np.abs(np.diff(x))[pair & ~at[1:] & ~at[:-1]]
     jump, ends = pair & (at[1:] != at[:-1]), (float(rest.min()), float(rest.max()))
-    return all(_is_mark(x, jump, mark, ends, step) for mark in marks)
+    # Fewer steps than jumps tell nothing of the motion.
+    return len(steps) > int(jump.sum()) and all(_is_mark(x, jump, mark, ends, float(steps.max())) for mark in marks)
 
 
 def _is_mark(x: np.ndarray, jump: np.ndarray, mark: float, ends: tuple[float, float], step: float) -> bool:
@@ -58,7 +62,8 @@ def _is_mark(x: np.ndarray, jump: np.ndarray, mark: float, ends: tuple[float, fl
     # fewer steps may jump anywhere.
     wraps = bool((np.abs(beside - (low if mark > high else high)) <= 2 * step).all())
     far = max(low - mark, mark - high) > high - low
-    return int(at.sum()) > 1 and far and bool(there.any() and back.any()) and not wraps
+    again = min(int(there.sum()), int(back.sum())) > (0 if is_usual(mark) else 1)
+    return int(at.sum()) > 1 and far and again and not wraps
 
 
 def is_usual(value: float) -> bool:

@@ -46,6 +46,10 @@ def test_marks_beside_blank_cells(tmp_path):
     assert data.samples == 200 - len(GONE) - 4
 
 
+def test_a_sensor_that_is_lost_once(tmp_path):  # fails if a loggers' number has to come in two places
+    assert load(written(tmp_path, having(SWING, -999, [60, 61]))).samples == 198
+
+
 def test_an_input_is_held_over_its_marks(tmp_path):
     # fails if -999 N acts, or if an input keeps the mark of its logger
     data = load(written(tmp_path, SWING, having(np.sin(T), -999)))
@@ -62,6 +66,9 @@ def test_an_input_is_held_over_its_marks(tmp_path):
         (having(SWING, -999, [60]), None),
         # Spikes that differ.
         (having(SWING, -999 - np.arange(6.0)), None),
+        # A jump there and back, once, and to no number of loggers; readings of which few are neighbours.
+        (having(SWING, -100, [60, 61]), None),
+        (having(SWING, -999, np.arange(1, 199, 3)), None),
         # Not farther than the readings are from one another.
         (having(SWING, 20), None),
         # A sensor that wraps: below 0 it reads 359.9.

@@ -55,6 +55,9 @@ ROLES = {
     "acc": "left aside", "gyro[rad/s]": "left aside", "a[m/s^2]": "left aside", "b (mm/s²)": "left aside",
     "index": "left aside", "frame": "left aside", "Unnamed: 0": "left aside", "theta2ddot": "left aside",
     "omega_1": "left aside",
+    # The width of a pulse commands a servo, a latency does not; us is a unit of time or ultrasound.
+    "pwm [us]": "input", "servo_duty[ms]": "input", "pulse width[us]": "input", "latency[ms]": "left aside",
+    "pwm_time[us]": "left aside", "us_distance": "coordinate", "us[mm]": "coordinate", "us_left[cm]": "coordinate",
     # Names that only begin like a force.
     "f": "coordinate", "N": "coordinate", "taut": "coordinate", "motion": "coordinate", "uplift": "coordinate",
     "forceful": "coordinate", "up": "coordinate", "unit[Nms]": "coordinate", "cmds": "coordinate",
@@ -211,6 +214,31 @@ def test_times_in_other_words(tmp_path, name):  # fails if a time is a coordinat
     data = read(tmp_path, table(f"x[m],{name},u_t[N]"))
     assert data.columns[1][1] == "time"
     assert data.t.tolist() == pytest.approx([(k / 8) ** (4 / 3) for k in range(8)], rel=1e-4, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "count"),
+    [("millis", "ms", 1e3), ("micros", "us", 1e6), ("ms", "ms", 1e3), ("elapsed_millis", "ms", 1e3), ("t", "", 1)],
+)
+def test_a_time_whose_name_says_its_unit(tmp_path, capsys, name, unit, count):
+    # fails if Arduino's millis() is no time, or is taken for seconds, by itself and where the user names it
+    text = f"{name},x[mm]\n" + "".join(f"{20 * k},{k**1.5:.4g}\n" for k in range(8))
+    for options in ({}, {"time": name}):
+        data = read(tmp_path, text, **options)
+        assert data.time_unit == "s"
+        assert data.t[-1].item() == pytest.approx(140 / count)
+    said = f"{unit}, converted to s" if unit else "- (taken for s)"
+    assert capsys.readouterr().err.count(said) == 2
+
+
+def test_of_several_times_those_are_meant_that_increase(tmp_path):
+    # fails if a column in a unit of time is asked for though its values go up and down, or a constant one is a time
+    rows = "".join(f"{k % 25},{1200 + 300 * (k % 2)},50,{k % 7}\n" for k in range(50))
+    data = read(tmp_path, "tick[ms],opening[us],period[ms],x[mm]\n" + rows)
+    assert [role for _, role, _ in data.columns] == ["time", "left aside", "left aside", "coordinate"]
+    assert data.lengths == (25, 25)
+    rows = "".join(f"{k},{1200 + 300 * (k % 2)},{k % 7},1\n" for k in range(50))
+    assert read(tmp_path, "tick[ms],opening[us],x[mm],note\n" + rows).names == ("x",)
 
 
 def test_two_times_are_asked_for(tmp_path):  # fails if one of two is chosen unsaid
