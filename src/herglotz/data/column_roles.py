@@ -171,6 +171,13 @@ def is_of_others(unit: str, units: Collection[str]) -> bool:
     return kind_of(unit) == "acceleration" and known and angular not in {bool(ANGLES.fullmatch(x)) for x in units}
 
 
+def is_rate_of_others(name: str, coordinates: Collection[str]) -> bool:
+    """Whether the name of a rate has words of its own, and none of these coordinates': `hoop speed` beside `bead`."""
+    own = words_of(name) - WORDS["rate"]
+    known = frozenset(word for other in coordinates for word in words_of(other))
+    return bool(own) and not own & known and not RATE.fullmatch(plainly(name).casefold())
+
+
 def is_angular(name: str) -> bool:
     """Whether a name is usual for angles."""
     return bool(words_of(name) & WORDS["angle"])
