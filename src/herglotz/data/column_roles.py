@@ -259,7 +259,8 @@ def _whole(key: str, kind: str) -> str:
 
 def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
     """The role of a column in the unit of a position: a coordinate, unless the name is usual for an excitation."""
-    if words and words <= GIVEN:
+    # A tendon input is an input, and an input shaft is a shaft.
+    if _last(key) in GIVEN:
         return Guess("input", "it has the unit of a position")
     if _is_rate(key, words, others, "position"):
         return Guess("rate", "it has the unit of a position")
@@ -298,10 +299,14 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
     attribute = words & WORDS["attribute"]
     if words & (WORDS["position"] | WORDS["reading"]) and not words & WORDS["effort"]:
         return Guess("q", "its name may be that of an input" if words & GIVEN else "")
-    last = re.split(r"[\W\d_]+", key.rstrip("0123456789_"))[-1]
-    if attribute and re.fullmatch(SYMBOL, last):
+    if attribute and re.fullmatch(SYMBOL, _last(key)):
         return Guess("q", "its name may be that of an input")
     return Guess("input" if attribute or words & WORDS["effort"] else "q")
+
+
+def _last(key: str) -> str:
+    """The last word of a name, without a number behind it; "" for a name without letters."""
+    return next(reversed(re.findall(r"[^\W\d_]+", key)), "")
 
 
 def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:
@@ -409,6 +414,8 @@ def _may_have(name: str, unit: str) -> bool:
     timed = _is_timed(name)
     length = part == "position" and not ANGLES.fullmatch(base)
     letter = len(unit) == 1 and unit.isalpha() and not AMBIGUOUS.fullmatch(unit)
+    # Behind the name of a rate g is that of gravity, as in ax_g; q_g is a name.
+    letter = letter and not (unit == "g" and role_of(name, "").role == "rate")
     # x_in is the input beside x_out, x_lb the lower bound, and left_feet are feet.
     word = base in ("in", "feet", "lb")
     if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or word:

@@ -31,6 +31,8 @@ SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
 MAX_TITLE_LINES = 50
 # A line above the header that gives Excel the separator.
 EXCEL = "sep=(.|tab)?"
+# The last line of each of two preambles of LabVIEW's measurement files.
+LABVIEW = "***End_of_Header***"
 # 1,234.5 and 1,234,567
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
 # 1,250 is 1250 or 1.25; 0,250 is 0.25 alone.
@@ -60,9 +62,10 @@ def table_of(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
     in others, or commas that may separate thousands.
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
+    written, preamble = _without_preamble(written)
     lines_of, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
     lines_of, above = _without_titles(lines_of)
-    notes += above
+    notes += [*preamble, *above]
     separator = (_separator(lines_of[0][1], lines_of[1][1]) if len(lines_of) > 1 else None) or ","
     if separator != ",":
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
@@ -108,6 +111,17 @@ def _without_titles(rows: Lines) -> tuple[Lines, list[str]]:
         return rows, []
     plural = "s" if at > 1 else ""
     return rows[at:], [f"{at} line{plural} above the header, which is row {rows[at][0]}, left out"]
+
+
+def _without_preamble(written: Lines) -> tuple[Lines, list[str]]:
+    """The rows below the last line that ends a preamble of LabVIEW, whose column X_Value is a time in s; and a note."""
+    ends = [k for k, (_, line) in enumerate(written[:MAX_TITLE_LINES], 1) if line.startswith(LABVIEW)]
+    if not ends or ends[-1] == len(written):
+        return written, []
+    (row, header), *rows = written[ends[-1] :]
+    if header.split("\t")[0] == "X_Value":
+        header = header.replace("X_Value", "X_Value [s]", 1)
+    return [(row, header), *rows], [f"{ends[-1]} lines above the header, which is row {row}, left out"]
 
 
 def _has_time(line: str, separator: str) -> bool:

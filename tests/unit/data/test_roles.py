@@ -58,6 +58,9 @@ ROLES = {
     # The width of a pulse commands a servo, a latency does not; us is a unit of time or ultrasound.
     "pwm [us]": "input", "servo_duty[ms]": "input", "pulse width[us]": "input", "latency[ms]": "left aside",
     "pwm_time[us]": "left aside", "us_distance": "coordinate", "us[mm]": "coordinate", "us_left[cm]": "coordinate",
+    # An input by its last word, and parts of machines; gravities of accelerometers, and a name.
+    "tendon_input[mm]": "input", "valve control 2[deg]": "input", "input_shaft[rad]": "coordinate",
+    "ax_g": "left aside", "acc_x_g": "left aside", "accel_g": "left aside", "q_g": "coordinate", "drum_g": "coordinate",
     # Names that only begin like a force.
     "f": "coordinate", "N": "coordinate", "taut": "coordinate", "motion": "coordinate", "uplift": "coordinate",
     "forceful": "coordinate", "up": "coordinate", "unit[Nms]": "coordinate", "cmds": "coordinate",
@@ -143,7 +146,8 @@ def test_a_goal_beside_what_acts_is_said(tmp_path, capsys, header, said):
 GUESSES = {
     "road[mm]": "is taken for an input, but by its name alone; else give --coordinates x,road or --drop road",
     "exciter[mm]": "is taken for an input, but by its name alone",
-    "pivot_acceleration[m/s^2]": "is taken for an input, but by its name alone",
+    "pivot_acceleration[m/s^2]": "is taken for an input, but by its name alone; else give --drop pivot_acceleration",
+    "tendon_input[mm]": "is taken for an input, but it has the unit of a position; else give --coordinates x,",
     "support[m]": "is taken for an input, but by its name alone",
     "pivot_y[m]": "is taken for a coordinate, but it may be moved from outside; else give --inputs pivot_y or",
     "u_x[m]": "is taken for an input, but it has the unit of a position",
@@ -173,6 +177,17 @@ def test_what_is_a_guess_is_said_in_a_warning(tmp_path, capsys, cell):
     told = {"inputs": name} if "--inputs" in GUESSES[cell] else {"coordinates": ["x", name]}
     read(tmp_path, table(f"t[s],x[m],{cell}"), **told)
     assert "warning" not in capsys.readouterr().err  # it is known by then, or the user has said it
+
+
+def test_no_acceleration_is_offered_as_a_coordinate():
+    # fails if the remedy for a floor in mm makes a position of an accelerometer beside it
+    (said,) = assign(["t[s]", "damper[mm]", "floor[mm]", "base_acc[m/s2]"], "header").notes
+    assert said == (
+        "warning: floor, base_acc are taken for inputs, but by their names alone; else give --coordinates damper,floor "
+        "or --drop floor,base_acc"
+    )
+    (said,) = assign(["t[s]", "pitch[deg]", "ax_g"], "header").notes
+    assert said.endswith("it may be an input; if so, give --inputs ax")
 
 
 def test_raw_values_are_fitted_and_their_filtered_copy_is_not():
