@@ -228,7 +228,7 @@ def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
     if not found:
         return "add a column such as q[rad]"
     # A rate that is taken for a coordinate is modelled as a position.
-    add = "integrate a rate over time into a column of its own, or, of what is a position after all, "
+    add = "integrate a rate over time into a column of its own, or, if one of these is a position, "
     ways = f"{add if roles['rate'] else ''}choose with --coordinates NAMES (coordinates= in Python)"
     return f"{', '.join(found)}: {ways}"
 

@@ -144,8 +144,8 @@ def load(
     Parameters
     ----------
     path
-        .csv (or such a table in .txt, .tsv, .dat, .lvm), .npz, or with the extra `tables` .parquet, .h5 or .mat; or a folder
-        of such files: each holds a recording, in the order of their names.
+        .csv (or such a table in .txt, .tsv, .dat, .lvm), .npz, or with the extra `tables` .parquet, .h5 or .mat; or a
+        folder of such files: each holds a recording, in the order of their names.
     angles
         Coordinates that are angles; True for all; left out: those in rad or deg; () for none.
     degrees

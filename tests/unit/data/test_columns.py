@@ -35,8 +35,8 @@ def rows(*columns):
 @pytest.mark.parametrize(
     ("head", "looks"),
     [
-        ("speed", "speed looks like a rate: integrate a rate over time into a column of its own, or, of what is a "
-                  "position after all, choose with --coordinates NAMES"),
+        ("speed", "speed looks like a rate: integrate a rate over time into a column of its own, or, if one of "
+                  "these is a position, choose with --coordinates NAMES"),
         ("voltage", "voltage looks like an input: choose with --coordinates NAMES"),
     ],
 )  # fmt: skip
