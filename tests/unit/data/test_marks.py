@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from herglotz.data import load
+from herglotz.data import as_trajectories, load
 
 T = np.arange(200) * 0.02
 SWING = 8 * np.cos(3 * T)
@@ -31,6 +31,17 @@ def test_a_mark_of_missing_readings_is_no_reading(tmp_path, mark):
     assert float(data.q.std()) < 8
     told = next(note for note in data.notes if "mark" in note)
     assert told.startswith(f"warning: level is {mark:.15g} in 6 rows (22, 23, 24, …), farther from its other values")
+
+
+def test_marks_in_arrays(capsys):
+    # fails if an array with -999 is read otherwise than a table with -999
+    both = as_trajectories(np.c_[having(SWING, -999), np.sin(T)], h=0.02, coordinates=["level[mm]", "x"])
+    assert both.samples == 200
+    assert both.observed is not None
+    assert (both.observed == 0).nonzero().tolist() == [[k, 0] for k in GONE]
+    assert float(both.q.abs().max()) < 9
+    assert "array: warning: level is -999 in 6 rows (20, 21, 22, …)" in capsys.readouterr().err
+    assert as_trajectories(having(SWING, -999), h=0.02).samples == 200 - len(GONE)
 
 
 def test_two_marks_in_one_column(tmp_path):
