@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from numbers import Number
 from pathlib import Path
 from types import FunctionType
@@ -17,6 +18,7 @@ from herglotz.data.column_roles import name_and_unit
 from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import with_missing
+from herglotz.data.marks import without_marks
 from herglotz.data.polar import named_by
 from herglotz.data.readers import angles_like, as_meant, finished, load
 from herglotz.data.sensors import calibrated
@@ -190,10 +192,13 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time), lambda k: f"sample {k}")
     t = np.arange(n) * float(h) if h is not None else _floats("time", clock)
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
-    missing = q.isnan().reshape(n, -1)
+    found = Trajectories.of(t, q.where(~q.isnan(), 0.0), u=u, source="array", **_labels(called))
+    readings = [(k, name, False) for k, name in enumerate(found.names, 1)]
+    table, marks = without_marks(np.column_stack([found.t, q.reshape(n, -1)]), [""] * n, range(n), readings)
+    missing = torch.from_numpy(np.isnan(table[:, 1:]))
     known = int((~missing.any(1)).sum())
     refuse({f"array: {known} of its {n} samples have a value, {MIN_SAMPLES} are needed": known < MIN_SAMPLES < n})
-    found = Trajectories.of(t, q.where(~q.isnan(), 0.0), u=u, source="array", **_labels(called))
+    found = replace(found, notes=(*found.notes, *marks))
     found = with_missing(found, ~missing, lambda k: f"sample {k}") if known < n else found
     return in_radians_and_seconds(found)
 

@@ -42,11 +42,15 @@ KINDS = {
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|VA|m?[AW]h|bool"),
 }
 NUMBERED = r"(_?\d+|_.*)?"
+# Words of a time that name its unit, as Arduino's millis() and micros() do.
+UNITS_OF_TIME = {"millis": "ms", "milliseconds": "ms", "ms": "ms"} | dict.fromkeys(
+    ("micros", "microseconds", "us", "µs", "μs"), "us"
+)
 # Names that have a role whatever their words, unless the unit is of another kind.
 ROLES = {
     "time": re.compile(
         r"t|times?|timestamps?|date|datetime|secs?|seconds|elapsed|zeit|zeitstempel|uhrzeit|temps|heure|tiempo|hora|tempo|tijd|tid"
-        r"|czas|čas|aika|(.+[._/])?stamp"
+        r"|czas|čas|aika|(.+[._/])?stamp|millis|micros|milliseconds|microseconds|ms|us|µs|μs"
     ),
     "trajectory": re.compile(
         r"(trajectory|trial|run|recording|experiment|episode|versuch|lauf|messreihe|essai|ensayo|prueba|prova)"
@@ -167,6 +171,13 @@ def is_of_others(unit: str, units: Collection[str]) -> bool:
     return kind_of(unit) == "acceleration" and known and angular not in {bool(ANGLES.fullmatch(x)) for x in units}
 
 
+def is_rate_of_others(name: str, coordinates: Collection[str]) -> bool:
+    """Whether the name of a rate has words of its own, and none of these coordinates': `hoop speed` beside `bead`."""
+    own = words_of(name) - WORDS["rate"]
+    known = frozenset(word for other in coordinates for word in words_of(other))
+    return bool(own) and not own & known and not RATE.fullmatch(plainly(name).casefold())
+
+
 def is_angular(name: str) -> bool:
     """Whether a name is usual for angles."""
     return bool(words_of(name) & WORDS["angle"])
@@ -201,8 +212,13 @@ def is_recorded_effort(name: str, unit: str) -> bool:
 
 
 def is_timed(words: frozenset[str]) -> bool:
-    """Whether a word of a name, longer than a letter, is that of a time: `elapsed_time`."""
-    return any(len(word) > 1 and ROLES["time"].fullmatch(word) for word in words)
+    """Whether a word of a name is that of a time: `elapsed_time`, but neither a letter nor `us_distance`."""
+    return any(len(word) > 2 and ROLES["time"].fullmatch(word) for word in words)
+
+
+def unit_of_time(name: str) -> str:
+    """The unit that the name of a time says, `millis` and `elapsed_us`; "" if the name says none."""
+    return next((unit for word, unit in UNITS_OF_TIME.items() if word in words_of(name)), "")
 
 
 def is_usual(name: str, unit: str) -> bool:
@@ -231,6 +247,8 @@ def words_of(name: str) -> frozenset[str]:
 def _whole(key: str, kind: str) -> str:
     """The role of a name as a whole, unless its unit is of another kind; "" for no role."""
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "")
+    if key in UNITS_OF_TIME:
+        return role if kind in ("", "time") else ""
     if role in ("action", "momentum"):
         return "" if kind in ("position", "pressure", "other") else role
     if role == "trajectory":
@@ -241,7 +259,8 @@ def _whole(key: str, kind: str) -> str:
 
 def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
     """The role of a column in the unit of a position: a coordinate, unless the name is usual for an excitation."""
-    if words and words <= GIVEN:
+    # A tendon input is an input, and an input shaft is a shaft.
+    if _last(key) in GIVEN:
         return Guess("input", "it has the unit of a position")
     if _is_rate(key, words, others, "position"):
         return Guess("rate", "it has the unit of a position")
@@ -256,6 +275,9 @@ def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
     """The role of a column with a unit that no position has."""
     if kind == "acceleration" and words & (WORDS["excitation"] | WORDS["support"]):
         return Guess("input", BY_NAME)
+    # The width of a pulse commands a servo.
+    if kind == "time" and words & {*WORDS["effort"], "pulse"} and not is_timed(words):
+        return Guess("input")
     if kind in ("effort", "electric"):
         read = words & WORDS["reading"] and not words & (WORDS["effort"] | WORDS["attribute"])
         read = read or re.fullmatch(SYMBOL + r"_?\d*", key)
@@ -277,10 +299,14 @@ def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess
     attribute = words & WORDS["attribute"]
     if words & (WORDS["position"] | WORDS["reading"]) and not words & WORDS["effort"]:
         return Guess("q", "its name may be that of an input" if words & GIVEN else "")
-    last = re.split(r"[\W\d_]+", key.rstrip("0123456789_"))[-1]
-    if attribute and re.fullmatch(SYMBOL, last):
+    if attribute and re.fullmatch(SYMBOL, _last(key)):
         return Guess("q", "its name may be that of an input")
     return Guess("input" if attribute or words & WORDS["effort"] else "q")
+
+
+def _last(key: str) -> str:
+    """The last word of a name, without a number behind it; "" for a name without letters."""
+    return next(reversed(re.findall(r"[^\W\d_]+", key)), "")
 
 
 def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:
@@ -388,6 +414,8 @@ def _may_have(name: str, unit: str) -> bool:
     timed = _is_timed(name)
     length = part == "position" and not ANGLES.fullmatch(base)
     letter = len(unit) == 1 and unit.isalpha() and not AMBIGUOUS.fullmatch(unit)
+    # Behind the name of a rate g is that of gravity, as in ax_g; q_g is a name.
+    letter = letter and not (unit == "g" and role_of(name, "").role == "rate")
     # x_in is the input beside x_out, x_lb the lower bound, and left_feet are feet.
     word = base in ("in", "feet", "lb")
     if timed != (kind == "time") or (length and is_angular(name)) or (letter and not timed) or word:

@@ -10,6 +10,7 @@ from typing import Any
 
 from herglotz.data.checks import quote
 from herglotz.data.column_roles import (
+    BY_NAME,
     READING,
     ROLES,
     Guess,
@@ -21,6 +22,7 @@ from herglotz.data.column_roles import (
     is_usual,
     kind_of,
     role_of,
+    unit_of_time,
     words_of,
 )
 from herglotz.errors import InputError, refuse
@@ -150,12 +152,14 @@ def assign(
     where: str,
     wanted: Wanted = HEADER_DECIDES,
     is_constant: Callable[[int], bool] | None = None,
+    increases: Callable[[int], bool] | None = None,
 ) -> Columns:
     """Give every column of a header its role; the cells are `name` or `name[unit]`.
 
     Of several columns with the name of a group, those that are the same in every row (`is_constant`) are left aside;
-    without `is_constant` the first is taken. Raise InputError, which begins with `where` (file and row), if a cell
-    cannot be read, a name comes twice, time or all coordinates are missing, a named column is absent, or several
+    without `is_constant` the first is taken. Of several times those are meant that increase (`increases`). A time whose
+    name says its unit, as `millis`, has this unit. Raise InputError, which begins with `where` (file and row), if a
+    cell cannot be read, a name comes twice, time or all coordinates are missing, a named column is absent, or several
     columns group the rows.
     """
     names, units = _parse(cells, where, wanted)
@@ -169,7 +173,11 @@ def assign(
     })  # fmt: skip
     guesses = _guesses(names, units, wanted)
     roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
-    clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))
+    clocks = roles["time"] or _other_clocks(names, units, roles)
+    if increases is not None and len(clocks) > 1:
+        clocks = [i for i in clocks if increases(i)] or clocks
+    clock = _clock(where, names, clocks)
+    units = (*units[:clock], units[clock] or unit_of_time(names[clock]), *units[clock + 1 :])
     u = wanted.in_order(roles["input"], names)
     if wanted.coordinates is None:
         q = wanted.in_order(roles["q"], names)
@@ -208,10 +216,21 @@ def same_everywhere(names: Sequence[str]) -> str:
 
 def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
     """The remedy for a table without a coordinate: what its columns look like, and the flag that chooses."""
-    looks = {"rate": "look like rates", "input": "look like inputs", "dropped": "look like no positions"}
-    found = [f"{', '.join(names[i] for i in roles[role])} {look}" for role, look in looks.items() if roles[role]]
-    choose = f"{', '.join(found)}: choose with --coordinates NAMES (coordinates= in Python)"
-    return choose if found else "add a column such as q[rad]"
+    looks = {
+        "rate": ("looks like a rate", "look like rates"),
+        "input": ("looks like an input", "look like inputs"),
+        "dropped": ("looks like no position", "look like no positions"),
+    }
+    found = [
+        f"{', '.join(names[i] for i in own)} {look[len(own) > 1]}"
+        for role, look in looks.items() if (own := roles[role])
+    ]  # fmt: skip
+    if not found:
+        return "add a column such as q[rad]"
+    # A rate that is taken for a coordinate is modelled as a position.
+    add = "integrate a rate over time into a column of its own, or, if one of these is a position, "
+    ways = f"{add if roles['rate'] else ''}choose with --coordinates NAMES (coordinates= in Python)"
+    return f"{', '.join(found)}: {ways}"
 
 
 def as_names(names: Names) -> Sequence[str]:
@@ -299,13 +318,20 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
     """The warning of these columns: their role, the doubt about the role, and the flags that change the role."""
     is_q, is_u = columns[0] in found.q, columns[0] in found.u
     names = [found.names[i] for i in columns]
-    one, some = len(names) == 1, ",".join(names[:MAX_LISTED])
+    one = len(names) == 1
+    doubt = doubt if one or doubt != BY_NAME else "by their names alone"
     few = ", ".join(names if len(names) <= MAX_LISTED else [*names[:MAX_LISTED], f"{len(names) - MAX_LISTED} more"])
     role = ("a coordinate" if one else "coordinates") if is_q else ("an input" if one else "inputs") if is_u else ""
-    flags = {"inputs": (not is_u, found.u), "coordinates": (not is_q, found.q), "drop": (role, ())}
+    # No acceleration and no force is a position.
+    places = [found.names[i] for i in columns if kind_of(found.units[i]) not in ("acceleration", "rate", "effort")]
+    flags = {
+        "inputs": ([] if is_u else names, found.u),
+        "coordinates": ([] if is_q else places, found.q),
+        "drop": (names if role else [], ()),
+    }
     ways = [
-        f"--{flag} {shlex.quote(','.join([*(found.names[i] for i in others), some]))}"
-        for flag, (applies, others) in flags.items() if applies
+        f"--{flag} {shlex.quote(','.join([*(found.names[i] for i in others), *own[:MAX_LISTED]]))}"
+        for flag, (own, others) in flags.items() if own
     ]  # fmt: skip
     if set(columns) == set(found.q):
         ways = ["--inputs or --drop with the names of those that are none"]
@@ -334,6 +360,7 @@ def _parse(cells: Sequence[str], where: str, wanted: Wanted) -> tuple[tuple[str,
         if head is None:
             raise InputError(
                 f"{where}, column {i + 1}: {quote(cells[i])} is not a header cell; write name or name[unit]"
+                + ("" if cells[i] else ", and delete lines above the header, or begin them with #")
             )
     names, units = (tuple(head[k] for head in found if head) for k in (0, 1))
     for name, count in Counter(names).items():

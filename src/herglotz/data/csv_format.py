@@ -31,6 +31,8 @@ SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
 MAX_TITLE_LINES = 50
 # A line above the header that gives Excel the separator.
 EXCEL = "sep=(.|tab)?"
+# The last line of each of two preambles of LabVIEW's measurement files.
+LABVIEW = "***End_of_Header***"
 # 1,234.5 and 1,234,567
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
 # 1,250 is 1250 or 1.25; 0,250 is 0.25 alone.
@@ -60,9 +62,10 @@ def table_of(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
     in others, or commas that may separate thousands.
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
+    written, preamble = _without_preamble(written)
     lines_of, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
     lines_of, above = _without_titles(lines_of)
-    notes += above
+    notes += [*preamble, *above]
     separator = (_separator(lines_of[0][1], lines_of[1][1]) if len(lines_of) > 1 else None) or ","
     if separator != ",":
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
@@ -108,6 +111,17 @@ def _without_titles(rows: Lines) -> tuple[Lines, list[str]]:
         return rows, []
     plural = "s" if at > 1 else ""
     return rows[at:], [f"{at} line{plural} above the header, which is row {rows[at][0]}, left out"]
+
+
+def _without_preamble(written: Lines) -> tuple[Lines, list[str]]:
+    """The rows below the last line that ends a preamble of LabVIEW, whose column X_Value is a time in s; and a note."""
+    ends = [k for k, (_, line) in enumerate(written[:MAX_TITLE_LINES], 1) if line.startswith(LABVIEW)]
+    if not ends or ends[-1] == len(written):
+        return written, []
+    (row, header), *rows = written[ends[-1] :]
+    if header.split("\t")[0] == "X_Value":
+        header = header.replace("X_Value", "X_Value [s]", 1)
+    return [(row, header), *rows], [f"{ends[-1]} lines above the header, which is row {row}, left out"]
 
 
 def _has_time(line: str, separator: str) -> bool:
@@ -181,16 +195,17 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5` make
     q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
 
-    **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` or the only column in a unit of time is the time.
-    So is the stamp of a message of ROS (`header.stamp`). Times may be dates in ISO 8601, which become seconds since the
-    first row. Stamps without a unit of about 1e12, 1e15 and 1e18 are ms, us and ns since 1970; above 2^53, stamps count
-    from the first row. A number in brackets belongs to the name: `position[0]`. `trajectory`, `trial`, `run`,
-    `experiment`, `Versuch`, `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a
-    warning, a column that changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or
-    text. A clock that falls back within such a group, or without one, begins a recording, with a warning. Text, and
-    numbers without a unit and a usual name, that are the same in every row are left aside beside other coordinates.
-    `s` is the action, `p`/`p_*` are momenta. Of other columns the unit decides before the name
-    (`herglotz.data.column_roles`): rad, deg, m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs; m/s, rad/s, rpm
+    **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` `millis`, `micros`, which say their unit, or the only
+    column in a unit of time is the time; of several such columns, the one that increases. So is the stamp of a message
+    of ROS (`header.stamp`). Times may be dates in ISO 8601, which become seconds since the first row. Stamps without a
+    unit of about 1e12, 1e15 and 1e18 are ms, us and ns since 1970; above 2^53, stamps count from the first row. A
+    number in brackets belongs to the name: `position[0]`. `trajectory`, `trial`, `run`, `experiment`, `Versuch`,
+    `Essai` or such a name (`run_nr`, `trial id`) without a unit groups the rows; else, with a warning, a column that
+    changes wherever time starts anew, and nowhere else, does: numbers of no length or angle, or text. A clock that
+    falls back within such a group, or without one, begins a recording, with a warning. Text, and numbers without a unit
+    and a usual name, that are the same in every row are left aside beside other coordinates. `s` is the action,
+    `p`/`p_*` are momenta. Of other columns the unit decides before the name (`herglotz.data.column_roles`): rad, deg,
+    m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs, and so is a pulse width (`pwm [us]`); m/s, rad/s, rpm
     rates; rates are left aside, and so are °C, Pa, W, and, unless no other column is a coordinate, Wb, T, H and F. A
     set value of a motion is an input in any unit: goal, target, set point, desired, reference, command, soll; so is
     what shakes a mechanism: road, ground, excitation, Erregung. Without a unit `u`, `u1`, `u_*`, `F`, force, torque,
@@ -199,7 +214,8 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     left aside; every other column is a coordinate. A coordinate in rad is taken for an angle. A warning names every
     role that is a guess.
 
-    **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`). A row
+    **Missing values.** A coordinate that is empty or NaN has no weight in a fit (`Trajectories.observed`), and neither
+    has a number that stands for a missing reading, such as -999 among millimetres (`herglotz.data.marks`). A row
     without any coordinate, or without s or a momentum, is left out; the step over that row has the mean of the inputs.
     An empty input is held from the row before, or interpolated linearly if the hold is "first" or "smooth". Rows of
     stacked tables are sorted by time, and rows of equal time joined.

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import Unusable, check_alike
+from herglotz.data.column_roles import is_usual
 from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.extra_formats import read_packed
@@ -74,10 +75,17 @@ def refuse_jumps(data: Trajectories, wanted: Wanted) -> None:
     if not found:
         return
     inputs = ",".join([*(name for name, _ in data.input_labels), *found])
+    # Beside a column with a usual name, one without a unit may be a coordinate or not: the user says which are.
+    usual = [name for name, unit in zip(data.names, data.units, strict=True) if is_usual(name, unit)]
+    others = [name for name in data.names if name not in (*usual, *found)]
+    places = [name for name in usual if name not in found]
+    some = f", with those of {', '.join(others)} that are positions" if places and others else ""
+    beside = f" and --coordinates {','.join(places)}{some}" if some else ""
+    all_the_same = [name for name in data.names if name not in others] if some else data.names
     what = f"{', '.join(found)} {'moves' if len(found) == 1 else 'move'} in jumps alone ({_levels(data, found[0])})"
     raise InputError(
-        f"{data.source or 'data'}: {what}; an input? --inputs {inputs} (inputs= in Python); a coordinate all the same: "
-        f"--coordinates {','.join(data.names)}"
+        f"{data.source or 'data'}: {what}; an input? --inputs {inputs} (inputs= in Python){beside}; a coordinate all "
+        f"the same: --coordinates {','.join(all_the_same)}{some}"
     )
 
 
@@ -105,7 +113,7 @@ class Format:
 FORMATS = (
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
     Format("Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, begins="%"),
-    *(Format(f"t[s],q[rad],... ({end})", end, read_csv, True) for end in (".csv", ".txt", ".tsv", ".dat")),
+    *(Format(f"t[s],q[rad],... ({end})", end, read_csv, True) for end in (".csv", ".txt", ".tsv", ".dat", ".lvm")),
     Format("columns as in csv (.parquet)", ".parquet", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_packed, True),
@@ -136,8 +144,8 @@ def load(
     Parameters
     ----------
     path
-        .csv (or such a table in .txt, .tsv, .dat), .npz, or with the extra `tables` .parquet, .h5 or .mat; or a folder
-        of such files: each holds a recording, in the order of their names.
+        .csv (or such a table in .txt, .tsv, .dat, .lvm), .npz, or with the extra `tables` .parquet, .h5 or .mat; or a
+        folder of such files: each holds a recording, in the order of their names.
     angles
         Coordinates that are angles; True for all; left out: those in rad or deg; () for none.
     degrees

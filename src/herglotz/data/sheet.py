@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from herglotz.data.checks import EXACT, MISSING, number, numbers_runs, quote
+from herglotz.data.checks import EXACT, MIN_SAMPLES, MISSING, number, numbers_runs, quote
 from herglotz.data.column_roles import is_usual, kind_of, name_and_unit
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, as_names, assign, is_number, same_everywhere
 from herglotz.data.rates import Recording, in_order
@@ -70,6 +70,17 @@ class Sheet:
     def is_constant(self, i: int) -> bool:
         """Whether a column has the same cell in every row."""
         return len(set(self.cells(i))) == 1
+
+    def increases(self, i: int) -> bool:
+        """Whether a column may be the time by its numbers, which rise twice at least for each fall to a new recording.
+
+        Texts may be dates.
+        """
+        with suppress(TypeError, ValueError):
+            steps = np.diff(self.column(i).astype(np.float64))
+            rises, falls = int((steps > 0).sum()), int((steps < 0).sum())
+            return rises > 0 and rises >= (MIN_SAMPLES - 1) * falls
+        return True
 
     def numbers(self, columns: Columns) -> np.ndarray:
         """The numeric columns of all rows, (N, columns.numeric), NaN for a missing value; dates become seconds.
@@ -130,7 +141,7 @@ def from_sheet(sheet: Sheet, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
 
 def _grouped(sheet: Sheet, wanted: Wanted) -> tuple[Columns, np.ndarray, list[str]]:
     """The columns with the one that groups the rows, without those that say nothing; their numbers; and notes."""
-    columns = assign(sheet.heads, sheet.where, wanted, sheet.is_constant)
+    columns = assign(sheet.heads, sheet.where, wanted, sheet.is_constant, sheet.increases)
     wanted = wanted.by_name(sheet.heads, columns.names)
     texts = [i for i in columns.numeric if i != columns.time and sheet.is_text(i)]
     bare = columns.without(texts)
@@ -149,7 +160,8 @@ def _grouped(sheet: Sheet, wanted: Wanted) -> tuple[Columns, np.ndarray, list[st
         ]
     names = [columns.names[i] for i in aside]
     groups = wanted.group if group is None else columns.names[group]
-    chosen = replace(wanted, drop=(*as_names(wanted.drop), *names), group=groups)
+    drop = (*as_names(wanted.drop), *names)
+    chosen = replace(wanted, time=columns.names[columns.time], drop=drop, group=groups)
     columns = assign(sheet.heads, sheet.where, chosen)
     values = values[:, [bare.numeric.index(i) for i in columns.numeric]]
     return columns, values, [*notes, *([same_everywhere(names)] if names else [])]

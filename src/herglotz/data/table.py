@@ -14,6 +14,7 @@ import torch
 from herglotz.data.checks import MIN_SAMPLES, Unusable, begins_anew, numbering, out_of_order, quote
 from herglotz.data.csv_columns import Columns
 from herglotz.data.gaps import with_missing
+from herglotz.data.marks import without_marks
 from herglotz.data.rates import Recording, completed, in_order, without_repeats
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import refuse
@@ -33,13 +34,18 @@ def from_table(
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
-    A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). Rows without any coordinate are
-    left out, and a note gives their number: the step over these rows is longer, with the mean of the inputs
-    (`herglotz.data.rates`). A clock that falls back begins another trajectory, with a warning. A trajectory that is too
-    short, or whose time does not increase, is left out with a warning. Raise InputError, which begins with `path`, if
-    most trajectories are unusable.
+    A row in which some coordinates are missing keeps the others (`herglotz.data.gaps`). Rows without any coordinate
+    are left out, and a note gives their number: the step over these rows is longer, with the mean of the inputs
+    (`herglotz.data.rates`). Marks of missing readings are missing, with a warning (`herglotz.data.marks`). A clock
+    that falls back begins another trajectory, with a warning. A trajectory that is too short, or whose time does not
+    increase, is left out with a warning. Raise InputError, which begins with `path`, if most trajectories are
+    unusable.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
+    marked = [
+        (k, columns.names[i], i in columns.u) for k, i in enumerate(columns.numeric) if i in (*columns.q, *columns.u)
+    ]
+    values, marks = without_marks(values, labels, at, marked)
     columns, values = _without_blank(columns, values)
     recordings = _recordings(path, labels, np.asarray(at), values)
     recordings, repairs = _with_clocks(recordings, bool(np.isnan(values).any()), columns)
@@ -47,7 +53,7 @@ def from_table(
     recordings, filled, hold = completed(recordings, columns, columns.hold)
     recordings, too_few = usable(path, recordings, lambda one: _with_enough(path, columns, one))
     found = _trajectories(path, columns, recordings, hold)
-    found = replace(found, notes=(*columns.notes, *repairs, *unordered, *filled, *too_few))
+    found = replace(found, notes=(*columns.notes, *marks, *repairs, *unordered, *filled, *too_few))
     return _with_missing(found, columns, recordings)
 
 

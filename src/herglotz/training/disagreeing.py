@@ -32,6 +32,7 @@ from herglotz.training.errors_of_runs import EXACT_ENOUGH
 from herglotz.training.left_out import NORMAL_REACH, LeftOut, beside, reach, scale_of_all, since
 from herglotz.training.look import Look, look, read_like
 from herglotz.training.problems.robust import FREEDOM, robust_fit, scale_of
+from herglotz.training.properties import own_properties
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.structure import MOST, search_between_coupled
@@ -56,6 +57,8 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         if not outlier and not out:
             bad = next((b for b in dict.fromkeys((worst, _least_alike(seen))) if _bends(seen, b)), None)
             worst, outlier = (worst, False) if bad is None else (bad, True)
+        # The law may depend on what this recording alone has.
+        outlier = outlier and not own_properties(data, worst)
         if outlier:
             now = sorted([*out, worst])
         else:
@@ -93,6 +96,7 @@ def outlying(seen: Look, model: ContactLagrangian, sigma: float) -> tuple[LeftOu
         return ()
     found.problem.parameters.set(found.theta)
     now = _worst(seen, _missed_by(seen, own, noise, followed), followed)
+    now = now._replace(properties=own_properties(seen.data, now.recording))
     return (now,) if now.stands_out and now.recording == worst.recording else ()
 
 

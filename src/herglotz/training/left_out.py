@@ -11,6 +11,7 @@ from torch import Tensor
 
 from herglotz.data.noise import TAIL
 from herglotz.training.problems.robust import FEW, scale_of
+from herglotz.training.properties import by_property, inverse
 
 # `reach` of normal residuals over their standard deviation.
 NORMAL_REACH = 1.645
@@ -21,7 +22,8 @@ class LeftOut(NamedTuple):
 
     In units of q, over the balance of several kinds of coordinates; `missed` is infinite where a step of the model
     fails. `label` is the recording's (`Trajectories.label`). `since` is the time from which on most samples are
-    outliers, None if that is the start.
+    outliers, None if that is the start. `properties` are inputs that are the same throughout each recording, with a
+    value that no other recording has (`herglotz.training.properties`).
     """
 
     recording: int
@@ -29,14 +31,17 @@ class LeftOut(NamedTuple):
     others: float
     label: str
     since: float | None = None
+    properties: tuple[str, ...] = ()
 
     @property
     def reason(self) -> str:
         """The reason of a misfit, with a remedy."""
         times = f"missed {self.missed / self.others:.2g} times as far as the others"
         far = f"is {times if math.isfinite(self.missed) else 'not followed'}{from_then_on(self.since)}"
-        what = f"{self.label[:1].upper()}{self.label[1:]}, counted from 0, {far}, and may be of something else"
-        return f"{what}. Try the fit without it"
+        what = f"{self.label[:1].upper()}{self.label[1:]}, counted from 0, {far}, and"
+        if self.properties:
+            return f"{what} {by_property(self.properties)}. Try {inverse(self.properties)}"
+        return f"{what} may be of something else. Try the fit without it"
 
     @property
     def stands_out(self) -> bool:

@@ -36,7 +36,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.column_roles import is_of_others, role_of
+from herglotz.data.column_roles import is_of_others, is_rate_of_others, role_of
 from herglotz.data.gaps import MEANS
 from herglotz.data.noise import SAMPLES, precisions
 from herglotz.data.polar import CIRCLE, LENGTH, circles, hint
@@ -44,6 +44,7 @@ from herglotz.data.rates import filled_inputs
 from herglotz.data.smoothing import slopes
 from herglotz.data.units import COUNTS, size
 from herglotz.training.following import HALF
+from herglotz.training.properties import inverse, properties
 
 # Most samples: the distances between all of them take 32 MB.
 MOST = 2000
@@ -152,22 +153,44 @@ def reason_of(
         )
     return (
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
-        f"what was not recorded. Try {' or '.join(_ways_to_the_past(data, level))}"
+        f"what was not recorded. Try {', or '.join(_ways_to_the_past(data, level))}"
     )
 
 
 def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
     """What to try where the present state and the inputs do not give the force: only what a fit would take."""
-    ways = [] if data.u is not None or level == "full" else ["--level full, whose action remembers,"]
-    # A name that is none of a rate: the unit alone has left such a column aside.
-    others = [
-        name for name, role, unit in data.columns
+    ways = [] if data.u is not None or level == "full" else ["--level full, whose action remembers"]
+    return [*ways, *(ways_of_columns(data) or ["a record of what else acts (--inputs)"])]
+
+
+def ways_of_columns(data: Trajectories) -> list[str]:
+    """What to try with columns that were left aside by their unit or as rates, and with properties of recordings."""
+    others, rates = _left_aside(data)
+    ways = _as_inputs_unless(data, others, rates)
+    if others and len(data) > 1:
+        numbers = "is a number" if len(others) == 1 else "are numbers"
+        ways.append(f"where {', '.join(others)} {numbers} of each recording, {inverse(others)}")
+    return [*ways, inverse(own)] if (own := list(properties(data))) else ways
+
+
+def _left_aside(data: Trajectories) -> tuple[list[str], list[str]]:
+    """The columns that their unit alone has left aside, and those left aside as rates whose names say other rates."""
+    aside = {
+        name: role_of(name, "").role for name, role, unit in data.columns
         if role == "left aside" and role_of(name, unit).role in ("rate", "dropped")
-        and role_of(name, "").role in ("q", "input")
-    ]  # fmt: skip
-    if others:
-        return [*ways, f"{_as_inputs(data, others)}, which takes {', '.join(others)}, left aside so far"]
-    return [*ways, "a record of what else acts (--inputs)"]
+    }  # fmt: skip
+    others = [name for name, role in aside.items() if role in ("q", "input")]
+    rates = [name for name, role in aside.items() if role == "rate" and is_rate_of_others(name, data.names)]
+    return others, rates
+
+
+def _as_inputs_unless(data: Trajectories, others: list[str], rates: list[str]) -> list[str]:
+    """The flag that takes columns left aside for inputs, unless some are rates of the motion; [] for no columns."""
+    if not (names := [*others, *rates]):
+        return []
+    unless = f", unless {', '.join(rates)} {'is a rate' if len(rates) == 1 else 'are rates'} of the motion"
+    takes = f"{_as_inputs(data, names)}, which takes {', '.join(names)}, left aside so far"
+    return [f"{takes}{unless if rates else ''}"]
 
 
 def _as_inputs(data: Trajectories, others: list[str]) -> str:
@@ -204,10 +227,9 @@ def _kicks(data: Trajectories, miss: Tensor, owner: Tensor) -> str:
         if (row := _kick(data, signal, run)) is not None:
             unit = "" if data.time_unit == "1" else data.time_unit
             when = f"t = {size(float(data.t[row]), unit)} of {data.label(int(data.trajectory[row]))}"
-            return (
-                f"{what}, the hardest at {when}, as by blows and end stops. Try what strikes as an input (--inputs), "
-                "or recordings that are cut there"
-            )
+            strikes = "".join(_as_inputs_unless(data, *_left_aside(data))) or "what strikes as an input (--inputs)"
+            where = f"{what}, the hardest at {when}, as by blows and end stops"
+            return f"{where}. Try {strikes}, or recordings that are cut there"
     return ""
 
 

@@ -12,6 +12,7 @@ from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.equation import Equation
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.left_out import from_then_on
+from herglotz.training.properties import by_property, inverse
 from herglotz.training.recorded_range import range_in_words
 
 MAX_FEATURES, COLUMNS = 5, 80
@@ -45,10 +46,16 @@ def outlying_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:
     """The recording that stands out where none was left out, with what to do."""
     unit = common_unit(data.units)
     return [
-        f"{_label(one)}, counted from 0, may be of something else: the model {_missed(one, unit)}, "
-        f"and the others by {size(one['others'], unit, digits=2)}; fit once more without it"
+        f"{_label(one)}, counted from 0, {_why(one)}: the model {_missed(one, unit)}, "
+        f"and the others by {size(one['others'], unit, digits=2)}; "
+        + (f"try {inverse(own)}" if (own := one.get("properties")) else "fit once more without it")
         for one in metrics.get("outlying", ())
     ]
+
+
+def _why(one: Mapping[str, Any]) -> str:
+    """Why a recording may stand out."""
+    return by_property(one["properties"]) if one.get("properties") else "may be of something else"
 
 
 def left_out_of(metrics: Mapping[str, Any], data: Trajectories) -> list[str]:

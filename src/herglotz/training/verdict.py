@@ -46,10 +46,11 @@ from herglotz.training.following import HALF
 from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.left_out import LeftOut, beside
 from herglotz.training.look import Look
-from herglotz.training.missed import MOST, OF_TIME, reason_of, reason_of_data
+from herglotz.training.missed import MOST, OF_TIME, reason_of, reason_of_data, ways_of_columns
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
 from herglotz.training.problems.robust import FEW, FREEDOM, far_out, scale_of
+from herglotz.training.properties import own_properties
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
@@ -174,7 +175,7 @@ def judged(
     words = ". ".join(filter(None, (misread(kept, seen, errors.missed), *reasons)))
     caveat = caveat_of_inputs(model, train, states)
     beyond = partial(unseen_outlier, seen, everywhere)
-    told = metrics | {"driven": train.u is not None}
+    told = metrics | {"driven": train.u is not None, "columns": ways_of_columns(train)}
     return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond)} | kept_numbers
 
 
@@ -210,7 +211,8 @@ def unseen_outlier(seen: Look, everywhere: Tensor) -> str:
         return ""
     (one,) = out
     since = float(t[one.recording][0]) if one.since is None else one.since
-    return one._replace(recording=recordings[one.recording], since=since).reason
+    recording = recordings[one.recording]
+    return one._replace(recording=recording, since=since, properties=own_properties(data, recording)).reason
 
 
 def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
@@ -333,7 +335,7 @@ def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], be
     ways = [] if metrics["objective"] == "smoothing" else ["--objective smoothing"]
     # Inputs leave one level.
     ways += [] if metrics.get("driven") else ["another --level (herglotz select)"]
-    return f"A force is missing. Try {', or '.join([*ways, 'a --feature for it'])}"
+    return f"A force is missing. Try {', or '.join([*ways, *metrics.get('columns', ()), 'a --feature for it'])}"
 
 
 def _rms(x: Tensor) -> float:

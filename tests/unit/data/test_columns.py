@@ -32,10 +32,18 @@ def rows(*columns):
     return "\n".join(",".join(map(str, row)) for row in zip(*columns, strict=True)) + "\n"
 
 
-@pytest.mark.parametrize(("head", "kind"), [("speed", "rate"), ("voltage", "input")])
-def test_rates_or_inputs_alone_are_refused_with_a_remedy(tmp_path, head, kind):
-    # fails if the message asks for a coordinate and does not say what became of the column that the user has
-    with pytest.raises(InputError, match=rf"{head} look like {kind}s: choose with --coordinates NAMES"):
+@pytest.mark.parametrize(
+    ("head", "looks"),
+    [
+        ("speed", "speed looks like a rate: integrate a rate over time into a column of its own, or, if one of "
+                  "these is a position, choose with --coordinates NAMES"),
+        ("voltage", "voltage looks like an input: choose with --coordinates NAMES"),
+    ],
+)  # fmt: skip
+def test_rates_or_inputs_alone_are_refused_with_a_remedy(tmp_path, head, looks):
+    # fails if the message asks for a coordinate and does not say what became of the column that the user has, or
+    # offers a speed as a position alone
+    with pytest.raises(InputError, match=looks):
         read(tmp_path, f"t,{head}\n0,1\n1,2\n2,4\n")
     assert read(tmp_path, f"t,{head}\n0,1\n1,2\n2,4\n", coordinates=head).names == (head,)
 
@@ -64,7 +72,7 @@ def test_headers_of_loggers(tmp_path):
     assert (data.names, data.units, data.time_unit, data.degrees) == (("Angle",), ("rad",), "s", ("Angle",))
     assert [role for _, role, _ in data.columns] == ["left aside", "time", "coordinate", "trajectory"]
     assert read(tmp_path, "t,x(1),x(2)\n0,1,1\n1,2,1\n2,2,4\n").names == ("x(1)", "x(2)")
-    with pytest.raises(InputError, match="column 2: '' is not a header cell"):
+    with pytest.raises(InputError, match=r"column 2: '' is not a header cell; .*, and delete lines above the header"):
         read(tmp_path, "t,\n0,1\n1,2\n2,2\n")
 
 

@@ -85,7 +85,7 @@ def test_blank_trajectory_column_is_one_trajectory(tmp_path):  # fails if a blan
         ("t;q\n0;1,5\n1;2.5\n", r"data.csv, row 3: '2.5' beside '1,5' in row 2; write all decimals with one sign"),
         ("a,q\n0,1\n", r"data.csv, row 1: no time column; the columns are a, q: choose one with --time NAME"),
         ("t,time,q\n0,1,2\n", r"data.csv, row 1: two time columns, t and time; choose one with --time NAME"),
-        ("t,v\n0,1\n", "data.csv, row 1: no coordinate column, only t, v; v look like rates"),
+        ("t,v\n0,1\n", "data.csv, row 1: no coordinate column, only t, v; v looks like a rate"),
         ("t,q,q\n0,1,2\n", r"data.csv, row 1: the column 'q' comes twice; rename or delete one"),
         ("t,q[rad\n0,1\n", r"data.csv, row 1, column 2: 'q\[rad' is not a header cell; write name or name\[unit\]"),
         ("t,,q\n0,1,2\n", r"data.csv, row 1, column 2: '' is not a header cell"),

@@ -39,6 +39,23 @@ def test_levels_that_are_leapt_to_are_asked_for(tmp_path, capsys):
     assert load(path, like=load(path, coordinates=["a", "b"])).names == ("a", "b")
 
 
+def test_the_remedy_names_the_coordinates_too(tmp_path):
+    # fails if the input that jumps is taken away, and what has neither a unit nor a usual name becomes a coordinate
+    columns = {
+        "delta[deg]": np.sin(T),
+        "Pm_pu": held([0.3, 0.7, 0.4, 1.1], 20),
+        "Pe_pu": np.cos(T),
+        "Vt_pu": np.cos(2 * T),
+    }
+    some = ", with those of Pe_pu, Vt_pu that are positions"
+    said = r"--inputs Pm_pu \(inputs= in Python\) and --coordinates delta"
+    same = f"{some}; a coordinate all the same: --coordinates delta,Pm_pu{some}$"
+    path = written(tmp_path, **columns)
+    with pytest.raises(InputError, match=said + same):
+        load(path)
+    assert load(path, inputs="Pm_pu", coordinates="delta").names == ("delta",)
+
+
 def test_degrees_are_named_as_they_stand(tmp_path):  # fails if levels of a table in degrees are shown in radians
     with pytest.raises(InputError, match=r"a moves in jumps alone \(0, 90, -45, 30\)"):
         load(written(tmp_path, **{"a[deg]": held([0, 90, -45, 30], 20), "b[deg]": 9 * np.sin(T)}))

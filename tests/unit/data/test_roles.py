@@ -55,6 +55,12 @@ ROLES = {
     "acc": "left aside", "gyro[rad/s]": "left aside", "a[m/s^2]": "left aside", "b (mm/s²)": "left aside",
     "index": "left aside", "frame": "left aside", "Unnamed: 0": "left aside", "theta2ddot": "left aside",
     "omega_1": "left aside",
+    # The width of a pulse commands a servo, a latency does not; us is a unit of time or ultrasound.
+    "pwm [us]": "input", "servo_duty[ms]": "input", "pulse width[us]": "input", "latency[ms]": "left aside",
+    "pwm_time[us]": "left aside", "us_distance": "coordinate", "us[mm]": "coordinate", "us_left[cm]": "coordinate",
+    # An input by its last word, and parts of machines; gravities of accelerometers, and a name.
+    "tendon_input[mm]": "input", "valve control 2[deg]": "input", "input_shaft[rad]": "coordinate",
+    "ax_g": "left aside", "acc_x_g": "left aside", "accel_g": "left aside", "q_g": "coordinate", "drum_g": "coordinate",
     # Names that only begin like a force.
     "f": "coordinate", "N": "coordinate", "taut": "coordinate", "motion": "coordinate", "uplift": "coordinate",
     "forceful": "coordinate", "up": "coordinate", "unit[Nms]": "coordinate", "cmds": "coordinate",
@@ -140,7 +146,8 @@ def test_a_goal_beside_what_acts_is_said(tmp_path, capsys, header, said):
 GUESSES = {
     "road[mm]": "is taken for an input, but by its name alone; else give --coordinates x,road or --drop road",
     "exciter[mm]": "is taken for an input, but by its name alone",
-    "pivot_acceleration[m/s^2]": "is taken for an input, but by its name alone",
+    "pivot_acceleration[m/s^2]": "is taken for an input, but by its name alone; else give --drop pivot_acceleration",
+    "tendon_input[mm]": "is taken for an input, but it has the unit of a position; else give --coordinates x,",
     "support[m]": "is taken for an input, but by its name alone",
     "pivot_y[m]": "is taken for a coordinate, but it may be moved from outside; else give --inputs pivot_y or",
     "u_x[m]": "is taken for an input, but it has the unit of a position",
@@ -170,6 +177,17 @@ def test_what_is_a_guess_is_said_in_a_warning(tmp_path, capsys, cell):
     told = {"inputs": name} if "--inputs" in GUESSES[cell] else {"coordinates": ["x", name]}
     read(tmp_path, table(f"t[s],x[m],{cell}"), **told)
     assert "warning" not in capsys.readouterr().err  # it is known by then, or the user has said it
+
+
+def test_no_acceleration_is_offered_as_a_coordinate():
+    # fails if the remedy for a floor in mm makes a position of an accelerometer beside it
+    (said,) = assign(["t[s]", "damper[mm]", "floor[mm]", "base_acc[m/s2]"], "header").notes
+    assert said == (
+        "warning: floor, base_acc are taken for inputs, but by their names alone; else give --coordinates damper,floor "
+        "or --drop floor,base_acc"
+    )
+    (said,) = assign(["t[s]", "pitch[deg]", "ax_g"], "header").notes
+    assert said.endswith("it may be an input; if so, give --inputs ax")
 
 
 def test_raw_values_are_fitted_and_their_filtered_copy_is_not():
@@ -211,6 +229,31 @@ def test_times_in_other_words(tmp_path, name):  # fails if a time is a coordinat
     data = read(tmp_path, table(f"x[m],{name},u_t[N]"))
     assert data.columns[1][1] == "time"
     assert data.t.tolist() == pytest.approx([(k / 8) ** (4 / 3) for k in range(8)], rel=1e-4, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "count"),
+    [("millis", "ms", 1e3), ("micros", "us", 1e6), ("ms", "ms", 1e3), ("elapsed_millis", "ms", 1e3), ("t", "", 1)],
+)
+def test_a_time_whose_name_says_its_unit(tmp_path, capsys, name, unit, count):
+    # fails if Arduino's millis() is no time, or is taken for seconds, by itself and where the user names it
+    text = f"{name},x[mm]\n" + "".join(f"{20 * k},{k**1.5:.4g}\n" for k in range(8))
+    for options in ({}, {"time": name}):
+        data = read(tmp_path, text, **options)
+        assert data.time_unit == "s"
+        assert data.t[-1].item() == pytest.approx(140 / count)
+    said = f"{unit}, converted to s" if unit else "- (taken for s)"
+    assert capsys.readouterr().err.count(said) == 2
+
+
+def test_of_several_times_those_are_meant_that_increase(tmp_path):
+    # fails if a column in a unit of time is asked for though its values go up and down, or a constant one is a time
+    rows = "".join(f"{k % 25},{1200 + 300 * (k % 2)},50,{k % 7}\n" for k in range(50))
+    data = read(tmp_path, "tick[ms],opening[us],period[ms],x[mm]\n" + rows)
+    assert [role for _, role, _ in data.columns] == ["time", "left aside", "left aside", "coordinate"]
+    assert data.lengths == (25, 25)
+    rows = "".join(f"{k},{1200 + 300 * (k % 2)},{k % 7},1\n" for k in range(50))
+    assert read(tmp_path, "tick[ms],opening[us],x[mm],note\n" + rows).names == ("x",)
 
 
 def test_two_times_are_asked_for(tmp_path):  # fails if one of two is chosen unsaid

@@ -43,6 +43,26 @@ def test_units_in_a_row_of_their_own(tmp_path, header, units, rate):
     assert "  units stand in row 2" in data.table().splitlines()
 
 
+LABVIEW = (
+    "LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\nTime\t10:22:31.22\n***End_of_Header***\t\n\t\n"
+    "Samples\t6\t6\nX_Dimension\tTime\tTime\n***End_of_Header***\t\t\nX_Value\tPath (mm)\tForce (N)\n"
+)
+
+
+def test_a_preamble_of_labview(tmp_path):
+    # fails if a measurement file of LabVIEW is refused for its preamble, or its X_Value is no time
+    path = tmp_path / "a.lvm"
+    path.write_text(LABVIEW + rows("\t", 2.5))
+    data = load(path)
+    assert [role for _, role, _ in data.columns] == ["time", "coordinate", "input"]
+    assert (data.time_unit, data.t.tolist(), data.q[:, 0].tolist()) == ("s", T.tolist(), X.tolist())
+    assert any(note == "8 lines above the header, which is row 10, left out" for note in data.notes)
+    # Where nothing follows the preamble, the message is of the file.
+    path.write_text(LABVIEW.partition("X_Value")[0])
+    with pytest.raises(InputError, match=r"a\.lvm, row 1"):
+        load(path)
+
+
 def test_columns_without_a_value_are_left_aside(tmp_path, capsys):
     # fails if an empty column of remarks refuses the table, as of all rows none is complete, or is left out in silence
     data = load(written(tmp_path, f"t[s];x[cm];remarks;by\n{rows(';', '', '')}"))
@@ -67,7 +87,7 @@ def test_units_below_are_converted(tmp_path):  # fails if ms and degrees of such
         ("t[s],x[m]\ns,mm\n", r"row 1: two units of one column, 'x\[m\]' and below it 'mm'"),
         ("t,x\ns,5\n", "row 2, column 't': 's' is not a number"),
         ("t,x\nfoo,bar\n", "row 2, column 't': 'foo' is not a number"),
-        ("t,x\nm,s\n", "row 1: no coordinate column, only t, x; x look like no positions"),
+        ("t,x\nm,s\n", "row 1: no coordinate column, only t, x; x looks like no position"),
         ("t,x\n,m\n", "row 2, column 't': a blank cell is not a number"),
     ],
 )

@@ -16,7 +16,7 @@ from herglotz.data.units import with_angles_in_degrees
 from herglotz.training import FitConfig, fit, verdict
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.errors_of_runs import Errors
-from herglotz.training.missed import FEW, reason_of, reason_of_data
+from herglotz.training.missed import FEW, reason_of, reason_of_data, ways_of_columns
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 from herglotz.training.verdict import in_words
@@ -108,6 +108,17 @@ def test_what_was_tried_and_what_inputs_leave_no_choice_of_is_no_remedy(driven, 
     metrics = {"follows_data": True, "objective": objective, "driven": driven}
     text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, metrics)
     assert text.endswith(f"A force is missing. Try {ways}"), text
+
+
+def test_columns_left_aside_are_named_where_something_is_missing():
+    # fails if blows, or a missing force, are said beside a column that was left aside in silence
+    columns = (("x", "coordinate", "mm"), ("valve", "left aside", "W"))
+    data = Trajectories.of(T, noisy()[:, None], names=("x",), units=("mm",), columns=columns)
+    takes = "--inputs valve, which takes valve, left aside so far, or"
+    assert f"end stops. Try {takes} recordings that are cut there" in (reason_of(data, left(kicks()), OWNER) or "")
+    metrics = {"follows_data": True, "objective": "smoothing", "driven": True, "columns": ways_of_columns(data)}
+    text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, metrics)
+    assert text.endswith(f"A force is missing. Try {takes} a --feature for it")
 
 
 def test_neighbours_are_of_other_times():
