@@ -265,8 +265,10 @@ class Search:
             return found
         fitter = self.fitter(found.fitter.variant.crossing(self.data.typical_step / found.fitter.data.typical_step))
         if found.fitter.data.lengths == self.data.lengths:
-            return fitter.fit(found.taken, found.values, found.length, found, 2 * ITERATIONS)
-        if (whole := fitter.fit(found.taken, found.values, fitter.lengths[-1], None, 2 * ITERATIONS)) and whole.near:
+            same = fitter.fit(found.taken, found.values, found.length, found, 2 * ITERATIONS)
+            if same is not None and same.rms <= found.followed:
+                return same
+        elif (whole := fitter.fit(found.taken, found.values, fitter.lengths[-1], None, 2 * ITERATIONS)) and whole.near:
             return self.finer(whole)
         first = next((length for length in fitter.lengths if length >= FIRST_SEGMENT), fitter.lengths[-1])
         other = fitter.fit(found.taken, found.values, first, None)
@@ -439,7 +441,7 @@ class Search:
         By the score of held-out blocks or, if `by_residuals`, of the fits themselves (`fitted_score`).
         """
         best, found = trial, ""
-        for hold in [] if trial.at_the_noise else [hold for hold in holds if hold != self.data.hold]:
+        for hold in [] if trial.lacks_nothing else [hold for hold in holds if hold != self.data.hold]:
             other = self.of(replace(self.data, hold=hold)).again(trial)
             if other is not None and (other.fits_better(best) if by_residuals else other.replaces(best)):
                 best, found = other, hold

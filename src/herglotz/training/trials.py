@@ -152,6 +152,12 @@ class Trial:
         return self.whole and self.rms <= FOLLOWED * self.fitter.spread
 
     @property
+    def followed(self) -> float:
+        """Largest misfit with which another fit of this model follows longer segments, or as long ones of other data."""
+        spread = self.fitter.spread
+        return min(max(LOST * self.rms, FOLLOWED * spread), MAX_MISFIT * spread)
+
+    @property
     def at_the_noise(self) -> bool:
         """True if the misfit of whole trajectories is about the noise of the data."""
         return self.whole and self.segments_at_the_noise
@@ -394,8 +400,7 @@ class Fitter:
             return None
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
-        followed = min(max(LOST * trial.rms, FOLLOWED * self.spread), MAX_MISFIT * self.spread)
-        return None if found is None or found.rms > followed else found
+        return None if found is None or found.rms > trial.followed else found
 
     def over(self, trial: Trial, length: int) -> Trial | None:
         """The model over shorter segments, of this length; None if no path is found."""
