@@ -153,7 +153,7 @@ class Trial:
 
     @property
     def followed(self) -> float:
-        """Largest misfit with which another fit of this model follows longer segments, or as long ones of other data."""
+        """Largest misfit with which the model follows longer segments, or equally long segments of other data."""
         spread = self.fitter.spread
         return min(max(LOST * self.rms, FOLLOWED * spread), MAX_MISFIT * spread)
 

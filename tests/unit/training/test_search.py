@@ -701,7 +701,7 @@ def test_a_hold_is_asked_for_until_residuals_are_white(white, hold, monkeypatch)
 
 @pytest.mark.parametrize("lost", [True, False])
 def test_a_model_that_other_inputs_lose_is_grown_anew(lost, monkeypatch):
-    # fails if a chaotic motion, which no fit of the whole finds again after the hold has changed, speaks for the old hold
+    # fails if a chaotic motion, which no fit of whole trajectories follows with another hold, speaks for the old hold
     data = simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3)
     search, whole, short, grown = searched(data), SimpleNamespace(rms=3.0 if lost else 1.0), object(), object()
     found = cast(Any, SimpleNamespace(
