@@ -73,6 +73,43 @@ def test_words(windows, unseen, free, ahead, expected):
 
 
 @pytest.mark.parametrize(
+    ("unseen", "told", "said", "unsaid"),
+    [
+        (0.011, {}, "a force too small to be seen in these, or from chaos", "unseen part differs"),
+        (0.011, {"driven": True}, "in these, from noise of the inputs, or from chaos", "--level"),
+        (0.011, {"angles": True}, "Try --angles none, where a spring", "unseen part differs"),
+        (0.03, {"level": "forced"}, "Try --level linear, or a larger train fraction: the unseen part differs", "chaos"),
+        (0.03, {"level": "linear"}, "Try a larger train fraction: the unseen part differs", "--level"),
+        (0.03, {"level": "forced", "driven": True}, "Try a larger train fraction: the unseen part", "--level"),
+    ],
+)
+def test_a_free_run_that_is_lost_alone_is_no_other_part(unseen, told, said, unsaid):
+    # fails if the unseen part is said to differ where short runs meet it to the noise, or a level is offered that
+    # refuses inputs or was taken
+    text = in_words(Errors(0.011, unseen, 1.2, noise=0.01, spread=1.0), KNOWN, GOOD | told)
+    assert text.startswith("does not fit beyond the recording")
+    assert said in text
+    assert unsaid not in text
+
+
+def test_what_a_start_and_a_model_do_to_a_free_run_adds_up():
+    # fails if a chaotic motion whose start explains nearly all of an error is refused: 3 × 0.03 of the start and 0.1
+    # that a model may have
+    ahead = replace(KNOWN, start=0.03)
+    told = [in_words(Errors(0.011, 0.011, free, noise=0.01, spread=1.0), ahead, GOOD) for free in (0.13, 0.14)]
+    assert [text.startswith("does not fit") for text in told] == [False, True]
+
+
+def test_angles_that_may_be_positions_on_a_line():
+    # fails if a spring is offered for an angle that turns over
+    t, angle = 0.1 * torch.arange(40, dtype=torch.float64), torch.linspace(-2.4, 2.4, 40, dtype=torch.float64)[:, None]
+    data = Trajectories.of(t, angle, angles=(True,))
+    assert verdict._never_turned(data)
+    assert not verdict._never_turned(replace(data, q=1.4 * angle))
+    assert not verdict._never_turned(replace(data, angles=(False,)))
+
+
+@pytest.mark.parametrize(
     ("noise", "error", "fits"),
     [
         (1e-6, 0.04, True),  # 40 000 × the noise, and less than a twentieth of the spread
