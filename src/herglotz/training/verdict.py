@@ -22,6 +22,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from typing import Any, cast
 
 import torch
@@ -226,9 +227,31 @@ def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
     by more than the noise, so is a recording that stands out, and what `reason_of_data` finds.
     """
     # A drift may make up for a constraint, which the readings keep.
-    if (words := bound(measured(kept, drifts=[-rate for rate in seen.drifts]))) or not missed:
+    as_read = measured(kept, drifts=[-rate for rate in seen.drifts])
+    if (words := in_proportion(as_read) or bound(as_read)) or not missed:
         return words
     return "".join(one.reason for one in seen.outlying) or reason_of_data(seen.train.liveliest(MOST))
+
+
+def in_proportion(data: Trajectories) -> str:
+    """A pair of positions that are in proportion within their precision, with a remedy; "" if there is none.
+
+    Each recording has a constant of its own: encoders begin at any count.
+    """
+    noise = precisions(data).to(data.q) * data.balance
+    x = torch.cat([(one.q - one.q.mean(0))[one.complete] for one in data])
+    moving = (noise <= HALF * x.square().mean(0).sqrt()).nonzero()[:, 0].tolist()
+    for i, j in combinations(moving, 2):
+        by = float((x[:, i] @ x[:, j]) / x[:, i].square().sum())
+        left = float((x[:, j] - by * x[:, i]).square().mean().sqrt())
+        if left <= AT_THE_NOISE * math.hypot(float(noise[j]), by * float(noise[i])):
+            one, other = data.names[i], data.names[j]
+            return (
+                f"{other} moves by {by:.4g} times what {one} does, to the precision of both, as where one shaft turns "
+                "another, and what holds them together was not recorded: they are one coordinate. Try --drop "
+                f"{shlex.quote(other)}, or motions in which they differ"
+            )
+    return ""
 
 
 def bound(data: Trajectories) -> str:

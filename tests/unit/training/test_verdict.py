@@ -201,6 +201,24 @@ def test_what_one_circle_does_not_tell(stretched, said):
     assert judged.startswith("does not fit: " if said else "fits to the noise: ")
 
 
+@pytest.mark.parametrize(("stretched", "size", "said"), [(0.0, 1.0, True), (0.01, 1.0, False), (0.0, 1e-3, False)])
+def test_two_readings_of_one_shaft(stretched, size, said):
+    # fails if a rigid gear is fitted as two bodies, a belt whose stretching is seen or a shaft at rest is called rigid,
+    # or the count at which an encoder begins in each recording hides the gear
+    t = torch.arange(200, dtype=torch.float64) / 30
+    both = []
+    for start in (0.0, 5.0):
+        motor = (3.5 * t + start).sin() + 0.4 * t
+        both.append(torch.stack([motor, start + size * motor / 3 + stretched * (9 * t).sin()], 1))
+    q = torch.cat(both) + 1e-3 * torch.randn(400, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = Trajectories.of(t.repeat(2), q, (200, 200), names=("motor", "gear shaft"))
+    text = verdict.in_proportion(data)
+    assert text.startswith("gear shaft moves by 0.333") is said
+    assert ("Try --drop 'gear shaft', or" in text) is said
+    seen: Any = SimpleNamespace(drifts=(), outlying=(), train=data)
+    assert ("they are one coordinate" in verdict.misread(data, seen, missed=False)) is said
+
+
 def test_all_pairs_on_circles_are_named():
     # fails if the verdict names the first body of a chain alone, or the second without its centre
     t = torch.arange(300, dtype=torch.float64) / 30
