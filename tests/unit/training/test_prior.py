@@ -8,11 +8,11 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.training.problems.prior import Prior
 
 
-def prior_of(n, level):
+def prior_of(n, level, rate=0.1):
     """Of a model of n lengths, and parameters away from its start."""
     one, zero = (1.0,) * n, (0.0,) * n
     config = ModelConfig(
-        angles=(False,) * n, level=level, stiffness=one, tilt=zero, scale=one, speed=one, rate=0.1, potential_width=4
+        angles=(False,) * n, level=level, stiffness=one, tilt=zero, scale=one, speed=one, rate=rate, potential_width=4
     )
     ends = torch.ones(n, dtype=torch.float64)
     prior = Prior(ContactLagrangian(config).double(), -ends, ends, departure=0.5)
@@ -37,3 +37,14 @@ def test_twenty_coordinates_fit_into_memory():
     cost, _, b = prior.normal_equations(theta)
     torch.testing.assert_close(cost, prior.cost(theta))
     torch.testing.assert_close(b, grad(prior.cost)(theta), rtol=1e-9, atol=1e-12 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize(("rate", "spread"), [(0.1, 1.0), (-10.0, 10.0)])
+def test_a_large_rate_is_as_free_as_it_is_large(rate, spread):
+    # fails if a rate of ten is held to within the rate of the motion, 1, at the value where a fit began: drag and
+    # weight of a body that falls in air made up for the rest, with the deviations of the prior
+    prior, _ = prior_of(1, "linear", rate)
+    (at,) = prior.parameters.index("damping.rate").tolist()
+    assert float(prior.spread[prior.index == at]) == pytest.approx(spread)
+    others = prior.spread[prior.index != at]
+    torch.testing.assert_close(others, prior_of(1, "linear")[0].spread[prior.index != at])

@@ -56,8 +56,9 @@ class Prior:
     * Every network weight is N(its start, `weight`²), a weak prior against drift of undetermined weights. (Centred at 0
       it would switch the network off: with a last layer that starts at 0, only the prior acts on the first layer.)
     * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
-      friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²),
-      its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their start, 0.5²).
+      friction (the first mass is 1) are N(their start, `rate_spread`²), and the first three at least N(start, start²):
+      the damping rate of a falling body is many times the rate of its fall. Dry friction is N(0, (`rate_spread`
+      speed)²), its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their start, 0.5²).
     * A `herglotz.models.Term` has its own spread, and the waves of functions have `spreads`, around 0.
     """
 
@@ -141,7 +142,9 @@ class Prior:
             *((torch.tensor([i]), spread) for i, spread in self.waves.items()),
         ]
         index = torch.cat([index for index, _ in spreads]).to(self.start.device)
-        return index, torch.cat([self.start.new_full((len(index),), spread) for index, spread in spreads])
+        spread = torch.cat([self.start.new_full((len(index),), spread) for index, spread in spreads])
+        rates = torch.isin(index, self._index("damping.rate", "damping.drag", "action.rate").to(index.device))
+        return index, spread.maximum(torch.where(rates, self.start[index].abs(), 0.0))
 
     def _index(self, *prefixes: str) -> Tensor:
         return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
