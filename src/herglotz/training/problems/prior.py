@@ -167,7 +167,8 @@ class Prior:
 def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None, wide_rates: bool = True) -> Any:
     """The `Prior` of every objective; the deviation of rates is 0.3 of the rate |q̇|/|q| of the slowest coordinate.
 
-    With `wide_rates` that of a rate which starts larger is as large as the rate. None for the user's own L_d, whose parameters have no known meaning.
+    With `wide_rates` that of a rate which starts larger is as large as the rate. None for the user's own
+    L_d, whose parameters have no known meaning.
     """
     if not isinstance(model, ContactLagrangian):
         return None
