@@ -100,6 +100,10 @@ class Term:
         """The term as a part of its function, without a deviation: a single wave has no meaning of its own."""
         return replace(self, what=self.what.partition(")")[0] + ")", deviation=None).text(digits)
 
+    def is_seen(self, digits: int = UNKNOWN) -> bool:
+        """Whether a digit other than 0 is printed; the wave of a function that prints none says nothing."""
+        return not self.function or any(x in "123456789" for x in self.wave(digits).split()[1].partition("e")[0])
+
 
 @dataclass(frozen=True, repr=False)
 class Equation:
@@ -117,8 +121,9 @@ class Equation:
 
     def __str__(self) -> str:
         lines = [line for left in self.lefts for line in self._lines_of(left)]
-        for name in dict.fromkeys(term.function for term in self.terms if term.function):
-            waves = [term.wave(self._digits) for term in self.terms if term.function == name]
+        seen = [term for term in self.terms if term.is_seen(self._digits)]
+        for name in dict.fromkeys(term.function for term in seen if term.function):
+            waves = [term.wave(self._digits) for term in seen if term.function == name]
             lines += _wrapped(name.split(")")[0] + ")", waves)
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
@@ -135,7 +140,7 @@ class Equation:
 
     def _lines_of(self, left: str) -> list[str]:
         """The line with this left side, broken between terms; no line for a force of 0."""
-        terms = (term for term in self.terms if term.left == left)
+        terms = (term for term in self.terms if term.left == left and term.is_seen(self._digits))
         own = (f"+ {term.function}" if term.function else term.text(self._digits) for term in terms)
         # The waves of one function give its name once.
         own = list(dict.fromkeys(own))

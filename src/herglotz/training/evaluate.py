@@ -25,7 +25,7 @@ from herglotz.training.plan import Plan
 from herglotz.training.problems.grid import step_inputs
 from herglotz.training.problems.one_step import ResidualProblem, SupervisedProblem
 from herglotz.training.problems.robust import FREEDOM
-from herglotz.training.recorded_range import box_of
+from herglotz.training.recorded_range import box_of, near_recorded
 from herglotz.training.run import Run
 from herglotz.training.task import Task
 from herglotz.training.verdict import judged, with_own_starts
@@ -68,7 +68,7 @@ def evaluate(task: Task, seen: Look, plan: Plan | None, fitted: Fitted, told: Fi
     h = train.typical_step / config.substeps
     # Posterior, report and export are made on the CPU, also of a run that is loaded.
     model, data, states = fitted.model.cpu(), data.to(device="cpu"), state_of(states.joined.cpu())
-    box = box_of(*state_of(fitted.states.cpu()))
+    box = box_of(*state_of(near_recorded(fitted.states, train).cpu()))
     return Run(model, told, metrics, data, train.lengths, states, h, box, task.stages.history)
 
 

@@ -254,13 +254,17 @@ def _is_other(lacking: Tensor, noise: float, x: Tensor, row: Tensor) -> bool:
     """Whether accelerations (K, n) of variance 1 differ where states x (K, m) of other times are alike.
 
     `noise` is the share of the variance that is noise. The quarter of the samples with the nearest neighbours counts.
+    Forces of the state differ, too, by their slope times the distance, which a regression takes off.
     """
     apart = torch.cdist(x, x).masked_fill((row[:, None] - row).abs() < 2 * SAMPLES, torch.inf)
     distance, other = apart.min(1)
     near = distance.argsort()[: max(1, len(x) // 4)]
     if not float(distance[near[-1]]) < NEAR:
         return False
-    differ = float((lacking[near] - lacking[other[near]]).square().mean()) / 2
+    steps, differences = x[near] - x[other[near]], lacking[near] - lacking[other[near]]
+    left = differences - steps @ (torch.linalg.pinv(steps) @ differences)
+    freedom = max(1, len(near) - x.shape[1])
+    differ = float(left.square().sum() / freedom) / (2 * lacking.shape[1])
     return differ > max(CLEAR * noise, noise + OTHER * (1 - noise))
 
 

@@ -13,6 +13,7 @@ from herglotz.choices import WARMUP
 from herglotz.data import Trajectories
 from herglotz.data.driving import acting
 from herglotz.data.input_terms import input_terms_of, with_input_terms, with_waves
+from herglotz.data.noise import AT_THE_NOISE, precisions
 from herglotz.data.sensors import measured
 from herglotz.data.splits import leading, leading_rows
 from herglotz.errors import InputError, refuse
@@ -247,8 +248,13 @@ def longer_warmup(found: Prediction, best: tuple[float, ...]) -> int | None:
     """The warm-up whose start would miss about what the `best` start does, if a coordinate is far from that; else None.
 
     The error of a velocity, σ √12 / (T √K), falls with K to the power 3/2. Half of the recording is left to predict.
+    None where the best start misses the data by more than their noise: the model misses them, too.
     """
     spreads = found.data.q.std(0, correction=0).tolist()
+    noise = (precisions(found.data).to(found.data.q) * found.data.balance).tolist()
+    met = (x <= max(AT_THE_NOISE * own, EXACT_ENOUGH * size) for x, own, size in zip(best, noise, spreads, strict=True))
+    if not all(met):
+        return None
     each = zip(found.rms_per_coordinate or (), best, spreads, strict=False)
     ratio = max((error / least for error, least, size in each if error > EXACT_ENOUGH * size and least), default=0.0)
     count = min(math.ceil(found.warmup * ratio ** (2 / 3)), min(found.data.lengths) // 2)

@@ -48,6 +48,18 @@ class Beyond:
         return f"the {self.quantity} of {self.coordinate} ({ends}){by}, since t = {time}{where}"
 
 
+def near_recorded(states: Tensor, train: Trajectories) -> Tensor:
+    """Those of the states (N, 2n+1) of a fit that lie in the recorded range of positions; all if none do.
+
+    Where a model does not follow its data, its states go where nothing was recorded.
+    """
+    seen = (torch.ones_like(train.q) if train.observed is None else train.observed).bool()
+    low, high = train.q.where(seen, torch.inf).amin(0), train.q.where(seen, -torch.inf).amax(0)
+    q, edge = states[:, : train.dof], MARGIN * (high - low)
+    inside = ((q >= low - edge) & (q <= high + edge)).all(-1)
+    return states[inside] if bool(inside.any()) else states
+
+
 def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:
     """Lowest and highest q, p and s over a set of states."""
     ends = {name: x.aminmax(dim=0) for name, x in (("q", q), ("p", p), ("s", s[:, None]))}

@@ -311,7 +311,8 @@ class Fitter:
 
     def _weights(self, numbers: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
         """Prior weights 1/variance by number: all, and those of waves and of powers that waves can imitate."""
-        prior, bands = prior_of(self.model, self.base, None), self.variant.functions
+        # Rates of a search stay where they began: under a controller they would make up for wrong forces of the inputs.
+        prior, bands = prior_of(self.model, self.base, None, wide_rates=False), self.variant.functions
         names = [numbers[int(i)] for i in prior.index]
         weights = {name: spread**-2 for name, spread in zip(names, prior.spread.tolist(), strict=True)}
         powers = [self.keys[name] for name in self.always if bands and not name.startswith(ALWAYS)]

@@ -22,6 +22,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from typing import Any, cast
 
 import torch
@@ -175,8 +176,17 @@ def judged(
     words = ". ".join(filter(None, (misread(kept, seen, errors.missed), *reasons)))
     caveat = caveat_of_inputs(model, train, states)
     beyond = partial(unseen_outlier, seen, everywhere)
-    told = metrics | {"driven": train.u is not None, "columns": ways_of_columns(train)}
+    told = metrics | {
+        "driven": train.u is not None, "level": task.config.level, "angles": _never_turned(train),
+        "columns": ways_of_columns(train),
+    }  # fmt: skip
     return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond)} | kept_numbers
+
+
+def _never_turned(data: Trajectories) -> bool:
+    """Whether the data have angles, and none of these goes through a whole turn: each may be a position on a line."""
+    turning = torch.tensor(data.angles, device=data.q.device)
+    return bool(turning.any()) and bool(((data.q.amax(0) - data.q.amin(0))[turning] < 2 * math.pi).all())
 
 
 def _errors(kept: Trajectories, unit: Tensor, missed: tuple[Tensor, Tensor | None, Tensor | None], out: int) -> Errors:
@@ -222,9 +232,31 @@ def misread(kept: Trajectories, seen: Look, missed: bool) -> str:
     by more than the noise, so is a recording that stands out, and what `reason_of_data` finds.
     """
     # A drift may make up for a constraint, which the readings keep.
-    if (words := bound(measured(kept, drifts=[-rate for rate in seen.drifts]))) or not missed:
+    as_read = measured(kept, drifts=[-rate for rate in seen.drifts])
+    if (words := in_proportion(as_read) or bound(as_read)) or not missed:
         return words
     return "".join(one.reason for one in seen.outlying) or reason_of_data(seen.train.liveliest(MOST))
+
+
+def in_proportion(data: Trajectories) -> str:
+    """A pair of positions that are in proportion within their precision, with a remedy; "" if there is none.
+
+    Each recording has a constant of its own: encoders begin at any count.
+    """
+    noise = precisions(data).to(data.q) * data.balance
+    x = torch.cat([(one.q - one.q.mean(0))[one.complete] for one in data])
+    moving = (noise <= HALF * x.square().mean(0).sqrt()).nonzero()[:, 0].tolist()
+    for i, j in combinations(moving, 2):
+        by = float((x[:, i] @ x[:, j]) / x[:, i].square().sum())
+        left = float((x[:, j] - by * x[:, i]).square().mean().sqrt())
+        if left <= AT_THE_NOISE * math.hypot(float(noise[j]), by * float(noise[i])):
+            one, other = data.names[i], data.names[j]
+            return (
+                f"{other} moves by {by:.4g} times what {one} does, to the precision of both, as where one shaft turns "
+                "another, and what holds them together was not recorded: they are one coordinate. Try --drop "
+                f"{shlex.quote(other)}, or motions in which they differ"
+            )
+    return ""
 
 
 def bound(data: Trajectories) -> str:
@@ -269,14 +301,15 @@ def in_words(
         return f"{FAILS}: {errors}. {misread}"
     follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
     if not follows or not math.isfinite(free):
-        return f"{FAILS}: {errors}. {_remedy(metrics, missed, shown, beyond)}"
+        return f"{FAILS}: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     # Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: {_unseen_motion(errors)}"
-    # Two motions of one kind that know nothing of each other differ by √2 of their spread.
+    # Two motions of one kind that know nothing of each other differ by √2 of their spread. The errors of a start and
+    # those of a model know nothing of each other, either.
     chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread
-    if free > max(errors.lost, chance):
-        return f"{FAILS} beyond the recording: {errors}. {_remedy(metrics, missed, shown, beyond)}"
+    if free > math.hypot(errors.lost, chance):
+        return f"{FAILS} beyond the recording: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
     return ". ".join(filter(None, (f"{_fits(errors)}: {errors}", shown(True) if missed else caveat)))
@@ -305,13 +338,13 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown:
     """The verdict on a model that the data do not determine, with the recording that would help."""
     over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.missed
     if not ahead.reached:
-        return f"the model's own motion breaks off {over}; {errors}. {_remedy(metrics, missed, shown)}"
+        return f"the model's own motion breaks off {over}; {errors}. {_remedy(errors, metrics, shown)}"
     what, share = f"a force too small to be seen ({ahead.name})", ahead.hidden
     if ahead.parameters >= ahead.hidden:
         what, share = "the uncertainty of the parameters", ahead.parameters
     changes = f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread"
     if missed:
-        return f"a force is missing, and others are left open; {errors}. {changes}. {_remedy(metrics, True, shown)}"
+        return f"a force is missing, and others are left open; {errors}. {changes}. {_remedy(errors, metrics, shown)}"
     # The uncertainty falls with the root of the number of samples.
     times = (ahead.open / UNCERTAIN) ** 2
     enough = times <= MAX_ROOT_OF_RECORDINGS**2
@@ -323,19 +356,35 @@ def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown:
     return f"too little was recorded to tell; {errors}. {changes}. Try {longer}"
 
 
-def _remedy(metrics: dict[str, Any], missed: bool, shown: Callable[..., str], beyond: Callable[[], str] = str) -> str:
-    """The remedy, after the reason if one is shown; `missed`: the training error exceeds the noise."""
-    if reason := shown(missed):
+def _remedy(errors: Errors, metrics: dict[str, Any], shown: Callable[..., str], beyond: Callable[[], str] = str) -> str:
+    """The remedy, after the reason if one is shown."""
+    if reason := shown(errors.missed):
         return reason
-    if not missed:
-        other = "Try a simpler level, or a larger train fraction: the unseen part differs from the training part"
-        return beyond() or other
+    if not errors.missed:
+        return beyond() or _unlike(errors, metrics)
     if metrics["objective"] in ("residual", "raw"):
         return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
     ways = [] if metrics["objective"] == "smoothing" else ["--objective smoothing"]
     # Inputs leave one level.
     ways += [] if metrics.get("driven") else ["another --level (herglotz select)"]
     return f"A force is missing. Try {', or '.join([*ways, *metrics.get('columns', ()), 'a --feature for it'])}"
+
+
+def _unlike(errors: Errors, metrics: dict[str, Any]) -> str:
+    """Why a model that meets the training data misses the unseen part, or one run over that part, with a remedy."""
+    driven = metrics.get("driven")
+    if (errors.unseen or 0.0) > AT_THE_NOISE * errors.limit:
+        # Inputs leave one level.
+        simpler = "" if driven or metrics.get("level") in ("conservative", "linear") else "--level linear, or "
+        return f"Try {simpler}a larger train fraction: the unseen part differs from the training part"
+    met = "the data" if errors.unseen is None else "the unseen part, too"
+    noisy = "from noise of the inputs, " if driven else ""
+    line = "--angles none, where a spring and not gravity holds the angle, or " if metrics.get("angles") else ""
+    return (
+        f"Runs over {FIRST_SEGMENT} steps meet {met}: errors of a longer run come from a force too small to be seen in "
+        f"these, {noisy}or from chaos, which no run follows for long. Try {line}a --feature for that force, or a "
+        "longer recording; herglotz predict with --windows and --horizon scores shorter runs"
+    )
 
 
 def _rms(x: Tensor) -> float:

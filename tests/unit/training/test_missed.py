@@ -128,6 +128,19 @@ def test_neighbours_are_of_other_times():
     assert "the force depends on the past" in (reason_of(data, left(0.2 * torch.sin(0.37 * T)), OWNER) or "")
 
 
+def test_a_stiff_force_between_two_coordinates_is_no_past():
+    # fails if neighbours, farther apart than a belt stretches, are said to be alike: their forces differ by the
+    # stiffness times what the belt is stretched more
+    stretch = 0.01 * torch.sin(1.9 * T + 2)
+    q = torch.stack([Q, Q + stretch], 1) + 1e-5 * torch.randn(N, 2, generator=MAKE, dtype=torch.float64)
+    force = 20 * stretch
+    assert not reason_of(Trajectories.of(T, q), torch.cat([left(force), left(-force)], 1), OWNER)
+    # A force as large that nobody recorded is told beside the belt.
+    both = force + 0.2 * torch.sin(0.37 * T)
+    found = reason_of(Trajectories.of(T, q), torch.cat([left(both), left(-both)], 1), OWNER)
+    assert "the force depends on the past" in (found or "")
+
+
 def test_the_hardest_kick_is_named():  # fails if the place is a row of the windows, or that of any other kick
     both = torch.cat([noisy(), noisy()])[:, None]
     data = Trajectories.of(torch.cat([T, T]), both, (N, N), recordings=["run 3", "run 8"])
@@ -280,7 +293,7 @@ def test_recordings_of_a_slow_input_begin_anywhere():
     [
         ({"windows": 0.05, "free": 1.2}, True),
         ({"windows": 0.5}, True),
-        ({"windows": 0.012, "free": 1.2}, False),  # the training part is met: it is the other part that differs
+        ({"windows": 0.012, "unseen": 0.3, "free": 1.2}, False),  # the training part is met: the other part differs
     ],
 )
 def test_a_verdict_gives_the_reason(errors, told):

@@ -91,6 +91,8 @@ def test_the_warm_up_that_tells_the_start_is_named():
     assert (found.rms or 0) > 20 * best[0]
     assert (again.rms or 1) < 1.5 * best[0]
     assert longer_warmup(again, best) is None
+    # fails if the start is blamed where the model misses from the best one, too, by twice the noise
+    assert longer_warmup(found, (2e-3,)) is None
     # An error that counts as none, of a motion without noise, is nobody's concern.
     exact = replace(found, states=found.states._replace(q=found.data.q + 1e-6))
     assert longer_warmup(exact, (1e-9,)) is None

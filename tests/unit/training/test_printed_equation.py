@@ -19,7 +19,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, fit, laplace
-from herglotz.training.equation import Departure, _is_lost, _sensors, equation_of, notes_of
+from herglotz.training.equation import Departure, Equation, Term, _is_lost, _sensors, equation_of, notes_of
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.fit import _of_short_steps
@@ -351,3 +351,17 @@ def test_an_equation_has_the_model_s_numbers_where_short_steps_have_no_limit(mon
     theta = ParameterVector(run.model).get()
     posterior: Any = SimpleNamespace(of_short_steps=lambda: (theta + 1.0, torch.zeros(len(run.data), 2)))
     assert (_of_short_steps(run, posterior) is not run) is printed
+
+
+def test_waves_of_which_no_digit_is_printed_are_left_out():
+    # fails if a function is printed by waves of 0, as of two angles that are one, or a damping of 0 and its deviation
+    # are lost with them
+    def term(value, what, function="", deviation=None):
+        return Term("x″", what, value, deviation, "1/s²", 1e-3, function)
+
+    waves = [term(x, f"cos({k} x)", "f1(x)") for k, x in enumerate((0.2, 3e-9, -0.0002, 0.1), 2)]
+    gone = [term(1e-90, f"sin({k} x)", "f2(x)") for k in range(2, 9)]
+    text = str(Equation((term(1e-5, "x′", deviation=2e-3), *waves, *gone), ("x″",), "x in m", None))
+    assert text.splitlines()[0] == "x″ = 0.000(2) x′ + f1(x)"
+    assert text.splitlines()[1] == "f1(x) = 0.200 cos(2 x) + 0.100 cos(5 x)"
+    assert "f2" not in text

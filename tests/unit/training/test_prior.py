@@ -8,14 +8,14 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.training.problems.prior import Prior
 
 
-def prior_of(n, level):
+def prior_of(n, level, rate=0.1, **options):
     """Of a model of n lengths, and parameters away from its start."""
     one, zero = (1.0,) * n, (0.0,) * n
     config = ModelConfig(
-        angles=(False,) * n, level=level, stiffness=one, tilt=zero, scale=one, speed=one, rate=0.1, potential_width=4
+        angles=(False,) * n, level=level, stiffness=one, tilt=zero, scale=one, speed=one, rate=rate, potential_width=4
     )
     ends = torch.ones(n, dtype=torch.float64)
-    prior = Prior(ContactLagrangian(config).double(), -ends, ends, departure=0.5)
+    prior = Prior(ContactLagrangian(config).double(), -ends, ends, departure=0.5, **options)
     make = torch.Generator().manual_seed(0)
     return prior, prior.start + 0.1 * torch.randn(len(prior.start), generator=make, dtype=torch.float64)
 
@@ -37,3 +37,16 @@ def test_twenty_coordinates_fit_into_memory():
     cost, _, b = prior.normal_equations(theta)
     torch.testing.assert_close(cost, prior.cost(theta))
     torch.testing.assert_close(b, grad(prior.cost)(theta), rtol=1e-9, atol=1e-12 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize(("rate", "spread"), [(0.1, 1.0), (-10.0, 10.0)])
+def test_a_large_rate_is_as_free_as_it_is_large(rate, spread):
+    # fails if a rate of ten is held to within the rate of the motion, 1, at the value where a fit began, in which drag
+    # and weight of a falling body made up for the rest; or if a search lets the rate go
+    prior, _ = prior_of(1, "linear", rate)
+    (at,) = prior.parameters.index("damping.rate").tolist()
+    assert float(prior.spread[prior.index == at]) == pytest.approx(spread)
+    narrow, _ = prior_of(1, "linear", rate, wide_rates=False)
+    assert float(narrow.spread[narrow.index == at]) == 1.0
+    others = prior.spread[prior.index != at]
+    torch.testing.assert_close(others, prior_of(1, "linear")[0].spread[prior.index != at])

@@ -7,7 +7,7 @@ import torch
 
 from herglotz.data import Trajectories
 from herglotz.data.units import span
-from herglotz.training.recorded_range import farthest, quantities_outside, range_in_words, warning
+from herglotz.training.recorded_range import farthest, near_recorded, quantities_outside, range_in_words, warning
 
 BOX = {"q_low": [-1.0, 2.0], "q_high": [1.0, 4.0], "p_low": [-3.0, -1.0], "p_high": [3.0, 1.0]}
 LIKE = Trajectories.of(
@@ -97,3 +97,18 @@ def test_zero_width_is_no_division_by_zero():  # fails if a coordinate that neve
     (found,) = quantities_outside(box, LIKE, LIKE.t, torch.tensor([[0.0, 0.0]] * 3 + [[1.0, 0.0]]), torch.zeros(4, 2))
     assert found.by == math.inf
     assert warning([found], "s").endswith(": the position of x (0 m throughout), since t = 3 s")
+
+
+def test_states_that_leave_the_recording_are_no_recorded_range():
+    # fails if a pole within 4 degrees is said to be recorded up to 246, where its model falls over, if a reading that
+    # was not recorded counts, or the noise of the ends takes states away
+    q = torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0]).double()
+    observed = torch.ones(5, 2, dtype=torch.float64)
+    observed[4, 1] = 0.0
+    data = Trajectories.of(torch.arange(5.0).double(), q, observed=observed)
+    states = torch.cat([q, 0 * q, 0 * q[:, :1]], 1)
+    states[0, 1], states[2, 1] = -2.01, 70.0
+    assert near_recorded(states, data)[:, 1].tolist() == [-2.01, -1.0, 1.0]
+    assert near_recorded(states, replace(data, observed=None))[:, 1].tolist() == [-2.01, -1.0, 1.0, 2.0]
+    # A model that is lost everywhere has its own range.
+    assert len(near_recorded(states + 100, data)) == 5

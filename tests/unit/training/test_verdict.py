@@ -73,6 +73,43 @@ def test_words(windows, unseen, free, ahead, expected):
 
 
 @pytest.mark.parametrize(
+    ("unseen", "told", "said", "unsaid"),
+    [
+        (0.011, {}, "a force too small to be seen in these, or from chaos", "unseen part differs"),
+        (0.011, {"driven": True}, "in these, from noise of the inputs, or from chaos", "--level"),
+        (0.011, {"angles": True}, "Try --angles none, where a spring", "unseen part differs"),
+        (0.03, {"level": "forced"}, "Try --level linear, or a larger train fraction: the unseen part differs", "chaos"),
+        (0.03, {"level": "linear"}, "Try a larger train fraction: the unseen part differs", "--level"),
+        (0.03, {"level": "forced", "driven": True}, "Try a larger train fraction: the unseen part", "--level"),
+    ],
+)
+def test_a_free_run_that_is_lost_alone_is_no_other_part(unseen, told, said, unsaid):
+    # fails if the unseen part is said to differ where short runs meet it to the noise, or a level is offered that
+    # refuses inputs or was taken
+    text = in_words(Errors(0.011, unseen, 1.2, noise=0.01, spread=1.0), KNOWN, GOOD | told)
+    assert text.startswith("does not fit beyond the recording")
+    assert said in text
+    assert unsaid not in text
+
+
+def test_what_a_start_and_a_model_do_to_a_free_run_adds_up():
+    # fails if a chaotic motion whose start explains nearly all of an error is refused: 3 × 0.03 of the start and 0.1
+    # that a model may have
+    ahead = replace(KNOWN, start=0.03)
+    told = [in_words(Errors(0.011, 0.011, free, noise=0.01, spread=1.0), ahead, GOOD) for free in (0.13, 0.14)]
+    assert [text.startswith("does not fit") for text in told] == [False, True]
+
+
+def test_angles_that_may_be_positions_on_a_line():
+    # fails if a spring is offered for an angle that turns over
+    t, angle = 0.1 * torch.arange(40, dtype=torch.float64), torch.linspace(-2.4, 2.4, 40, dtype=torch.float64)[:, None]
+    data = Trajectories.of(t, angle, angles=(True,))
+    assert verdict._never_turned(data)
+    assert not verdict._never_turned(replace(data, q=1.4 * angle))
+    assert not verdict._never_turned(replace(data, angles=(False,)))
+
+
+@pytest.mark.parametrize(
     ("noise", "error", "fits"),
     [
         (1e-6, 0.04, True),  # 40 000 × the noise, and less than a twentieth of the spread
@@ -162,6 +199,24 @@ def test_what_one_circle_does_not_tell(stretched, said):
     assert ("Try --polar x,y " in text) is said
     judged = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), KNOWN, GOOD, misread=text)
     assert judged.startswith("does not fit: " if said else "fits to the noise: ")
+
+
+@pytest.mark.parametrize(("stretched", "size", "said"), [(0.0, 1.0, True), (0.01, 1.0, False), (0.0, 1e-3, False)])
+def test_two_readings_of_one_shaft(stretched, size, said):
+    # fails if a rigid gear is fitted as two bodies, a belt whose stretching is seen or a shaft at rest is called rigid,
+    # or the count at which an encoder begins in each recording hides the gear
+    t = torch.arange(200, dtype=torch.float64) / 30
+    both = []
+    for start in (0.0, 5.0):
+        motor = (3.5 * t + start).sin() + 0.4 * t
+        both.append(torch.stack([motor, start + size * motor / 3 + stretched * (9 * t).sin()], 1))
+    q = torch.cat(both) + 1e-3 * torch.randn(400, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = Trajectories.of(t.repeat(2), q, (200, 200), names=("motor", "gear shaft"))
+    text = verdict.in_proportion(data)
+    assert text.startswith("gear shaft moves by 0.333") is said
+    assert ("Try --drop 'gear shaft', or" in text) is said
+    seen: Any = SimpleNamespace(drifts=(), outlying=(), train=data)
+    assert ("they are one coordinate" in verdict.misread(data, seen, missed=False)) is said
 
 
 def test_all_pairs_on_circles_are_named():

@@ -56,8 +56,10 @@ class Prior:
     * Every network weight is N(its start, `weight`²), a weak prior against drift of undetermined weights. (Centred at 0
       it would switch the network off: with a last layer that starts at 0, only the prior acts on the first layer.)
     * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
-      friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²),
-      its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their start, 0.5²).
+      friction (the first mass is 1) are N(their start, `rate_spread`²), and with `wide_rates` the first three at least
+      N(start, start²): the damping rate of a falling body is many times the rate of its fall. Dry friction is
+      N(0, (`rate_spread` speed)²), its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their
+      start, 0.5²).
     * A `herglotz.models.Term` has its own spread, and the waves of functions have `spreads`, around 0.
     """
 
@@ -70,6 +72,7 @@ class Prior:
         departure: float | None,
         weight: float = 10.0,
         rate_spread: float = 1.0,
+        wide_rates: bool = True,
         spreads: Mapping[str, float] | None = None,
     ):
         self.parameters = ParameterVector(model)
@@ -94,6 +97,9 @@ class Prior:
         # RMS force of the baseline.
         self.force = float(own.square().mean().sqrt()) or 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
+        if wide_rates:
+            rates = torch.isin(self.index, self._index("damping.rate", "damping.drag", "action.rate").to(self.index))
+            self.spread = self.spread.maximum(torch.where(rates, self.start[self.index].abs(), 0.0))
         self.networks = self._index(*NETWORKS).to(self.start.device)
         with torch.no_grad():
             self.departs = departure is not None and bool(self._departures(self.start, self.grid, self.velocity))
@@ -158,17 +164,19 @@ class Prior:
         return parts if rate is None else [*parts, rate[None] / self.typical_rate]
 
 
-def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Any:
+def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None, wide_rates: bool = True) -> Any:
     """The `Prior` of every objective; the deviation of rates is 0.3 of the rate |q̇|/|q| of the slowest coordinate.
 
-    None for the user's own L_d, whose parameters have no known meaning.
+    With `wide_rates` that of a rate which starts larger is as large as the rate. None for the user's own
+    L_d, whose parameters have no known meaning.
     """
     if not isinstance(model, ContactLagrangian):
         return None
     typical = min(v / s for v, s in zip(base.speed, base.scale, strict=True))
     return Prior(
-        model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical, spreads=base.spreads
-    )
+        model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical,
+        wide_rates=wide_rates, spreads=base.spreads,
+    )  # fmt: skip
 
 
 def _departures(model: ContactLagrangian, q: Tensor, v: Tensor) -> tuple[Tensor | None, Tensor | None]:
