@@ -21,6 +21,7 @@ from herglotz.least_squares import least_squares
 from herglotz.models.drag import input_columns, input_forces
 from herglotz.training.baseline import acceleration_terms, for_each
 from herglotz.training.dictionary import by_motion
+from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.offers import INPUTS, ZEROS
 from herglotz.training.search import Search
 from herglotz.training.trials import Trial, Variant
@@ -66,7 +67,7 @@ def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
     Each level counts as one more number of the model. A trial at the noise lacks no terms.
     """
     every = () if trial.at_the_noise or not search.config.find_input_terms else offered_terms(search.data)
-    if not every:
+    if not (every := _in_a_kernel(search, every)):
         return ()
     found = _with(search, every, trial)
     if found is None or not found.replaces(trial):
@@ -79,6 +80,22 @@ def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
                 every, found = of, other
     taken = taken_terms(found, every)
     return taken if found.gain(trial, sum(map(bool, map(saturation, taken)))) > 0 else ()
+
+
+def _in_a_kernel(search: Search, every: tuple[str, ...]) -> tuple[str, ...]:
+    """The terms without forces by the motion, or without saturations too, that a kernel has room for; () if it has not.
+
+    Without a kernel, a fit of three joints with all terms of their inputs takes minutes.
+    """
+    still = tuple(term for term in every if term not in input_forces(every))
+    plain = tuple(term for term in still if saturation(term) is None)
+    room = (own for own in (every, still, plain) if own and _numbers(search, own) <= MAX_PARAMETERS)
+    return next(room, ())
+
+
+def _numbers(search: Search, terms: Sequence[str]) -> int:
+    """The number of parameters of a search with these terms of the inputs."""
+    return len(search.driven_by(terms).fitter(Variant(search.order)).start)
 
 
 def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:

@@ -15,8 +15,18 @@ import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import saturation
 from herglotz.models import ModelConfig
-from herglotz.training import questions
-from herglotz.training.acting_inputs import _least, _with, asked_terms, beside, offered_terms, taken_terms
+from herglotz.models.drag import input_forces
+from herglotz.training import acting_inputs, questions
+from herglotz.training.acting_inputs import (
+    _in_a_kernel,
+    _least,
+    _numbers,
+    _with,
+    asked_terms,
+    beside,
+    offered_terms,
+    taken_terms,
+)
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import by_motion, dictionary
@@ -387,3 +397,18 @@ def test_terms_also_join_the_simplest_model_where_a_near_one_misses_the_noise(at
     found = _with(search, (), trial)
     assert found is not None
     assert (asked, found.name) == (tried, tried[-1])  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_no_more_terms_of_inputs_are_offered_than_a_kernel_has_room_for(monkeypatch):
+    # fails if a search of three joints with all terms of their inputs goes on without a kernel, for minutes
+    data = driven(lambda u, _: u, sway, samples=60)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    every = offered_terms(search.data)
+    all_of, still = _numbers(search, every), tuple(term for term in every if term not in input_forces(every))
+    assert _in_a_kernel(search, every) == every
+    monkeypatch.setattr(acting_inputs, "MAX_PARAMETERS", all_of - 1)
+    assert _in_a_kernel(search, every) == still
+    monkeypatch.setattr(acting_inputs, "MAX_PARAMETERS", _numbers(search, still) - 1)
+    assert _in_a_kernel(search, every) == tuple(term for term in still if saturation(term) is None)
+    monkeypatch.setattr(acting_inputs, "MAX_PARAMETERS", 1)
+    assert _in_a_kernel(search, every) == ()
