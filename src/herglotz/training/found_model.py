@@ -27,7 +27,8 @@ def settings(trial: Trial, config: FitConfig) -> tuple[FitConfig, Baseline]:
     terms = every.only(keys)
     dry = any(key.startswith(("friction.coulomb", "friction.breakaway")) for key in keys)
     forces = [key for key in keys if key.startswith(("friction.", "coupling."))]
-    between = any(key in keys for key in ("kinetic.off_diagonal", "coupling.viscous"))
+    # Of three coordinates and more these keys have an index.
+    between = any(key.startswith(("kinetic.off_diagonal", "coupling.viscous")) for key in keys)
     terms = replace(terms, dry=dry, apart=not between, one_rate=every.one_rate or not forces)
     variant = trial.fitter.variant
     config = replace(config, drag=())
