@@ -94,8 +94,10 @@ def _in_a_kernel(search: Search, every: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _numbers(search: Search, terms: Sequence[str]) -> int:
-    """The number of parameters of a search with these terms of the inputs."""
-    return len(search.driven_by(terms).fitter(Variant(search.order)).start)
+    """The number of parameters with these terms: a column of u has a gain for each coordinate and a zero."""
+    columns = len(input_columns(terms))
+    more = (search.data.dof + 1) * columns + len(terms) - columns
+    return len(search.fitter(Variant(search.order)).start) + more
 
 
 def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:

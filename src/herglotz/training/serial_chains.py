@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from itertools import combinations, combinations_with_replacement
 
+from herglotz.training.offers import INPUTS
+
 # Offers of every chain, by the start of their names: constant masses, weights and springs, damping, and inputs.
-PLAIN = ("kinetic.off_diagonal", "potential.", "friction.viscous", "coupling.viscous", "friction.input_map")
+PLAIN = ("kinetic.off_diagonal", "potential.", "friction.viscous", "coupling.viscous", INPUTS)
 
 
 def serial_chains(angles: Sequence[bool], offers: Collection[str]) -> list[frozenset[str]]:

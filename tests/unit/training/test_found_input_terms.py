@@ -37,7 +37,7 @@ from herglotz.training.plan import Plan
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task, build_model
-from herglotz.training.trials import Trial
+from herglotz.training.trials import Trial, Variant
 
 H = 0.04
 
@@ -403,8 +403,10 @@ def test_no_more_terms_of_inputs_are_offered_than_a_kernel_has_room_for(monkeypa
     # fails if a search of three joints with all terms of their inputs goes on without a kernel, for minutes
     data = driven(lambda u, _: u, sway, samples=60)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search.order = 2
     every = offered_terms(search.data)
     all_of, still = _numbers(search, every), tuple(term for term in every if term not in input_forces(every))
+    assert all_of == len(search.driven_by(every).fitter(Variant(2)).start)
     assert _in_a_kernel(search, every) == every
     monkeypatch.setattr(acting_inputs, "MAX_PARAMETERS", all_of - 1)
     assert _in_a_kernel(search, every) == still
