@@ -70,14 +70,15 @@ def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
     Returns
     -------
     list of Path
-        The files, in the order of `FIGURES`. `plan` is left out for a run without a plan, and `sizes` for a run
-        without a search for terms. Every figure is drawn before the first is written.
+        The files, in the order of `FIGURES`. `plan` is left out for a run without a plan, `sizes` for a run without a
+        search for terms, and `training` for a run without a history, as where no stage of its fit found a path. Every
+        figure is drawn before the first is written.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written to.
     """
-    required = {"plan": "plan", "sizes": "compared"}
-    plots = {name: plot for name, plot in FIGURES.items() if name not in required or run.metrics.get(required[name])}
+    required = {"plan": run.metrics.get("plan"), "sizes": run.metrics.get("compared"), "training": run.history}
+    plots = {name: plot for name, plot in FIGURES.items() if required.get(name, True)}
     return save_all({name: plot(run) for name, plot in plots.items()}, folder, form)

@@ -82,6 +82,12 @@ def test_every_figure_of_every_kind_of_run(tmp_path, name, kind):
     assert title(figure)
 
 
+def test_a_fit_without_iterations_has_its_other_figures(tmp_path):
+    # fails if a fit of which no stage found a path, and which is saved, ends with an error of a figure
+    run = replace(fake_run(steps=20), history=[])
+    assert [x.stem for x in save_figures(run, tmp_path)] == [name for name in FIGURES if name != "training"]
+
+
 def test_save_figures_writes_all_and_nothing_else(tmp_path):
     # fails if a name changes, a temporary file stays, or the folder is not made
     folder = tmp_path / "a" / "b"
