@@ -77,7 +77,7 @@ MODELS = {
         2,
         (False, False),
         level="forced",
-        drag=("(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v", "cos(0.8 (v1 - v2))"),
+        drag=("(0.4 v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v", "cos(0.8 (v1 - v2))"),
     ),
     "drag of position, order four": config(
         2, (False, True), level="forced", drag=("q1^2 |v2| v2", "v1^2"), order=4, potential_width=0, coulomb=True

@@ -64,9 +64,9 @@ def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
 def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
     """The terms of the inputs that a model takes if all are offered; () if the model is no better than the trial.
 
-    Each level counts as one more number of the model. A trial at the noise lacks no terms.
+    Each level counts as one more number of the model. A trial that lacks nothing lacks no terms of its inputs.
     """
-    every = () if trial.at_the_noise or not search.config.find_input_terms else offered_terms(search.data)
+    every = () if trial.lacks_nothing or not search.config.find_input_terms else offered_terms(search.data)
     if not (every := _in_a_kernel(search, every)):
         return ()
     found = _with(search, every, trial)

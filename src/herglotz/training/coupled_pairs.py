@@ -1,8 +1,8 @@
 """Pairs of coordinates between which a force acts, so that a search of many coordinates need not offer every pair.
 
-The acceleration of each coordinate is a linear regression on all positions and the own velocity,
+The acceleration of each coordinate is a linear regression on all positions, the own velocity and all inputs,
 
-    q̈ᵢ = Σⱼ aᵢⱼ qⱼ + bᵢ + cᵢ q̇ᵢ,
+    q̈ᵢ = Σⱼ aᵢⱼ qⱼ + bᵢ + cᵢ q̇ᵢ + Σₖ dᵢₖ uₖ,
 
 over smoothed samples. A position stays if the fit needs it by the extended Bayesian information criterion (Chen & Chen
 2008), which also asks for the price of a choice among n − 1 positions. Nonlinear terms are offered where the linear one
@@ -28,8 +28,8 @@ from herglotz.training.pruning import prune
 def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
     """Pairs i < j of coordinates, counted from 0, of which either acceleration needs the other position.
 
-    None if there are too few independent samples for the n + 2 coefficients of a coordinate. Samples that share half a
-    smoothing window are dependent: their number is divided by the overlap.
+    None if there are too few independent samples for the n + m + 2 coefficients of a coordinate with m inputs. Samples
+    that share half a smoothing window are dependent: their number is divided by the overlap.
     """
     data = data.to(torch.float64, "cpu")
     local = local_polynomials(data)
@@ -38,23 +38,40 @@ def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
     n, overlap = data.dof, local.width / 2
     half = local.half[local.centred, None]
     q, v, a = (local.coefficients[local.centred, k] * math.factorial(k) / half**k for k in range(3))
-    count = len(q) / overlap
-    if count <= n + 2:
+    u = data.q.new_zeros(data.samples, 0) if data.u is None else data.u
+    count, coefficients = len(q) / overlap, n + 2 + u.shape[1]
+    if count <= coefficients:
         return None
     worth, kept = math.log(count) + 2 * math.log(n - 1), torch.zeros(n, n, dtype=torch.bool)
     for i in range(n):
-        X = torch.cat([q, torch.ones_like(half), v[:, i, None]], 1)
+        X = torch.cat([q, torch.ones_like(half), v[:, i, None], u[local.centred]], 1)
         x = least_squares(X, a[:, i, None])[:, 0]
-        variance = float((a[:, i] - X @ x).square().mean()) / (1 - (n + 2) / count)
+        variance = float((a[:, i] - X @ x).square().mean()) / (1 - coefficients / count)
         others = torch.tensor([j for j in range(n) if j != i])
         kept[i, prune(X.T @ X, x, others, worth * overlap * variance)[0]] = True
     return [(i, j) for i, j in combinations(range(n), 2) if bool(kept[i, j] | kept[j, i])]
 
 
-def terms_between(coupled: Collection[tuple[int, int]], angles: Sequence[bool]) -> tuple[str, ...]:
-    """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs."""
-    on = {name: _coordinates(name, angles) for name in lengths(angles)}
-    return tuple(name for name, own in on.items() if len(own) == 1 or own in coupled)
+def terms_between(coupled: Collection[tuple[int, int]], data: Trajectories) -> tuple[str, ...]:
+    """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs (`difference`)."""
+    own, between = {}, {f"(q{i + 1} - q{j + 1})": difference("q", i, j, data) for i, j in coupled}
+    for name in lengths(data.angles):
+        form, mark, power = name.partition("^")
+        if len(_coordinates(name, data.angles)) == 1:
+            own[name] = name
+        elif form in between:
+            own[name] = between[form] + mark + power
+    return tuple(own.values())
+
+
+def difference(x: str, i: int, j: int, data: Trajectories) -> str:
+    """The text of the difference of two coordinates or speeds; coordinates of different units count by their size.
+
+    A spring between a metre and a degree would be that of the metre alone, and what it does to the angle a small
+    difference of large terms.
+    """
+    ratio = "" if data.units[i] == data.units[j] else f"{float(data.balance[j] / data.balance[i]):.3g} "
+    return f"({ratio}{x}{i + 1} - {x}{j + 1})"
 
 
 def groups(features: Collection[str], angles: Sequence[bool]) -> list[list[int]]:

@@ -166,9 +166,10 @@ def _seen(
 
 
 def _needs_probe(seen: Look) -> bool:
-    """Whether the objective depends on the noise, which a probe measures."""
-    c = seen.settings
-    return c.objective == "auto" and c.supervision == "q" and seen.baseline_motion is None and not c.sticking
+    """Whether the objective depends on the noise, which a probe measures; not where `look` looks again."""
+    c, again = seen.settings, seen.found is not None and bool(seen.found.reading)
+    plain = c.objective == "auto" and c.supervision == "q" and not c.sticking
+    return plain and seen.baseline_motion is None and not again
 
 
 def _other_holds(recorded: Trajectories, arrival: Arrival) -> tuple[str, ...]:
@@ -224,7 +225,7 @@ def _with_terms(
         def find() -> Structure:
             if few:
                 return known or search(kept, base, plain, outliers=seen.outliers, holds=holds)
-            return search_of_many(kept, base, plain, outliers=seen.outliers)
+            return search_of_many(kept, base, plain, outliers=seen.outliers, holds=holds)
 
         found = kept_structure("terms", find, base, settings, stages)
         seen = replace(seen, structure=found.reason, found=found)

@@ -459,6 +459,7 @@ class Search:
         forces = input_forces(terms)
         data = with_input_terms(self.data, input_columns(terms))
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        other = Search(data, base, replace(self.config, drag=forces), outliers=self.freedom is not None)
+        drag = (*self.config.drag, *forces)
+        other = Search(data, base, replace(self.config, drag=drag), outliers=self.freedom is not None)
         other.order = self.order
         return other

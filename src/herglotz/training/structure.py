@@ -1,7 +1,7 @@
 """The terms of several coordinates, found from the data.
 
 `search` finds named terms of one to three coordinates, which whole trajectories ask for, and `search_of_many` those of
-more noisy lengths. Where no search is made, or it finds none, `structured` takes a dictionary of features. Every planar
+more coordinates. Where no search is made, or it finds none, `structured` takes a dictionary of features. Every planar
 chain of revolute joints, in absolute or relative angles, has its mass and its weight in the dictionary `revolute`
 (`herglotz.models.features`); coordinates without an angle among them have constant masses of their own, and springs,
 powers and distances in the dictionary `lengths`. Either starts as a linear problem (`linear_start`). For joints the
@@ -24,11 +24,13 @@ from herglotz.data import Trajectories
 from herglotz.data.noise import precision, roughness
 from herglotz.data.sensors import measured
 from herglotz.data.units import common_unit, size
+from herglotz.models.drag import input_columns
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
-from herglotz.training.baseline import Baseline
+from herglotz.training.acting_inputs import asked_terms
+from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.coupled_pairs import coupled_pairs, terms_between
+from herglotz.training.coupled_pairs import coupled_pairs, difference, terms_between
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.distributed import of_first
 from herglotz.training.found_model import settings as settings_of_trial
@@ -122,12 +124,13 @@ def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 
 def many_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
-    """Whether `search_of_many` may choose: more coordinates than `search` takes, no angle, and nothing named.
+    """Whether `search_of_many` may choose: more coordinates than `search` takes, and nothing named.
 
-    Data without noise, or with few samples a period, are not searched: their steps need a rule of order 4.
+    Exact positions on lines without inputs are not searched: one-step errors of order 4 tell their dictionary.
     """
-    c = user_settings
-    return structure_is_free(data, c) and data.dof > MOST and c.objective == "auto" and not is_precise(data)
+    c, driven = user_settings, data.u is not None and user_settings.use_inputs
+    noisy = driven or any(data.angles) or not is_precise(data)
+    return _nothing_named(c) and data.dof > MOST and c.objective == "auto" and noisy
 
 
 def _nothing_named(c: FitConfig) -> bool:
@@ -148,7 +151,7 @@ def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
     names = tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
     springs = tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))
     coupled = coupled_pairs(data) if data.dof > MOST else None
-    return [names, *([] if coupled is None else [terms_between(coupled, data.angles)]), springs]
+    return [names, *([] if coupled is None else [terms_between(coupled, data)]), springs]
 
 
 def kept_structure(
@@ -210,26 +213,49 @@ def search(
     )
 
 
-def search_of_many(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
-    """The named terms of many coordinates at the noise of whole trajectories; unchanged if no terms are.
+def search_of_many(
+    data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool, holds: Sequence[str] = ()
+) -> Structure:
+    """The named terms of many coordinates that meet whole trajectories; unchanged if no terms do.
 
-    Offers leave the model of all offers of `search_between_coupled`.
+    Offers leave the model of all offers of `search_between_coupled`. Where that misses the data, inputs are tried with
+    these other `holds`, then their terms are offered. Angles are taken for positions on a line: no dictionary has the
+    terms of so many joints.
     """
 
     def without(reason: str) -> Structure:
         return Structure(config, base, f"no dictionary of terms: {reason}")
 
-    data, own = data.to(torch.float64, "cpu"), replace(base, low=base.low.double().cpu(), high=base.high.double().cpu())
+    data = data.to(torch.float64, "cpu")
+    own, turning = replace(base, low=base.low.double().cpu(), high=base.high.double().cpu()), any(data.angles)
+    if turning:
+        data = replace(data, angles=(False,) * data.dof)
+        own = estimate_baseline(data, outliers=outliers)
     wanted = search_between_coupled(data, own, config, outliers=outliers)
     if isinstance(wanted, str):
         return without(wanted)
-    found = wanted.part.full
-    found = found and wanted.part.settled(found)
+    found, hold, terms = _pared_down(wanted), "", ()
+    if found is not None and (hold := wanted.part.better_hold(found, holds)):
+        wanted = wanted.of(replace(wanted.data, hold=hold))
+        found = _pared_down(wanted)
+    if found is not None and data.u is not None and (terms := asked_terms(wanted.part, found)):
+        wanted = wanted.driven_by(terms)
+        found = _pared_down(wanted)
     if wanted.part is not wanted:
         found = wanted.of_part(found, None)[1]
-    if found is None or not found.at_the_noise:
+    if found is None or not (found.at_the_noise or found.misses_next_to_nothing):
         return without("the terms of one coordinate and of two miss the data by more than the noise")
-    return _of_trial(found, data, wanted.config, config, base, wanted.part)
+    if turning:
+        # `look` searches again, with positions on a line, whose inputs and sizes differ.
+        return Structure(config, base, "terms of positions on a line meet the data", turning=False)
+    plain = _of_trial(found, data, wanted.config, config, base, wanted.part)
+    return plain._replace(hold=hold, input_terms=input_columns(terms))
+
+
+def _pared_down(search: Search) -> Trial | None:
+    """The model of a part that is left of all offers; None if no path is found."""
+    every = search.part.full
+    return every and search.part.settled(every)
 
 
 def search_between_coupled(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Search | str:
@@ -240,7 +266,7 @@ def search_between_coupled(data: Trajectories, base: Baseline, config: FitConfig
     """
     if (coupled := coupled_pairs(data)) is None:
         return "too few samples to find which coordinates are coupled"
-    terms, dampers = terms_between(coupled, data.angles), tuple(f"(v{i + 1} - v{j + 1})" for i, j in coupled)
+    terms, dampers = terms_between(coupled, data), tuple(difference("v", i, j, data) for i, j in coupled)
     offered = replace(config, dtype="float64", device="cpu", level="forced", features=terms)
     tried = (Search(data, base, replace(offered, drag=drag), outliers=outliers) for drag in (dampers, ()))
     found = next((x for x in tried if len(x.fitter(Variant(x.order)).start) <= MAX_PARAMETERS), None)

@@ -167,11 +167,15 @@ class Trial:
         """True if the misfit of the segments is about the noise of the data."""
         return self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
 
+    @property
+    def misses_next_to_nothing(self) -> bool:
+        """True if the misfit of whole trajectories is too small to matter."""
+        return self.whole and self.rms <= EXACT_ENOUGH * self.fitter.spread
+
     @cached_property
     def lacks_nothing(self) -> bool:
         """True if the misfit of whole trajectories is about the noise and white, or too small to matter."""
-        small = self.rms <= EXACT_ENOUGH * self.fitter.spread
-        return self.at_the_noise and (small or are_white(self.problem, self.path))
+        return self.at_the_noise and (self.misses_next_to_nothing or are_white(self.problem, self.path))
 
     @cached_property
     def _held_out(self) -> HeldOut:

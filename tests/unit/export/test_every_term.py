@@ -61,7 +61,8 @@ CASES: dict[str, tuple[str, Setting]] = {
     }),
     "lengths": ("ll", {
         "level": "forced", "diagonal": True, "coulomb": True, "sticking": True, "features": ("lengths", "q1 v1^2 v2"),
-        "drag": ("|v| v", "(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 v2", "(v1 - v2)^3", "|v2|", "sin(0.8 (v1 - v2))"),
+        "drag": ("|v| v", "(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 v2", "(v1 - v2)^3", "|v2|", "sin(0.8 (v1 - v2))",
+                 "(0.4 v1 - v2)"),
     }),
     "one distance and one field": ("ll", {
         "level": "conservative", "alike": True, "features": ("r^-1", "q1 v2 - q2 v1"), "known": ("0.3 q1^2",),

@@ -73,10 +73,10 @@ MODELS: dict[str, tuple[dict[str, Any], dict[str, list[float]]]] = {
     "two masses": (
         {"angles": (False, False), "stiffness": (1.0, 0.5), "diagonal": True, "known": ("0.4 (q1 - q2)^2",),
          "coulomb": True, "level": "forced",
-         "drag": ("(v1 - v2)", "|v1| v1", "q2^2 v2", "q1^2 sgn(v1)", "|v| v", "sin(1.7 (v1 - v2))")},
+         "drag": ("(v1 - v2)", "|v1| v1", "q2^2 v2", "q1^2 sgn(v1)", "|v| v", "sin(1.7 (v1 - v2))", "(0.4 v1 - v2)")},
         {"kinetic.log_diagonal": [0.3], "friction.viscous": [0.05, 0.1], "friction.coulomb": [0.05, 0.1],
          "friction.breakaway": [0.1, 0.05], "friction.log_smooth": [-1.5, -1.2], "friction.log_stribeck": [-1.0, -0.8],
-         "drag.coefficient": [0.1, 0.15, 0.2, 0.1, 0.1, 0.1]},
+         "drag.coefficient": [0.1, 0.15, 0.2, 0.1, 0.1, 0.1, 0.2]},
     ),
     "a joint that sticks": (
         {"angles": (True,), "level": "forced", "coulomb": True, "sticking": True, "inputs": 1, "input_zero": True,

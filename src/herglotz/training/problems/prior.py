@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch.func import jacrev, vmap
 from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
 from herglotz.models.jet import coordinates
-from herglotz.models.terms import AffineDamping
+from herglotz.models.terms import AffineDamping, mass_matrix
 from herglotz.training.baseline import Baseline
 from herglotz.training.dictionary import keys_of
 from herglotz.training.parameter_vector import ParameterVector
@@ -55,11 +56,11 @@ class Prior:
     * The damping's network G(q̄, v) (affine level) has there an RMS of N(0, (τ r)²), r the typical rate of the motion.
     * Every network weight is N(its start, `weight`²), a weak prior against drift of undetermined weights. (Centred at 0
       it would switch the network off: with a last layer that starts at 0, only the prior acts on the first layer.)
-    * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
-      friction (the first mass is 1) are N(their start, `rate_spread`²), and with `wide_rates` the first three at least
-      N(start, start²): the damping rate of a falling body is many times the rate of its fall. Dry friction is
-      N(0, (`rate_spread` speed)²), its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their
-      start, 0.5²).
+    * The damping rate, the drag coefficients (per unit of position) and the rates of the full level's units are N(their
+      start, `rate_spread`²), with `wide_rates` at least N(start, start²): the damping rate of a falling body is many
+      times the rate of its fall. Viscous friction over the mass of its coordinate is N(0, `rate_spread`²), dry friction
+      over that mass and the speed of the coordinate, too. The excess at breakaway is N(0, (0.01 F)²), and the
+      logarithms of the widths of dry friction are N(their start, 0.5²).
     * A `herglotz.models.Term` has its own spread, and the waves of functions have `spreads`, around 0.
     """
 
@@ -94,6 +95,8 @@ class Prior:
             own, features = model.potential.baseline(self.grid, 1).gradient, model.potential.features
             if features is not None and not bool(own.any()):
                 own = features(self.grid, 1).gradient
+            # Masses of the coordinates at the start: the first one is 1, and the others have the units of the data.
+            self.mass = mass_matrix(model.kinetic, self.grid).diagonal(0, -2, -1).abs().mean(0)
         # RMS force of the baseline.
         self.force = float(own.square().mean().sqrt()) or 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
@@ -135,8 +138,8 @@ class Prior:
         spreads = [
             (self._index(*NETWORKS), weight),
             (self._index("damping.rate", "damping.drag", "action.rate"), rate_spread),
-            (self._index("friction.viscous"), rate_spread * (SPLIT if len(model.config.scale) == 1 else 1.0)),
-            (self._index("friction.coulomb"), rate_spread * max(model.config.speed)),
+            self._each("friction.viscous", rate_spread * self.mass * (SPLIT if len(self.mass) == 1 else 1.0)),
+            self._each("friction.coulomb", rate_spread * self.mass * self.mass.new_tensor(model.config.speed)),
             (self._index("friction.breakaway"), BREAKAWAY * self.force),
             (self._index("friction.log"), WIDTH),
             *(
@@ -147,7 +150,14 @@ class Prior:
             *((torch.tensor([i]), spread) for i, spread in self.waves.items()),
         ]
         index = torch.cat([index for index, _ in spreads]).to(self.start.device)
-        return index, torch.cat([self.start.new_full((len(index),), spread) for index, spread in spreads])
+        own = [torch.as_tensor(spread).to(self.start).expand(len(index)) for index, spread in spreads if len(index)]
+        return index, torch.cat(own)
+
+    def _each(self, prefix: str, spreads: Tensor) -> tuple[Tensor, Tensor]:
+        """Places of the numbers of a parameter that has one for each coordinate, and their spreads out of (n,)."""
+        index = self._index(prefix)
+        places = [re.search(r"\[(\d+)\]", self.parameters.numbers[i]) for i in index.tolist()]
+        return index, spreads[[int(place[1]) if place else 0 for place in places]]
 
     def _index(self, *prefixes: str) -> Tensor:
         return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
