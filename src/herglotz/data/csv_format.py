@@ -188,12 +188,12 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
 
     **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
     The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
-    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says where the end of
-    a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
-    of their own below the header. Other lines that start with # and blank lines are skipped, except for these comments:
-    `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples, `# delay: 0.004` and `# lag: 0.02`
-    are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5` make
-    q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
+    `name in unit`, `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says
+    where the end of a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units
+    may stand in a row of their own below the header. Other lines that start with # and blank lines are skipped, except
+    for these comments: `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples,
+    `# delay: 0.004` and `# lag: 0.02` are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and
+    `# scale: 1 0.5` make q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
 
     **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` `millis`, `micros`, which say their unit, or the only
     column in a unit of time is the time; of several such columns, the one that increases. So is the stamp of a message
@@ -208,7 +208,9 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs, and so is a pulse width (`pwm [us]`); m/s, rad/s, rpm
     rates; rates are left aside, and so are °C, Pa, W, and, unless no other column is a coordinate, Wb, T, H and F. A
     set value of a motion is an input in any unit: goal, target, set point, desired, reference, command, soll; so is
-    what shakes a mechanism: road, ground, excitation, Erregung. Without a unit `u`, `u1`, `u_*`, `F`, force, torque,
+    what shakes a mechanism: road, ground, excitation, Erregung; a floor, unless it has a number or a base or a ground
+    is recorded, too: then it is a storey. A share of a nominal value (pu) is an input, unless its name is that of a
+    position or a rate. Without a unit `u`, `u1`, `u_*`, `F`, force, torque,
     tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors, temperatures, batteries,
     counters (`index`, `frame`, a first column without a name) and filtered copies of another column (`theta_filt`) are
     left aside; every other column is a coordinate. A coordinate in rad is taken for an angle. A warning names every
