@@ -177,8 +177,9 @@ def _by_kind(key: str, unit: str, words: frozenset[str], others: Collection[str]
     kind = kind_of(unit)
     if kind in ("", "share"):
         guess = _by_words(key, words, others)
-        # A share acts, as percents do, unless its name is that of a position or a rate.
-        return Guess("input", BY_UNIT) if kind and guess.role == "q" and not is_usual(key, "") else guess
+        # A share acts, as percents do, unless its name is that of a position or a rate; Q is a reactive power.
+        is_place = not kind or KNOWN.fullmatch(key) or words & WORDS["position"]
+        return guess if guess.role != "q" or is_place else Guess("input", BY_UNIT)
     return _in_place(key, unit, words, others) if kind == "position" else _by_unit(key, kind, words)
 
 

@@ -234,7 +234,7 @@ def test_a_share_of_a_nominal_value_is_no_position():
     assert " ".join(roles(header)) == "coordinate left aside input input input"
     (said,) = assign(header.split(","), "header").notes
     assert said == "warning: Pm, Pe, Vt are taken for inputs, but by their units alone; else give --drop Pm,Pe,Vt"
-    assert " ".join(roles("t,x_pu,u[pu],s[pu],torque[pu]")) == "coordinate input input input"
+    assert " ".join(roles("t,x_pu,u[pu],s[pu],torque[pu],Q[pu]")) == "coordinate input input input input"
 
 
 @pytest.mark.parametrize(
