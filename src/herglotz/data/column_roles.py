@@ -2,7 +2,7 @@
 
 An explicit unit decides the role first, then the words of the name.
 
-Names and units of a header's cells: `x[m]`, `x (m)`, `x(m)`, `x/m`, `v/(m/s)`, `x_mm` and `angleDeg`.
+Names and units of a header's cells: `x[m]`, `x (m)`, `x(m)`, `x/m`, `v/(m/s)`, `x in m`, `x_mm` and `angleDeg`.
 
 A slash stands before a known unit (ISO 80000-1: a quantity over its unit), unless another column has the same name
 before a slash: `arm/A` beside `arm/B` is a path. A unit of time stands behind the name of a time alone, unlike `x/s`.
@@ -22,23 +22,25 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 from unicodedata import combining, normalize
 
 ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|[Gg]rad|degrés|grados|gradi|gon|revs?|turns?|arcmin|arcsec")
-# Kinds of units, in the order of trial. With other units, such as counts or 1, the name decides the role.
+# Kinds of units, in the order of trial. With other units, such as counts or 1, and shares, the name decides the role.
 KINDS = {
     "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch(es)?|ft|feet|mils?|thou|px|pixels?"),
     "time": re.compile(r"s|ms|us|µs|μs|ns|min|h|secs?|seconds?|msec|usec"),
     "effort": re.compile(
         r"[kmMµμ]?N([ *·.⋅-]?[cm]?m)?|kgf|lbs?|(lbf?|ozf?)([ *·.⋅-]?(ft|in))?|(ft|in)[ *·.⋅-]?(lbf?|ozf?)"
     ),
-    "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|volts?|amps?|%|percent"),
+    "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|volts?|amps?|%|percent|pct"),
     "field": re.compile(r"[mµμun]?(Wb|T)|V[ *·⋅]s|[mµμun]?H|[mµμunp]F"),
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi|s?lpm|gpm|(m?[lL]|m3|m³)/ ?(s|min|h)"),
     "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
     "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|(.+[ ·*])?(s|min)(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
+    # A share of a nominal value, as of electric machines.
+    "share": re.compile(r"pu|PU|p\.u\.?"),
     "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|VA|m?[AW]h|bool"),
 }
 NUMBERED = r"(_?\d+|_.*)?"
@@ -65,7 +67,7 @@ ROLES = {
 SYMBOL = r"(?:[qxyzr]|theta|phi|psi|alpha|beta|gamma|th|θ|φ|ϕ|ψ|α|β|pos|position|angle|joint|roll|pitch|yaw)"
 RATE = re.compile(
     rf"v\d*|[va]_[xyz]|(.+_)?[vaw][xyz]|d?d?{SYMBOL}_?\d*_?(d?dot|vel|velocity|speed|rate|acc)(_?\d+)?|{SYMBOL}_?d?d_?\d+|{SYMBOL}dd"
-    rf"|dd?_?{SYMBOL}{NUMBERED}|d\d?.+?_?/?dt(\^?2)?|(vel|acc|gyro)[xyz]\d*"
+    rf"|dd?_?{SYMBOL}{NUMBERED}|d\d?.+?_?/?dt(\^?2)?|(vel|acc|gyro|gf)[xyz]\d*"
 )
 # Letters of velocities and accelerations, unless the unit is that of a position.
 LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")
@@ -73,10 +75,10 @@ LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")
 DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")
 # Usual names of coordinates.
 KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")
-# The last part of a German compound decides, Motorstrom, Winkelgeschwindigkeit, or a first part for an excitation:
-# Erregerwinkel.
+# The last part of a German compound decides, Motorstrom, Winkelgeschwindigkeit, or a first part for an excitation or a
+# goal: Erregerwinkel, Zielwinkel.
 COMPOUND = re.compile(
-    "^(?:erreger|anregung(?=s))(?=.)|(?<=.)(?:winkel|kraft|moment|strom|spannung|drehzahl|geschwindigkeit|beschleunigung"
+    "^(?:erreger|ziel|anregung(?=s))(?=.)|(?<=.)(?:winkel|kraft|moment|strom|spannung|drehzahl|geschwindigkeit|beschleunigung"
     "|fehler|temperatur|zeit|erregung|anregung)$"
 )
 # A column that was filtered from another: theta_filt beside theta, x_smoothed beside x_raw.
@@ -90,8 +92,9 @@ COPY = re.compile(
 # places that may do so.
 _WORDS = {
     "goal": "goal target setpoint setpoints sp desired des reference ref command commands commanded cmd demand "
-            "demanded wanted vorgabe fuhrungsgrosse fuehrungsgroesse consigne commande consigna referencia riferimento "
-            "comando",
+            "demanded wanted vorgabe fuhrungsgrosse fuehrungsgroesse ziel gewunscht consigne commande cible desire "
+            "desiree consigna referencia objetivo deseado deseada riferimento comando obiettivo desiderato desiderata "
+            "desejado desejada gewenst gewenste zadany zadana",
     "side": "error err std sd stderr variance var covariance cov uncertainty residual quality confidence likelihood "
             "temperature temp temperatur temperatura battery batt supply humidity status statusword statuswort valid "
             "checksum crc power leistung puissance potencia potenza fehler regelabweichung erreur errore reward done",
@@ -103,15 +106,22 @@ _WORDS = {
     "angle": "theta phi psi angle alpha beta gamma roll pitch yaw winkel angulo angolo θ φ ϕ ψ α β",
     "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle kraft drehmoment moment "
               "strom spannung couple courant tension fuerza corriente voltaje coppia corrente forza tensione grf",
-    "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse",
+    "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse "
+                 "eingang eingangssignal entree entrada ingresso",
     "reading": "pot potentiometer lvdt encoder laser",
     "excitation": "road ground floor shaker exciter excitation erreger erregung anregung excitateur excitador "
-                  "excitacion eccitazione disturbance seismic",
+                  "excitacion eccitazione disturbance seismic quake earthquake erdbeben seisme terremoto boden sol "
+                  "suelo suolo",
     "support": "base pivot support platform fusspunkt fundament",
 }  # fmt: skip
 WORDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
-GIVEN = frozenset(("input", "inputs", "control", "controls"))
-BY_NAME = "by its name alone"
+# Words that call a column an input; so does `in` beside a column `out`, where it is no inch and no preposition.
+GIVEN = frozenset(("input", "inputs", "control", "controls", "eingang", "entree", "entrada", "ingresso"))
+ACCELERATION = frozenset(("acceleration", "acc", "accel", "beschleunigung", "aceleracion", "accelerazione"))
+# A floor shakes what stands on it, unless it is a storey.
+STOREY = "floor"
+BY_NAME, BY_UNIT = "by its name alone", "by its unit alone"
+MOVED = "it may be moved from outside"
 READING = "it may be the reading of a position"
 
 
@@ -122,10 +132,14 @@ class Guess(NamedTuple):
     doubt: str = ""
 
 
-def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
-    """The role of a column by its own name and unit; `others` are the names of all columns: dx is the rate of x."""
+def role_of(name: str, unit: str, others: Collection[str] = (), shaken: bool = False) -> Guess:
+    """The role of a column by its own name and unit.
+
+    `others` are the names of all columns: dx is the rate of x. `shaken` says whether what shakes a structure is among
+    them (`is_shaken`): its floors are storeys then.
+    """
     name, others = plainly(name), [plainly(other) for other in others]
-    guess = _own_role(name, unit, others)
+    guess = _own_role(name, unit, others, shaken)
     copy = COPY.fullmatch(name.casefold()) if guess.role == "q" else None
     base = copy and (copy["before"] or copy["behind"])
     # The other column, or its raw values.
@@ -134,12 +148,16 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
     return guess
 
 
-def _own_role(name: str, unit: str, others: Collection[str]) -> Guess:
+def _own_role(name: str, unit: str, others: Collection[str], shaken: bool) -> Guess:
     """The role of a column that is no filtered copy of another."""
     kind = kind_of(unit)
     # "Time" means time, but a single "V" may be a volume.
     key = name.casefold() if len(name) > 1 else name
     words = words_of(name)
+    numbered = re.search(rf"{STOREY}[ _-]?\d|\d[ _-]?{STOREY}", key)
+    if STOREY in words and (shaken or numbered):
+        guess = _by_kind(key, unit, words - {STOREY}, others)
+        return Guess("q", MOVED) if guess == Guess("q") and not numbered else guess
     if whole := _whole(key, kind):
         # An input in the unit of a position that only its letter u names.
         letter = kind == "position" and re.fullmatch(r"u_?([xyz]|\d*)", key)
@@ -151,9 +169,26 @@ def _own_role(name: str, unit: str, others: Collection[str]) -> Guess:
     if DESIRED.fullmatch(key) and kind in ("", "position"):
         role = "input" if kind else "dropped"
         return Guess(role, "it may be a desired value or a derivative")
-    if not kind:
-        return _by_words(key, words, others)
+    return _by_kind(key, unit, words, others)
+
+
+def _by_kind(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
+    """The role of a column that is no set point, by the kind of its unit."""
+    kind = kind_of(unit)
+    if kind in ("", "share"):
+        guess = _by_words(key, words, others)
+        # A share acts, as percents do, unless its name is that of a position or a rate; Q is a reactive power.
+        is_place = not kind or KNOWN.fullmatch(key) or words & WORDS["position"]
+        return guess if guess.role != "q" or is_place else Guess("input", BY_UNIT)
     return _in_place(key, unit, words, others) if kind == "position" else _by_unit(key, kind, words)
+
+
+def is_shaken(heads: Iterable[tuple[str, str]]) -> bool:
+    """Whether a column of these names and units has the motion of a ground, a shaker or a base, beside any floors."""
+    return any(
+        words & (WORDS["excitation"] | WORDS["support"]) - {STOREY} and role_of(name, unit).role == "input"
+        for name, unit in heads if not is_effort(words := words_of(name), unit)
+    )  # fmt: skip
 
 
 def kind_of(unit: str) -> str:
@@ -227,6 +262,13 @@ def is_usual(name: str, unit: str) -> bool:
     return kind_of(unit) == "position" or bool(usual)
 
 
+def may_be_place(name: str, unit: str) -> bool:
+    """Whether a column is none of an acceleration, a rate, a force and a share of a nominal value."""
+    kind = kind_of(unit)
+    by_name = kind or not words_of(name) & WORDS["rate"]
+    return bool(by_name) and kind not in ("acceleration", "rate", "effort", "share")
+
+
 def plainly(name: str) -> str:
     """A name with its numbers out of their brackets: q[0] has the role of q0."""
     return re.sub(r"\[(\d+)\]", r"\1", name)
@@ -239,8 +281,7 @@ def words_of(name: str) -> frozenset[str]:
     """
     parts = re.findall(r"[^\W\d_]+", name)
     found = [word for part in parts for word in re.findall(r"[A-ZÄÖÜ]?[^A-ZÄÖÜ]+|[A-ZÄÖÜ]+(?![^A-ZÄÖÜ])", part)]
-    folded = ("".join(x for x in normalize("NFD", word.casefold()) if not combining(x)) for word in found)
-    words = frozenset(folded)
+    words = frozenset(map(_folded, found))
     return words | {part for word in words for part in COMPOUND.findall(word)}
 
 
@@ -250,25 +291,30 @@ def _whole(key: str, kind: str) -> str:
     if key in UNITS_OF_TIME:
         return role if kind in ("", "time") else ""
     if role in ("action", "momentum"):
-        return "" if kind in ("position", "pressure", "other") else role
+        return "" if kind in ("position", "pressure", "share", "other") else role
     if role == "trajectory":
         return "" if kind else role
-    meant = kind in ("", "effort", "electric") or (kind == "position" and key[0] == "u")
+    meant = kind in ("", "effort", "electric", "share") or (kind == "position" and key[0] == "u")
     return "" if role == "input" and not meant else role
 
 
 def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
     """The role of a column in the unit of a position: a coordinate, unless the name is usual for an excitation."""
-    # A tendon input is an input, and an input shaft is a shaft.
-    if _last(key) in GIVEN:
-        return Guess("input", "it has the unit of a position")
+    # A tendon input is an input, and so is the input x beside x; an input shaft is a shaft.
+    if given := _given(key, others):
+        rest = [word for word in _in_order(key) if word not in given]
+        same = any(_in_order(other) == rest for other in others)
+        if same or not rest or _last(key) in given:
+            return Guess("input", "it has the unit of a position")
     if _is_rate(key, words, others, "position"):
         return Guess("rate", "it has the unit of a position")
     if words & WORDS["excitation"]:
         return Guess("input", BY_NAME)
     moved = words & WORDS["support"] and not ANGLES.fullmatch(unit)
     alone = words <= WORDS["support"] | WORDS["position"]
-    return Guess("input", BY_NAME) if moved and alone else Guess("q", "it may be moved from outside" if moved else "")
+    if moved:
+        return Guess("input", BY_NAME) if alone else Guess("q", MOVED)
+    return Guess("q", "its name may be that of an input" if given else "")
 
 
 def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
@@ -289,24 +335,42 @@ def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
 
 def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess:
     """The role of a column whose unit does not decide."""
-    shaken = words & {"acceleration", "acc", "accel"} and words & WORDS["support"]
+    shaken = words & ACCELERATION and words & WORDS["support"]
     if shaken or words & WORDS["excitation"]:
         return Guess("input", "" if words & WORDS["effort"] else BY_NAME)
     if is_timed(words):
         return Guess("dropped")
     if _is_rate(key, words, others, ""):
         return Guess("rate")
-    attribute = words & WORDS["attribute"]
+    given = _given(key, others)
+    attribute = words & (WORDS["attribute"] | given)
     if words & (WORDS["position"] | WORDS["reading"]) and not words & WORDS["effort"]:
-        return Guess("q", "its name may be that of an input" if words & GIVEN else "")
+        return Guess("q", "its name may be that of an input" if given else "")
     if attribute and re.fullmatch(SYMBOL, _last(key)):
         return Guess("q", "its name may be that of an input")
-    return Guess("input" if attribute or words & WORDS["effort"] else "q")
+    return Guess("input" if attribute or words & WORDS["effort"] else "q", BY_NAME if attribute == {"in"} else "")
+
+
+def _in_order(name: str) -> list[str]:
+    """The parts of a name in their order, in lower case, without numbers and accents."""
+    return re.findall(r"[^\W\d_]+", _folded(name))
+
+
+def _folded(text: str) -> str:
+    """A text in lower case and without accents."""
+    return "".join(x for x in normalize("NFD", text.casefold()) if not combining(x))
 
 
 def _last(key: str) -> str:
     """The last word of a name, without a number behind it; "" for a name without letters."""
-    return next(reversed(re.findall(r"[^\W\d_]+", key)), "")
+    return next(reversed(_in_order(key)), "")
+
+
+def _given(key: str, others: Collection[str]) -> frozenset[str]:
+    """The words of a name that call it an input; `in` does beside a column `out`."""
+    words = frozenset(_in_order(key))
+    beside = any({"out", "output"}.intersection(_in_order(other)) for other in others)
+    return words & (GIVEN | {"in"} if beside else GIVEN)
 
 
 def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:
@@ -325,6 +389,8 @@ ELEMENT = re.compile(r"(.+)\[(\d+)\]\s*")
 TIGHT = re.compile(r"([^()]+)\(([^()]+)\)")
 # A quantity over its unit: t/s, phi / °, v/(m/s).
 SLASH = re.compile(r"([^/\[\]()]+?)\s*/\s*(?:[\[(](.+)[\])]|([^\[\]()]+?))\s*")
+# A quantity in its unit: Weg in mm, angle en °.
+WITHIN = re.compile(r"(.+?)\s+(?:in|en)\s+(\S+)\s*")
 # Units that are read in any case, and as the last word of a name in camel case.
 CASELESS = re.compile(r"(?:deg|rad)(?:/s2?)?|mm|rpm|s|ms|us|ns|min", re.I)
 # A name, and a unit of two parts or one at its end. The momentum of x_deg is p_x_deg.
@@ -347,8 +413,8 @@ def name_and_unit(cell: str) -> tuple[str, str] | None:
         return None
     if (element := ELEMENT.fullmatch(cell)) and element[2] != "1":
         return cell.strip(), ""
-    if slash := SLASH.fullmatch(cell):
-        name, unit = slash[1], slash[2] or slash[3]
+    for ends in filter(None, (SLASH.fullmatch(cell), WITHIN.fullmatch(cell))):
+        name, unit = filter(None, ends.groups())
         if kind_of(unit) and _is_timed(name) == (kind_of(unit) == "time"):
             return name, unit
     if match[2] is not None or match[3] is not None:

@@ -11,6 +11,8 @@ from typing import Any
 from herglotz.data.checks import quote
 from herglotz.data.column_roles import (
     BY_NAME,
+    BY_UNIT,
+    MOVED,
     READING,
     ROLES,
     Guess,
@@ -18,9 +20,11 @@ from herglotz.data.column_roles import (
     is_of_others,
     is_recorded_effort,
     is_set_point,
+    is_shaken,
     is_timed,
     is_usual,
     kind_of,
+    may_be_place,
     role_of,
     unit_of_time,
     words_of,
@@ -29,10 +33,26 @@ from herglotz.errors import InputError, refuse
 
 # Fields of `Wanted` that give columns a role, and the role.
 ROLE_OF_FIELD = {"time": "time", "group": "trajectory", "drop": "dropped", "coordinates": "q", "inputs": "input"}
+# The doubt about an acceleration that is left aside.
+OF_OTHERS = "no coordinate has its kind of unit, and it may be an input"
 # Roles by their names in the table of columns.
 AS_SHOWN = {
     "time": "time", "trajectory": "trajectory", "coordinate": "q", "input": "input", "left aside": "dropped",
 }  # fmt: skip
+# The doubts about several columns.
+MANY = {
+    BY_NAME: "by their names alone",
+    BY_UNIT: "by their units alone",
+    READING: "they may be the readings of positions",
+    OF_OTHERS: "no coordinate has their kind of unit, and they may be inputs",
+    "it may be an input": "they may be inputs",
+    MOVED: "they may be moved from outside",
+    "it has the unit of a position": "they have the unit of a position",
+    "its name may be that of an input": "their names may be those of inputs",
+    "its unit is none of a position": "their units are none of positions",
+    "it may be a desired value or a derivative": "they may be desired values or derivatives",
+    "it may be more than a filtered copy of another column": "they may be more than filtered copies of other columns",
+}
 # Names that a warning lists.
 MAX_LISTED = 5
 Names = str | Sequence[str]
@@ -240,13 +260,15 @@ def as_names(names: Names) -> Sequence[str]:
 
 def _guesses(names: Sequence[str], units: Sequence[str], wanted: Wanted) -> list[Guess]:
     """The role of every column; if no column is a coordinate, voltages of sensors are the coordinates."""
-    guesses = [_guess(name, unit, wanted, names) for name, unit in zip(names, units, strict=True)]
+    heads = list(zip(names, units, strict=True))
+    shaken = is_shaken(heads)
+    guesses = [_guess(name, unit, wanted, names, shaken) for name, unit in heads]
     if wanted.motion and wanted.coordinates is None and all(guess.role != "q" for guess in guesses):
         return [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
     return guesses
 
 
-def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Guess:
+def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str], shaken: bool) -> Guess:
     """The role that the user gives to a column, or else its role in another table, or else by its name and unit.
 
     The role is `dropped` if the user gives the found role to other columns.
@@ -254,7 +276,7 @@ def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Gue
     if own := wanted.role(name):
         return Guess(own)
     known = wanted.before(name)
-    guess = Guess(known) if known else role_of(name, unit, others)
+    guess = Guess(known) if known else role_of(name, unit, others, shaken)
     taken = [role for field, role in ROLE_OF_FIELD.items() if field != "drop" and getattr(wanted, field) is not None]
     return Guess("dropped") if guess.role in taken else guess
 
@@ -279,7 +301,7 @@ def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple
         if guess.doubt:
             doubts.setdefault(guess.doubt, []).append(i)
     if others := _accelerations_of_others(found, guesses, wanted):
-        doubts["no coordinate has its kind of unit, and it may be an input"] = others
+        doubts[OF_OTHERS] = others
     own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
     unusual = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
     # A single column without another role can only be the coordinate.
@@ -319,11 +341,11 @@ def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
     is_q, is_u = columns[0] in found.q, columns[0] in found.u
     names = [found.names[i] for i in columns]
     one = len(names) == 1
-    doubt = doubt if one or doubt != BY_NAME else "by their names alone"
+    doubt = doubt if one else MANY.get(doubt, doubt)
     few = ", ".join(names if len(names) <= MAX_LISTED else [*names[:MAX_LISTED], f"{len(names) - MAX_LISTED} more"])
     role = ("a coordinate" if one else "coordinates") if is_q else ("an input" if one else "inputs") if is_u else ""
-    # No acceleration and no force is a position.
-    places = [found.names[i] for i in columns if kind_of(found.units[i]) not in ("acceleration", "rate", "effort")]
+    # No acceleration, no force and no share of a nominal value is a position.
+    places = [name for i, name in zip(columns, names, strict=True) if may_be_place(name, found.units[i])]
     flags = {
         "inputs": ([] if is_u else names, found.u),
         "coordinates": ([] if is_q else places, found.q),

@@ -31,8 +31,8 @@ SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
 MAX_TITLE_LINES = 50
 # A line above the header that gives Excel the separator.
 EXCEL = "sep=(.|tab)?"
-# The last line of each of two preambles of LabVIEW's measurement files.
-LABVIEW = "***End_of_Header***"
+# The last line of each of two preambles of LabVIEW's measurement files, and the name of their columns of times.
+LABVIEW, LABVIEW_TIME = "***End_of_Header***", "X_Value"
 # 1,234.5 and 1,234,567
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
 # 1,250 is 1250 or 1.25; 0,250 is 0.25 alone.
@@ -62,7 +62,7 @@ def table_of(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
     in others, or commas that may separate thousands.
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
-    written, preamble = _without_preamble(written)
+    written, preamble = _without_preamble(path, written)
     lines_of, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
     lines_of, above = _without_titles(lines_of)
     notes += [*preamble, *above]
@@ -113,15 +113,35 @@ def _without_titles(rows: Lines) -> tuple[Lines, list[str]]:
     return rows[at:], [f"{at} line{plural} above the header, which is row {rows[at][0]}, left out"]
 
 
-def _without_preamble(written: Lines) -> tuple[Lines, list[str]]:
-    """The rows below the last line that ends a preamble of LabVIEW, whose column X_Value is a time in s; and a note."""
+def _without_preamble(path: Path, written: Lines) -> tuple[Lines, list[str]]:
+    """The rows below the last line that ends a preamble of LabVIEW, with one time, and a note.
+
+    X_Value is a time in s, which may stand before each channel; the last column may be of comments. Raise InputError if
+    channels have different times, or none.
+    """
     ends = [k for k, (_, line) in enumerate(written[:MAX_TITLE_LINES], 1) if line.startswith(LABVIEW)]
     if not ends or ends[-1] == len(written):
         return written, []
-    (row, header), *rows = written[ends[-1] :]
-    if header.split("\t")[0] == "X_Value":
-        header = header.replace("X_Value", "X_Value [s]", 1)
-    return [(row, header), *rows], [f"{ends[-1]} lines above the header, which is row {row}, left out"]
+    notes = [f"{ends[-1]} lines above the header, which is row {written[ends[-1]][0]}, left out"]
+    separator = "\t" if "\t" in written[ends[-1]][1] else ","
+    (row, heads), *rows = [(i, cells_of(line, separator)) for i, line in written[ends[-1] :]]
+    if heads[0] != LABVIEW_TIME:
+        return written[ends[-1] :], notes
+    times = [k for k, name in enumerate(heads) if name == LABVIEW_TIME]
+    for i, cells in rows:
+        seen = {cells[k] for k in times if k < len(cells)}
+        one = "save them with one column of times (X_Columns: One)"
+        refuse({
+            f"{path}, row {i}: {LABVIEW_TIME} is blank; {one}": seen == {""},
+            f"{path}, row {i}: channels have different times, {' and '.join(map(quote, sorted(seen)))}; {one}, or a "
+            "file for each channel": len(seen) > 1,
+        })  # fmt: skip
+    remarks = heads[-1] == "Comment" and not any(cells[-1] for _, cells in rows if len(cells) == len(heads))
+    left_out = {*times[1:], *([len(heads) - 1] if remarks else [])}
+    lines = [(row, [f"{LABVIEW_TIME} [s]", *heads[1:]]), *rows]
+    return [
+        (i, separator.join(cell for k, cell in enumerate(cells) if k not in left_out)) for i, cells in lines
+    ], notes  # fmt: skip
 
 
 def _has_time(line: str, separator: str) -> bool:
@@ -188,12 +208,12 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
 
     **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
     The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
-    `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says where the end of
-    a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units may stand in a row
-    of their own below the header. Other lines that start with # and blank lines are skipped, except for these comments:
-    `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples, `# delay: 0.004` and `# lag: 0.02`
-    are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5` make
-    q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
+    `name in unit`, `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says
+    where the end of a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units
+    may stand in a row of their own below the header. Other lines that start with # and blank lines are skipped, except
+    for these comments: `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples,
+    `# delay: 0.004` and `# lag: 0.02` are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and
+    `# scale: 1 0.5` make q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).
 
     **Roles.** `t`, `time`, `timestamp`, `Zeit`, `temps`, `tiempo` `millis`, `micros`, which say their unit, or the only
     column in a unit of time is the time; of several such columns, the one that increases. So is the stamp of a message
@@ -208,7 +228,9 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     m, mm, mil, px are positions; N, Nm, lb, A, V, % inputs, and so is a pulse width (`pwm [us]`); m/s, rad/s, rpm
     rates; rates are left aside, and so are °C, Pa, W, and, unless no other column is a coordinate, Wb, T, H and F. A
     set value of a motion is an input in any unit: goal, target, set point, desired, reference, command, soll; so is
-    what shakes a mechanism: road, ground, excitation, Erregung. Without a unit `u`, `u1`, `u_*`, `F`, force, torque,
+    what shakes a mechanism: road, ground, excitation, Erregung; a floor, unless it has a number or a base or a ground
+    is recorded, too: then it is a storey. A share of a nominal value (pu) is an input, unless its name is that of a
+    position or a rate. Without a unit `u`, `u1`, `u_*`, `F`, force, torque,
     tau, voltage, motor are inputs; `v`, `vx`, velocity, `*_dot`, `dx`, `qd1` rates; errors, temperatures, batteries,
     counters (`index`, `frame`, a first column without a name) and filtered copies of another column (`theta_filt`) are
     left aside; every other column is a coordinate. A coordinate in rad is taken for an angle. A warning names every
@@ -270,8 +292,10 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     """Write trajectories so that `read_csv` returns the same numbers, bit for bit, atomically.
 
     `comments` become lines that start with #. Positions that were not read are NaN. A coordinate in rad that is not an
-    angle is written too, although `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit
-    cannot stand in the header, because of a comma or because the name means another column.
+    angle is written too, although `read_csv` reads it as an angle; and so are numbers that `read_csv` takes for marks
+    of missing readings (`herglotz.data.marks`): a set that holds -999 among millimetres comes back from .npz. Raise
+    InputError if a coordinate's name or a unit cannot stand in the header, because of a comma or because the name means
+    another column.
     """
     header, table = _table(trajectories)
     _check_header(Path(path), header, trajectories)

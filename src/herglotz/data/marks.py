@@ -74,13 +74,13 @@ def is_usual(value: float) -> bool:
 
 def without_marks(
     values: np.ndarray,  # (N, k) numbers, the time first, NaN for a missing value
-    labels: Sequence[str],  # (N,) recording of each row
+    labels: Sequence[str | int],  # (N,) recording of each row
     at: Sequence[int],  # (N,) number of each row in the file
     columns: Sequence[tuple[int, str, bool]],  # place among the k, name, whether an input
 ) -> tuple[np.ndarray, list[str]]:
     """The numbers with NaN for marks of missing readings, and a warning for each mark."""
     values, notes = values.copy(), []
-    together = (np.diff(values[:, 0]) > 0) & (np.array(labels[1:]) == np.array(labels[:-1]))
+    together = (values[1:, 0] > values[:-1, 0]) & (np.array(labels[1:]) == np.array(labels[:-1]))
     for k, name, is_input in columns:
         for mark in marks_of(values[:, k], together, is_input):
             rows = np.flatnonzero(values[:, k] == mark)

@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -15,6 +16,9 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, EXACT, quote
 from herglotz.data.files import PathLike, read_bytes, write_atomically
+from herglotz.data.gaps import with_missing
+from herglotz.data.holds import last_read
+from herglotz.data.marks import without_marks
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 from herglotz.schema import check_entries
@@ -47,7 +51,9 @@ def read_npz(path: PathLike) -> Trajectories:
 
     Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and `metadata`
     (a JSON object with names, units, angles, time_unit, source, hold, delay, lag, columns, recordings) may follow.
-    Integer arrays become float64. InputError names the file, the array, what is wrong with it and the remedy.
+    Integer arrays become float64. In an archive without metadata, marks of missing readings (`herglotz.data.marks`) are
+    missing, with a warning; `write_npz` writes metadata, and what it wrote stays as it is. InputError names the file,
+    the array, what is wrong with the array and the remedy.
     """
     return trajectories_of(read_bytes(path), Path(path))
 
@@ -64,9 +70,29 @@ def trajectories_of(content: bytes, path: Path) -> Trajectories:
     lengths = arrays.get("lengths")
     if lengths is not None and (lengths.dtype.kind not in "iu" or lengths.ndim != 1):
         raise InputError(f"{path}: array 'lengths' must hold integers in one row, got {lengths.dtype} {lengths.shape}")
-    return Trajectories.of(
+    found = Trajectories.of(
         **numbers, lengths=None if lengths is None else lengths.tolist(), **{"source": path.name, **labels}
     )
+    return found if "metadata" in arrays or found.observed is not None else _without_marks(found)
+
+
+def _without_marks(data: Trajectories) -> Trajectories:
+    """The set without the marks of missing readings, and a warning for each mark.
+
+    Positions that are marks are missing; inputs that are marks are held from the sample before.
+    """
+    parts = [x.double().numpy() for x in (data.t[:, None], data.q, data.u) if x is not None]
+    names = [(name, False) for name in data.names] + [(name, True) for name, _ in data.input_labels]
+    columns = [(k, *own) for k, own in enumerate(names, 1)]
+    table, notes = without_marks(np.hstack(parts), data.trajectory.tolist(), range(data.samples), columns)
+    if not notes:
+        return data
+    numbers = torch.from_numpy(table[:, 1:]).to(data.q)
+    q, u = numbers[:, : data.dof], numbers[:, data.dof :]
+    u = last_read(u, ~u.isnan(), data.trajectory)
+    held = None if data.u is None else u.nan_to_num(nan=0.0)
+    found = replace(data, u=held, notes=(*data.notes, *notes))
+    return with_missing(found, ~q.isnan(), lambda k: f"sample {k}", u.isnan().any(1))
 
 
 def write_npz(path: PathLike, trajectories: Trajectories) -> None:

@@ -161,7 +161,7 @@ def load(
     unwrap
         Make angles continuous.
     show
-        Print the table of columns on stderr, where a table was read.
+        Print the table of columns on stderr, where a table was read, or else the notes.
     sensor_zeros, sensor_scales
         Positions are scale · (reading − zero), both in the file's units: n numbers each, or n for each recording of the
         file, one recording after the other. The comments of the file act first.
@@ -192,8 +192,9 @@ def load(
     if angles is None and like is not None:
         found = angles_like(found, like)
     found = finished(found, angles, sensor_zeros, sensor_scales)
-    if show and found.columns:
-        tell(found.table())
+    if show:
+        for text in [found.table()] if found.columns else [f"{found.source}: {note}" for note in found.notes]:
+            tell(text)
     return found.unwrapped() if unwrap else found
 
 

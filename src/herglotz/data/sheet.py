@@ -110,6 +110,8 @@ class Sheet:
         return np.array([np.nan if may_miss and _is_missing(x) else number(x, at, *self.remedies) for x, at in cells])
 
 
+# Differences of numbers near the largest are infinite, and compare as such.
+@np.errstate(over="ignore")
 def from_sheet(sheet: Sheet, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     """The recordings of a sheet; see `herglotz.data.table.from_table`.
 

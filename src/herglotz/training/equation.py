@@ -27,7 +27,7 @@ from herglotz.models import refuse_own
 from herglotz.models.action import ActionFlow
 from herglotz.models.jet import coordinates
 from herglotz.training.baseline import JITTER
-from herglotz.training.equation_terms import Line, Reader, is_formula, newtonian
+from herglotz.training.equation_terms import Line, Reader, is_formula, mentions, newtonian
 from herglotz.training.equation_words import BESIDE, UNKNOWN, Joint, Numbers, number, plain
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.fitted_run import FittedRun
@@ -180,10 +180,35 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
     if data.degrees:
         units.append(f"{', '.join(data.degrees)} recorded in deg (1 rad = 57.3 deg)")
     units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []
-    every = (*reader.explained(), *notes, *map(str, numbers.trades()))
+    told = (without_bound(terms, data.names), *map(str, numbers.trades()))
+    every = (*reader.explained(), *notes, *filter(None, told))
     if any(term.function for term in terms):
         every = ("f1 and so on: functions of what was recorded alone; beyond its range they are not known", *every)
     return Equation(tuple(terms), tuple(reader.lefts), ", ".join(units) or "plain numbers", network, every)
+
+
+def without_bound(terms: Sequence[Term], names: Sequence[str]) -> str:
+    """The note on coordinates whose mass in L the data do not bound; "" for none.
+
+    The deviation of the mass exceeds the mass, and so for every term of this coordinate alone: the accelerations are
+    known, and what the other coordinates do to such a coordinate is not.
+    """
+    found = []
+    for name in names:
+        others = [other for other in names if other != name]
+        own = [x for x in terms if x.left in ("L", f"force on {name}") and mentions(f"{x.what} {x.left}", [name])]
+        own = [x for x in own if not mentions(x.what, others)]
+        is_open = all(x.deviation is not None and x.deviation > abs(x.value) for x in own)
+        if is_open and len(own) > 1 and any(x.what == f"{name}′²" for x in own):
+            found.append(name)
+    if not found:
+        return ""
+    one = len(found) == 1
+    return (
+        f"the mass{'' if one else 'es'} of {', '.join(found)} {'is' if one else 'are'} not determined: what the other "
+        f"coordinates do to {'it' if one else 'each'} is too small to be seen, as where a drive moves {found[0]}; the "
+        f"motion stays the same if all terms of {found[0]} alone, mass and forces, are multiplied by one number"
+    )
 
 
 def network_of(run: FittedRun) -> str | None:

@@ -48,9 +48,9 @@ class Line:
     of: str = ""
 
 
-def _mentions(text: str, names: Iterable[str]) -> bool:
-    """True if the text contains one of these names."""
-    return any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for name in names)
+def mentions(text: str, names: Iterable[str]) -> bool:
+    """True if the text contains one of these names, alone or with an exponent."""
+    return any(re.search(rf"(?<!\w){re.escape(name)}(?![^\W⁰¹²³⁴⁵⁶⁷⁸⁹])", text) for name in names)
 
 
 def is_formula(model: ContactLagrangian) -> bool:
@@ -100,7 +100,7 @@ class Reader:
         found = list(lines)
         for k, (m, own, name) in enumerate(zip(self._masses().diagonal(), self.own, self.names, strict=True)):
             others = {*self.names, self.distance} - {name}
-            if any(_mentions(line.what, others if line.left == own else {name}) for line in lines):
+            if any(mentions(line.what, others if line.left == own else {name}) for line in lines):
                 mass = self.shown(m, f"the mass of {name}", True)
                 self.lefts = [*self.lefts[:k], f"{'' if mass == '1' else mass + ' '}{own}", *self.lefts[k + 1 :]]
                 found = [replace(line, left=self.lefts[k]) if line.left == own else line for line in found]

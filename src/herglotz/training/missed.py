@@ -147,10 +147,9 @@ def reason_of(
     ):
         return None if hidden > OTHER else ""
     if by_time < min(by_past, HALF * by_state):
-        return (
-            f"{OF_TIME}, as where a mass grows or leaks. Try shorter recordings, each with a fit of its own, or what "
-            "changes as an input (--inputs)"
-        )
+        changes = ", or ".join(ways_of_columns(data)) or "what changes as an input (--inputs)"
+        own = "Try shorter recordings, each with a fit of its own"
+        return f"{OF_TIME}, as where a mass grows or leaks. {own}, or {changes}"
     return (
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
         f"what was not recorded. Try {', or '.join(_ways_to_the_past(data, level))}"
@@ -158,9 +157,12 @@ def reason_of(
 
 
 def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
-    """What to try where the present state and the inputs do not give the force: only what a fit would take."""
+    """What to try where the present state and the inputs do not give the force: only what a fit would take.
+
+    What was recorded and left aside comes first.
+    """
     ways = [] if data.u is not None or level == "full" else ["--level full, whose action remembers"]
-    return [*ways, *(ways_of_columns(data) or ["a record of what else acts (--inputs)"])]
+    return [*columns, *ways] if (columns := ways_of_columns(data)) else [*ways, "a record of what else acts (--inputs)"]
 
 
 def ways_of_columns(data: Trajectories) -> list[str]:

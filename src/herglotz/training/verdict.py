@@ -362,12 +362,20 @@ def _remedy(errors: Errors, metrics: dict[str, Any], shown: Callable[..., str], 
         return reason
     if not errors.missed:
         return beyond() or _unlike(errors, metrics)
+    columns = metrics.get("columns", ())
     if metrics["objective"] in ("residual", "raw"):
-        return "Try --objective trajectory; or --substeps where a period has few samples; inputs that are not recorded?"
-    ways = [] if metrics["objective"] == "smoothing" else ["--objective smoothing"]
+        ways = ", or ".join(["Try --objective trajectory", *columns])
+        asked = "" if columns else "; inputs that are not recorded?"
+        return f"{ways}; or --substeps where a period has few samples{asked}"
+    ways = [*columns, *([] if metrics["objective"] == "smoothing" else ["--objective smoothing"])]
     # Inputs leave one level.
     ways += [] if metrics.get("driven") else ["another --level (herglotz select)"]
-    return f"A force is missing. Try {', or '.join([*ways, *metrics.get('columns', ()), 'a --feature for it'])}"
+    told = f"A force is missing. Try {', or '.join([*ways, 'a --feature for it'])}"
+    if metrics.get("driven") or columns:
+        return told
+    return (
+        f"{told}; where motors, hands or other bodies drive the motion, record their forces (--inputs), as no input was"
+    )
 
 
 def _unlike(errors: Errors, metrics: dict[str, Any]) -> str:

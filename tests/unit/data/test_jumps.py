@@ -43,17 +43,17 @@ def test_the_remedy_names_the_coordinates_too(tmp_path):
     # fails if the input that jumps is taken away, and what has neither a unit nor a usual name becomes a coordinate
     columns = {
         "delta[deg]": np.sin(T),
-        "Pm_pu": held([0.3, 0.7, 0.4, 1.1], 20),
-        "Pe_pu": np.cos(T),
-        "Vt_pu": np.cos(2 * T),
+        "Pm": held([0.3, 0.7, 0.4, 1.1], 20),
+        "Pe": np.cos(T),
+        "Vt": np.cos(2 * T),
     }
-    some = ", with those of Pe_pu, Vt_pu that are positions"
-    said = r"--inputs Pm_pu \(inputs= in Python\) and --coordinates delta"
-    same = f"{some}; a coordinate all the same: --coordinates delta,Pm_pu{some}$"
+    some = ", with those of Pe, Vt that are positions"
+    said = r"--inputs Pm \(inputs= in Python\) and --coordinates delta"
+    same = f"{some}; a coordinate all the same: --coordinates delta,Pm{some}$"
     path = written(tmp_path, **columns)
     with pytest.raises(InputError, match=said + same):
         load(path)
-    assert load(path, inputs="Pm_pu", coordinates="delta").names == ("delta",)
+    assert load(path, inputs="Pm", coordinates="delta").names == ("delta",)
 
 
 def test_degrees_are_named_as_they_stand(tmp_path):  # fails if levels of a table in degrees are shown in radians

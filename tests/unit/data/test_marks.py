@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from herglotz.data import as_trajectories, load
+from herglotz.data import Trajectories, as_trajectories, load, save
+from herglotz.errors import InputError
 
 T = np.arange(200) * 0.02
 SWING = 8 * np.cos(3 * T)
@@ -44,6 +45,24 @@ def test_marks_in_arrays(capsys):
     assert as_trajectories(having(SWING, -999), h=0.02).samples == 200 - len(GONE)
 
 
+def test_marks_in_an_archive(tmp_path, capsys):
+    # fails if -999 in an archive of arrays is a reading, an input of 9999 acts, or an archive of herglotz loses numbers
+    np.savez(tmp_path / "a.npz", t=T, q=np.c_[having(SWING, -999), np.sin(T)], u=having(np.sin(T), 9999, [80, 81]))
+    data = load(tmp_path / "a.npz")
+    assert data.samples == 200
+    assert data.observed is not None
+    assert data.u is not None
+    assert (data.observed == 0).nonzero().tolist() == [[k, 0] for k in GONE]
+    assert float(data.q.abs().max()) < 9
+    assert data.u[79:82, 0].tolist() == [np.sin(T[79])] * 3
+    err = capsys.readouterr().err
+    assert "a.npz: warning: q1 is -999 in 6 rows (20, 21, 22, …)" in err
+    assert " is 9999 in 2 rows (80, 81)" in err
+    own = Trajectories.of(T, having(SWING, -999)[:, None])
+    save(tmp_path / "b.npz", own)
+    assert load(tmp_path / "b.npz").digest() == own.digest()
+
+
 def test_two_marks_in_one_column(tmp_path):
     # fails if one mark hides another on the other side of the readings
     data = load(written(tmp_path, having(having(SWING, -999), 9999, [80, 82])))
@@ -55,6 +74,12 @@ def test_marks_beside_blank_cells(tmp_path):
     # fails if the jump to a mark is not seen where the rows beside it are blank
     data = load(written(tmp_path, having(having(SWING, np.nan, [19, 23, 59, 62]), -999)))
     assert data.samples == 200 - len(GONE) - 4
+
+
+def test_times_near_the_largest_number(tmp_path):  # fails if the difference of two times overflows with a warning
+    (tmp_path / "a.csv").write_text("t,q[rad],x\n0.0,0.0,0.0\n1.7e+308,0.0,0.0\n-1.7e+308,0.0,0.0")
+    with pytest.raises(InputError, match="does not increase"):
+        load(tmp_path / "a.csv")
 
 
 def test_a_sensor_that_is_lost_once(tmp_path):  # fails if a loggers' number has to come in two places

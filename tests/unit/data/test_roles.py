@@ -54,7 +54,8 @@ ROLES = {
     "v": "left aside", "vx": "left aside", "velocity_x": "left aside", "x_dot": "left aside", "x_ddot": "left aside",
     "acc": "left aside", "gyro[rad/s]": "left aside", "a[m/s^2]": "left aside", "b (mm/s²)": "left aside",
     "index": "left aside", "frame": "left aside", "Unnamed: 0": "left aside", "theta2ddot": "left aside",
-    "omega_1": "left aside",
+    "omega_1": "left aside", "gFx": "left aside", "aceleracion_base": "input", "Boden[mm]": "input",
+    "déplacement sol[mm]": "input", "quake_acc_g": "input", "thrust_pct": "input", "Gewenste hoek[°]": "input",
     # The width of a pulse commands a servo, a latency does not; us is a unit of time or ultrasound.
     "pwm [us]": "input", "servo_duty[ms]": "input", "pulse width[us]": "input", "latency[ms]": "left aside",
     "pwm_time[us]": "left aside", "us_distance": "coordinate", "us[mm]": "coordinate", "us_left[cm]": "coordinate",
@@ -161,6 +162,7 @@ GUESSES = {
     "pot[V]": "is left aside, but it may be the reading of a position",
     "flux[Wb]": "is left aside, but it may be the reading of a position; if so, give --inputs flux or",
     "motor_x": "is taken for a coordinate, but its name may be that of an input",
+    "input_shaft[rad]": "is taken for a coordinate, but its name may be that of an input; else give --inputs",
     "input_angle": "is taken for a coordinate, but its name may be that of an input",
     "load": "is taken for a coordinate, but no unit and no usual name says so; else give --inputs load or --drop load",
 }
@@ -180,14 +182,83 @@ def test_what_is_a_guess_is_said_in_a_warning(tmp_path, capsys, cell):
 
 
 def test_no_acceleration_is_offered_as_a_coordinate():
-    # fails if the remedy for a floor in mm makes a position of an accelerometer beside it
-    (said,) = assign(["t[s]", "damper[mm]", "floor[mm]", "base_acc[m/s2]"], "header").notes
-    assert said == (
-        "warning: floor, base_acc are taken for inputs, but by their names alone; else give --coordinates damper,floor "
-        "or --drop floor,base_acc"
-    )
+    # fails if the remedy for a road in mm makes a position of an accelerometer beside it
+    for unit in ("[m/s2]", "[g]", ""):
+        (said,) = assign(["t[s]", "damper[mm]", "road[mm]", f"ground_acc{unit}"], "header").notes
+        assert said == (
+            "warning: road, ground_acc are taken for inputs, but by their names alone; else give --coordinates "
+            "damper,road or --drop road,ground_acc"
+        )
     (said,) = assign(["t[s]", "pitch[deg]", "ax_g"], "header").notes
     assert said.endswith("it may be an input; if so, give --inputs ax")
+    (said,) = assign(["t[s]", "pitch[deg]", "ax_g", "ay_g"], "header").notes
+    assert said.endswith(
+        "ax, ay are left aside, but no coordinate has their kind of unit, and they may be inputs; if so, give --inputs "
+        "ax,ay"
+    )
+
+
+def roles(header):
+    """The roles of the columns of a header but the time."""
+    return [role for _, role, _ in assign(header.split(","), "header").roles()][1:]
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("t[s],floor[mm],damper[mm],base_acc[m/s2]", "coordinate coordinate input"),
+        ("t[s],floor[mm],damper[mm],ground[g]", "coordinate coordinate input"),
+        ("t[s],floor[mm],body[mm],road[mm]", "coordinate coordinate input"),
+        ("t,floor1,floor2,u", "coordinate coordinate input"),
+        ("t[s],2nd floor[mm],roof[mm],shaker force[N]", "input coordinate input"),
+        ("t[s],floor 1[mm],floor 1 acc[m/s2],base_acc[m/s2]", "coordinate left aside input"),
+        ("t[s],floor[mm],table[mm]", "input coordinate"),
+        ("t[s],floor[mm],floor_acc[m/s2],table[mm]", "input input coordinate"),
+    ],
+)
+def test_a_floor_is_a_storey_where_something_else_shakes(header, expected):
+    # fails if the storey of a building whose base is shaken is an input, or the floor below a table a coordinate
+    assert " ".join(roles(header)) == expected
+
+
+def test_a_storey_is_a_guess():  # fails if a floor beside a base is a coordinate without a word
+    said, _ = assign(["t[s]", "floor[mm]", "damper[mm]", "base_acc[m/s2]"], "header").notes
+    assert said.endswith(
+        "coordinate, but it may be moved from outside; else give --inputs base_acc,floor or --drop floor"
+    )
+
+
+def test_a_share_of_a_nominal_value_is_no_position():
+    # fails if powers and voltages in per unit are coordinates beside the angle of a generator, or a travel is none
+    header = "t_s,delta_deg,omega_pu,Pm_pu,Pe [p.u.],Vt (pu)"
+    assert " ".join(roles(header)) == "coordinate left aside input input input"
+    (said,) = assign(header.split(","), "header").notes
+    assert said == "warning: Pm, Pe, Vt are taken for inputs, but by their units alone; else give --drop Pm,Pe,Vt"
+    assert " ".join(roles("t,x_pu,u[pu],s[pu],torque[pu],Q[pu]")) == "coordinate input input input input"
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("t[s],input_x[mm],x[mm]", "input coordinate"),
+        ("t[s],Eingang[mm],Ausgang[mm]", "input coordinate"),
+        ("t[s],entrée[mm],x[mm]", "input coordinate"),
+        ("t[s],x_in[mm],x_out[mm]", "input coordinate"),
+        ("t,in,out", "input coordinate"),
+        ("t,x_in,y_in", "coordinate coordinate"),
+        ("t[s],input_angle[deg],output_angle[deg]", "coordinate coordinate"),
+        ("t[s],Zielwinkel[deg],cible[deg],x[deg]", "input input coordinate"),
+    ],
+)
+def test_a_word_for_an_input_anywhere_in_a_name(header, expected):
+    # fails if `input` in front of the name of another column makes a second coordinate, or inches are an input
+    assert " ".join(roles(header)) == expected
+
+
+def test_a_quantity_in_its_unit():  # fails if "Weg in mm" is a name without a unit
+    found = assign(["Zeit in ms", "Weg in mm", "angle en °", "v in m/s", "x in box"], "header")
+    assert found.names == ("Zeit", "Weg", "angle", "v", "x in box")
+    assert found.units == ("ms", "mm", "°", "m/s", "")
 
 
 def test_raw_values_are_fitted_and_their_filtered_copy_is_not():

@@ -63,6 +63,24 @@ def test_a_preamble_of_labview(tmp_path):
         load(path)
 
 
+def test_times_of_several_channels_of_labview(tmp_path, capsys):
+    # fails if the time of the second channel is a coordinate, a comment is warned of, or other times are overlooked
+    path, preamble = tmp_path / "a.lvm", LABVIEW.partition("X_Value")[0]
+    heads = "X_Value\tPath (mm)\tX_Value\tForce (N)\tComment\n"
+    body = [f"{t}\t{x}\t{t}\t2\t\n" for t, x in zip(T, X, strict=True)]
+    path.write_text(preamble + heads + "".join(body))
+    data = load(path)
+    assert data.columns == (("X_Value", "time", "s"), ("Path", "coordinate", "mm"), ("Force", "input", "N"))
+    assert (data.t.tolist(), data.q[:, 0].tolist()) == (T.tolist(), X.tolist())
+    assert "warning" not in capsys.readouterr().err
+    path.write_text(preamble + heads + body[0] + body[1].replace(f"\t{T[1]}\t", "\t7.5\t"))
+    with pytest.raises(InputError, match=rf"row 12: channels have different times, '{T[1]}' and '7.5'; save them with"):
+        load(path)
+    path.write_text(preamble + heads.replace("X_Value\tForce", "Force") + "\t1\t2\t\n\t3\t2\t\n")
+    with pytest.raises(InputError, match="row 11: X_Value is blank; save them with one column of times"):
+        load(path)
+
+
 def test_columns_without_a_value_are_left_aside(tmp_path, capsys):
     # fails if an empty column of remarks refuses the table, as of all rows none is complete, or is left out in silence
     data = load(written(tmp_path, f"t[s];x[cm];remarks;by\n{rows(';', '', '')}"))

@@ -82,6 +82,12 @@ def test_what_a_residual_shows(what):
         (False, "full", (), "a record of what else acts (--inputs)"),
         (True, "forced", (), "a record of what else acts (--inputs)"),
         (True, "forced", (("wind", "left aside", "m/s"),), "--inputs volt,wind, which takes wind, left aside so far"),
+        (
+            False,
+            "forced",
+            (("wind", "left aside", "m/s"),),
+            "--inputs wind, which takes wind, left aside so far, or --level full, whose action remembers",
+        ),
         (True, "forced", (("x_ref", "left aside", "mm"),), "a record of what else acts (--inputs)"),
         (True, "forced", (("speed", "left aside", "m/s"), ("dx", "left aside", "m/s")), "a record of what else acts"),
     ],
@@ -99,12 +105,18 @@ def test_a_remedy_would_run(driven, level, columns, ways):
 @pytest.mark.parametrize(
     ("driven", "objective", "ways"),
     [
-        (False, "trajectory", "--objective smoothing, or another --level (herglotz select), or a --feature for it"),
+        (
+            False,
+            "trajectory",
+            "--objective smoothing, or another --level (herglotz select), or a --feature for it; where motors, hands "
+            "or other bodies drive the motion, record their forces (--inputs), as no input was",
+        ),
         (True, "smoothing", "a --feature for it"),
     ],
 )
 def test_what_was_tried_and_what_inputs_leave_no_choice_of_is_no_remedy(driven, objective, ways):
-    # fails if another level is offered for inputs, which one level takes, or the objective that missed
+    # fails if another level is offered for inputs, which one level takes, or the objective that missed; or if nothing
+    # is said of a crane whose drives move what was recorded, and whose forces were not
     metrics = {"follows_data": True, "objective": objective, "driven": driven}
     text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, metrics)
     assert text.endswith(f"A force is missing. Try {ways}"), text
@@ -119,6 +131,10 @@ def test_columns_left_aside_are_named_where_something_is_missing():
     metrics = {"follows_data": True, "objective": "smoothing", "driven": True, "columns": ways_of_columns(data)}
     text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, metrics)
     assert text.endswith(f"A force is missing. Try {takes} a --feature for it")
+    text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, metrics | {"objective": "residual"})
+    assert f"Try --objective trajectory, or {takes.removesuffix(', or')}; or --substeps" in text
+    grows = reason_of(data, left(0.01 * (T - T.mean()) * Q), OWNER) or ""
+    assert grows.endswith(f"each with a fit of its own, or {takes.removesuffix(', or')}")
 
 
 def test_neighbours_are_of_other_times():

@@ -19,7 +19,16 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, fit, laplace
-from herglotz.training.equation import Departure, Equation, Term, _is_lost, _sensors, equation_of, notes_of
+from herglotz.training.equation import (
+    Departure,
+    Equation,
+    Term,
+    _is_lost,
+    _sensors,
+    equation_of,
+    notes_of,
+    without_bound,
+)
 from herglotz.training.equation_terms import is_formula
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.fit import _of_short_steps
@@ -160,6 +169,28 @@ def test_the_printed_equation_is_the_model(name):
     missed, moved = compared(run, parts=1 if sticks else 2)
     assert "step it as" not in text_of(run)
     assert moved < TWICE * missed
+
+
+def test_a_mass_without_a_bound_is_said():
+    # fails if the mass of a beam that a servo moves, 8.8e14 ± 640e14 beside a ball of 1, is printed without a word; or
+    # if so is a coordinate without inertia, whose forces are known
+    def terms(deviation, force=2e16):
+        own = Term("L", "beam′²", 8.8e14, deviation, ""), Term("L", "ball′²", 0.5, None, "")
+        both = Term("L", "ball′ beam′", -17.5, 0.2, ""), Term("L", "ball² beam′²", 0.37, 0.004, "")
+        return [
+            *own,
+            *both,
+            Term("force on beam", "servo", 1e16, force, ""),
+            Term("force on ball", "servo", -122, 0.1, ""),
+        ]
+
+    names = ("ball", "beam")
+    assert without_bound(terms(6e16), names).startswith(
+        "the mass of beam is not determined: what the other coordinates"
+    )
+    assert without_bound(terms(1e14), names) == ""
+    assert without_bound(terms(6e16, 1e14), names) == ""
+    assert without_bound(terms(None), names) == ""
 
 
 @pytest.mark.parametrize("name", LONG)
