@@ -61,37 +61,38 @@ if any("gloo" in name for name in threads):
 """
 
 
-def result_here(tmp_path, monkeypatch):
-    """Parameters and costs of the fits in this process."""
+def worked(monkeypatch, out):
+    """Parameters and costs of the fits, with `WORK` run by this process."""
     # `WORK` sets both.
     monkeypatch.setattr(distributed, "MIN_ROWS", distributed.MIN_ROWS)
     monkeypatch.setattr(distillation, "ITERATIONS", distillation.ITERATIONS)
-    monkeypatch.setattr(sys, "argv", ["work.py", str(tmp_path / "1.pt")])
+    monkeypatch.setattr(sys, "argv", ["work.py", str(out)])
     exec(WORK, {"__name__": "work"})
-    return torch.load(tmp_path / "1.pt", weights_only=True)
+    return torch.load(out, weights_only=True)
 
 
-def result(tmp_path, processes):
-    """Parameters and costs of the fits on so many processes."""
-    out = tmp_path / f"{processes}.pt"
-    command = [sys.executable, "-c", WORK, str(out)]
+def worked_by_two(monkeypatch, tmp_path):
+    """The same by this process and another one, which imports everything anew."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": str(processes)}
-    started = []
-    for rank in range(processes):
-        extra = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
-        started.append(subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1", **extra}))
-    assert [p.wait(timeout=300) for p in started] == [0] * processes
-    return torch.load(out, weights_only=True)
+    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", WORK, str(tmp_path / "none.pt")]
+    second = {**os.environ, **shared, "RANK": "1", "LOCAL_RANK": "1"}
+    with monkeypatch.context() as first, subprocess.Popen(command, cwd=ROOT, env=second) as other:
+        for name, value in {**shared, "RANK": "0", "LOCAL_RANK": "0"}.items():
+            first.setenv(name, value)
+        found = worked(first, tmp_path / "2.pt")
+        assert other.wait(timeout=300) == 0
+    assert not (tmp_path / "none.pt").exists()
+    return found
 
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this PyTorch has no torch.distributed")
 def test_two_processes_find_what_one_finds(tmp_path, monkeypatch):
     # fails if a process's share is left out or counted twice (prior included), or processes take different decisions;
     # or if a process ends while threads of gloo still run: once, on a loaded machine, one aborted
-    one, two = result_here(tmp_path, monkeypatch), result(tmp_path, 2)
+    one, two = worked(monkeypatch, tmp_path / "1.pt"), worked_by_two(monkeypatch, tmp_path)
     assert one.keys() == two.keys()
     assert len(one) == 8
     for name, value in one.items():
