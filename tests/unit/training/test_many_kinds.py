@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -59,21 +60,21 @@ def test_a_flexible_joint_is_found():
     h, steps, count = 0.01, 4, 700
     make = torch.Generator().manual_seed(0)
     u = (4 * torch.rand(count // 30 + 1, generator=make, dtype=torch.float64) - 2).repeat_interleave(30)[:count]
-    t, y, q = torch.arange(count).double() * h, torch.zeros(4, dtype=torch.float64), []
+    t, y, q = torch.arange(count).double() * h, np.zeros(4), []
 
     def rate(y, u):
         motor, link, v, w = y
         spring = 100 * (motor - link) + 1.5 * (v - w)
-        return torch.stack([v, w, 40 * u - 2 * v - 2 * spring, spring - 25 * link.sin() - 0.3 * w])
+        return np.array([v, w, 40 * u - 2 * v - 2 * spring, spring - 25 * np.sin(link) - 0.3 * w])
 
-    for held in u:
+    for held in u.tolist():
         q.append(y[:2])
         for _ in range(steps):
             a = rate(y, held)
             b = rate(y + h / steps / 2 * a, held)
             c = rate(y + h / steps / 2 * b, held)
             y = y + h / steps * (a + 2 * b + 2 * c + rate(y + h / steps * c, held)) / 6
-    q = torch.stack(q) + 5e-4 * torch.randn(count, 2, generator=make, dtype=torch.float64)
+    q = torch.tensor(np.stack(q)) + 5e-4 * torch.randn(count, 2, generator=make, dtype=torch.float64)
     assert float((q[:, 0] - q[:, 1]).abs().max()) > 0.4
     run = fit(Trajectories.of(t, q, u=u, hold="zero", angles=(True, True)), progress=False)
     assert run.metrics["plan"]["features"] == ("(q1 - q2)^2",)
