@@ -54,12 +54,6 @@ def pytest_collection_finish():
 
 
 def pytest_configure():
-<<<<<<< HEAD
-    # What is imported stays: looking through it for garbage took a quarter of the collection of the tests.
-    gc.disable()
-=======
-    keep_files_in_memory()
->>>>>>> d181ce86 (Tests: the search for garbage rests in workers alone, which collect tests)
     seed = os.environ.get("HERGLOTZ_SHAKE")
     if seed is None:
         return
