@@ -391,7 +391,11 @@ class Search:
             if moved(trial, problem, trial.theta) <= FINER * max(trial.rms, fitter.floor / ALIKE):
                 break
             fit = other.fit(trial.taken, trial.values, trial.length, trial)
-            if fit is None or trial.replaces(fit):
+            # Finer steps cannot miss what coarser ones meet: from these values the fit has not found its way.
+            lost = fit is None or fit.rms > trial.followed
+            if fit is None or lost or (trial.segments_at_the_noise and not fit.segments_at_the_noise):
+                break
+            if trial.replaces(fit):
                 break
             trial = other.grow(fit)
         return trial

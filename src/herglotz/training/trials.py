@@ -17,7 +17,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import input_terms_of
-from herglotz.data.noise import AT_THE_NOISE, coarse, precision, relative_spread
+from herglotz.data.noise import AT_THE_NOISE, coarse, precision, precisions, relative_spread
 from herglotz.data.smoothing import slopes, smoothed
 from herglotz.models.features import windings
 from herglotz.training.baseline import Baseline
@@ -168,6 +168,30 @@ class Trial:
         return self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
 
     @cached_property
+    def lost(self) -> bool:
+        """True if an error of the start as small as the noise grows to the spread of the motion in longer segments.
+
+        In two segments, one after the other, by the linearised steps of this model: as an unstable motion does. Longer
+        segments would tell a wrong start from a wrong force no more.
+        """
+        problem, grid, data = self.problem, self.problem.grid, self.problem.data
+        n, d, spread = problem.n, problem.d, data.q.std(0, correction=0).clamp_min(1e-300)[:, None]
+        noise = (precisions(data).to(data.q) * data.balance).diag()  # (n, n)
+
+        def size(error: Tensor) -> Tensor:
+            return (error / spread).square().sum((-2, -1)).div(n).sqrt().nan_to_num(torch.inf)
+
+        # Growth by a factor G in one segment is growth by about G² in two, and slower growth is less.
+        slopes = problem.slopes_at_samples(self.theta, self.path)[..., problem.P : problem.P + n]
+        if self.whole or float(size(slopes @ noise).max()) ** 2 < float(size(noise)):
+            return False
+        moved = problem.sensitivities(self.theta, self.path, held=True).detach()  # (S, K + 1, d, d)
+        first = torch.cat([noise, noise.new_zeros(d - n, n)]).expand(grid.segments, d, n)
+        ends = moved[torch.arange(grid.segments), grid.end] @ first
+        first = torch.where(grid.joined[:, None, None], ends.roll(1, 0), first)
+        return bool((size(grid.at_samples((moved @ first[:, None])[..., :n, :])) >= 1).any())
+
+    @cached_property
     def lacks_nothing(self) -> bool:
         """True if the misfit of whole trajectories is about the noise and white, or too small to matter."""
         small = self.rms <= EXACT_ENOUGH * self.fitter.spread
@@ -194,31 +218,34 @@ class Trial:
     def gain(self, simple: Trial, more: int = 0) -> float:
         """`Score.gain` over a simpler model, with `more` further numbers; ±infinite if segments differ in length.
 
-        The model that follows longer segments is better.
+        The model that follows longer segments is better, as far as noise lets them be followed (`of_one_length`).
         """
-        if self.length != simple.length:
+        if (pair := of_one_length(self, simple)) is None:
             return math.inf if self.length > simple.length else -math.inf
+        rich, other = pair
         offered = max(self.fitter.offered, simple.fitter.offered)
-        return replace(self.score, zeros=more).gain(simple.score, offered)
+        return replace(rich.score, zeros=more).gain(other.score, offered)
 
     def foretells(self, other: Trial) -> bool:
         """True if this model misses held-out blocks clearly less than another, whatever the numbers of both cost.
 
-        The model that follows longer segments is better.
+        The model that follows longer segments is better, as far as noise lets them be followed (`of_one_length`).
         """
-        if self.length != other.length:
+        if (pair := of_one_length(self, other)) is None:
             return self.length > other.length
-        return self.score.clearly_better(other.score)
+        return pair[0].score.clearly_better(pair[1].score)
 
     def fits_better(self, simple: Trial, zeros: int = 0) -> bool:
         """True if this model, with `zeros` of sensors as further numbers, replaces a model with the same offers.
 
-        By the residuals of both fits (`fitted_score`); the model that follows longer segments is better.
+        By the residuals of both fits (`fitted_score`); the model that follows longer segments is better, as far as
+        noise lets them be followed (`of_one_length`).
         """
-        if self.length != simple.length:
+        if (pair := of_one_length(self, simple)) is None:
             return self.length > simple.length
-        theirs = fitted_score(simple.problem, simple.path, self.fitter.floor)
-        own = fitted_score(self.problem, self.path, self.fitter.floor, zeros)
+        rich, other = pair
+        theirs = fitted_score(other.problem, other.path, self.fitter.floor)
+        own = fitted_score(rich.problem, rich.path, self.fitter.floor, zeros)
         return own.replaces(theirs, self.fitter.offered)
 
     @property
@@ -396,8 +423,12 @@ class Fitter:
         return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
-        """The model over segments of the next length; None if there is none or the model does not follow so long."""
-        if trial.whole:
+        """The model over segments of the next length; None if there is none or the model does not follow so long.
+
+        None, too, if noise would grow to the spread in these: held-out blocks of such segments compare starts, and no
+        forces.
+        """
+        if trial.whole or trial.lost:
             return None
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
@@ -449,6 +480,21 @@ def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
     if path is None:
         return math.inf
     return float((problem.misfit(path) - trial.problem.misfit(trial.path)).square().mean().sqrt())
+
+
+def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:
+    """Two models over segments of one length; None if their segments differ, and longer ones say more.
+
+    Segments of an unstable motion are as long as they can be if noise grows to the spread in longer ones
+    (`Trial.lost`). A model that follows longer ones does so with a motion less unstable, right or wrong: the two are
+    compared over the shorter ones.
+    """
+    if own.length == other.length:
+        return own, other
+    long, short = (own, other) if own.length > other.length else (other, own)
+    if not short.lost or (same := long.fitter.over(long, short.length)) is None:
+        return None
+    return (same, short) if long is own else (short, same)
 
 
 def likeliest(trial: Trial, most: int) -> Trial:
