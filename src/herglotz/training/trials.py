@@ -486,13 +486,14 @@ def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:
     """Two models over segments of one length; None if their segments differ, and longer ones say more.
 
     Segments of an unstable motion are as long as they can be if noise grows to the spread in longer ones
-    (`Trial.lost`). A model that follows longer ones does so with a motion less unstable, right or wrong: the two are
-    compared over the shorter ones.
+    (`Trial.lost`). A model that misses longer ones by more than the noise follows them with a motion less unstable than
+    that of a model at the noise of the shorter ones: the two are compared over these.
     """
     if own.length == other.length:
         return own, other
     long, short = (own, other) if own.length > other.length else (other, own)
-    if not short.lost or (same := long.fitter.over(long, short.length)) is None:
+    misses = short.segments_at_the_noise and not long.segments_at_the_noise
+    if not (misses and short.lost) or (same := long.fitter.over(long, short.length)) is None:
         return None
     return (same, short) if long is own else (short, same)
 
