@@ -168,7 +168,7 @@ class Reader:
             f = parse_drag(text, self.config.angles)
             for i in (i for i in range(len(self.names)) if f.air or i in (f.on, f.of)):
                 value = self.model.drag.coefficient[g] * (
-                    1.0 if f.of == i or (f.input is not None and not f.power) else -1.0
+                    1.0 if f.of == i or (f.input is not None and not f.power) else -f.ratio
                 )
                 words = self._sign(f.on) if f.dry else "" if f.input is None else self.data.input_labels[f.input][0]
                 size = unit_of(self.data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)

@@ -49,7 +49,8 @@ def drag_in_words(f: DragFeature, i: int, names: Sequence[str], given: str = "")
     """A force on coordinate i with the names of coordinates; `given` is the text of a direction, or of an input."""
     if f.air:
         return f"√({' + '.join(f'{name}′²' for name in names)}) {names[i]}′"
-    speed = f"{names[f.on]}′" if f.of is None else f"({names[f.on]}′ − {names[f.of]}′)"
+    ratio = "" if f.ratio == 1 else f"{plain(f.ratio)} "
+    speed = f"{names[f.on]}′" if f.of is None else f"({ratio}{names[f.on]}′ − {names[f.of]}′)"
     position, size = [raised(names[f.at], f.a)] if f.a else [], [f"|{speed.strip('()')}|"] if f.b else []
     if f.wave:
         own = "" if f.rate == 1 else f"{plain(f.rate)} "

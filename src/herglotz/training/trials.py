@@ -276,16 +276,17 @@ class Fitter:
     """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
 
     `like` is another fitter of the same data, which shares its segments and noise levels. Numbers are scalar
-    parameters, by name; `keys` has the term of each number. Features in the settings take the place of `candidates`.
+    parameters, by name; `keys` has the term of each number. Features in the settings take the place of `candidates`;
+    `ratios` are those of the candidates.
     """
 
     def __init__(
         self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None,
-        like: Fitter | None = None,
+        like: Fitter | None = None, ratios: Mapping[tuple[int, int], str] | None = None,
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
         bands = variant.functions
-        terms = NamedTerms(config.features) if config.features else candidates(data, config.translations)
+        terms = NamedTerms(config.features) if config.features else candidates(data, config.translations, ratios)
         terms = terms.joined(NamedTerms(tuple(windings(data.angles)))) if variant.windings else terms
         terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
