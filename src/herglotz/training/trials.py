@@ -426,10 +426,10 @@ class Fitter:
     def longer(self, trial: Trial) -> Trial | None:
         """The model over segments of the next length; None if there is none or the model does not follow so long.
 
-        None, too, if noise would grow to the spread in these: held-out blocks of such segments compare starts, and no
-        forces.
+        None, too, if a model at the noise lets noise grow to the spread in these: held-out blocks of such segments
+        compare starts, and no forces. Of a model that misses more, it may be the model that is unstable.
         """
-        if trial.whole or trial.lost:
+        if trial.whole or (trial.segments_at_the_noise and trial.lost):
             return None
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
