@@ -398,8 +398,9 @@ class Search:
                 break
             fit = other.fit(trial.taken, trial.values, trial.length, trial)
             # Finer steps cannot miss what coarser ones meet: from these values the fit has not found its way.
-            lost = fit is None or fit.rms > trial.followed
-            if fit is None or lost or (trial.segments_at_the_noise and not fit.segments_at_the_noise):
+            if fit is None or fit.rms > MAX_MISFIT * other.spread:
+                break
+            if trial.segments_at_the_noise and not fit.segments_at_the_noise:
                 break
             if trial.replaces(fit):
                 break
