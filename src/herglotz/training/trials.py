@@ -168,6 +168,17 @@ class Trial:
         return self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
 
     @cached_property
+    def unstable(self) -> bool:
+        """True if the model meets the samples of its segments to the noise, and in longer ones noise would be `lost`.
+
+        Without the joints, whose misfit of an unstable motion is that of the ends of segments.
+        """
+        if self.whole or not self.lost:
+            return False
+        r = self._held_out.fitted_residuals([range(self.problem.P)])[0][self.problem.data.complete]
+        return float(r.square().mean().sqrt()) <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
+
+    @cached_property
     def lost(self) -> bool:
         """True if an error of the start as small as the noise grows to the spread of the motion in longer segments.
 
@@ -429,7 +440,7 @@ class Fitter:
         None, too, if a model at the noise lets noise grow to the spread in these: held-out blocks of such segments
         compare starts, and no forces. Of a model that misses more, it may be the model that is unstable.
         """
-        if trial.whole or (trial.segments_at_the_noise and trial.lost):
+        if trial.whole or trial.unstable:
             return None
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
@@ -487,14 +498,13 @@ def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:
     """Two models over segments of one length; None if their segments differ, and longer ones say more.
 
     Segments of an unstable motion are as long as they can be if noise grows to the spread in longer ones
-    (`Trial.lost`). A model that misses longer ones by more than the noise follows them with a motion less unstable than
-    that of a model at the noise of the shorter ones: the two are compared over these.
+    (`Trial.unstable`). A model that misses longer ones by more than the noise follows them with a motion less
+    unstable than that of a model at the noise of the shorter ones: the two are compared over these.
     """
     if own.length == other.length:
         return own, other
     long, short = (own, other) if own.length > other.length else (other, own)
-    misses = short.segments_at_the_noise and not long.segments_at_the_noise
-    if not (misses and short.lost) or (same := long.fitter.over(long, short.length)) is None:
+    if long.segments_at_the_noise or not short.unstable or (same := long.fitter.over(long, short.length)) is None:
         return None
     return (same, short) if long is own else (short, same)
 
