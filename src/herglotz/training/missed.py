@@ -68,8 +68,6 @@ KICKS = 5
 WIDTHS, RIDGES = (0.5, 1.0, 2.0, 4.0), (1e-3, 1e-2, 1e-1, 1.0)
 # Time constants of the filters, in periods 2π σ(q)/σ(q̇) of the motion, and half widths of the play, in σ(q).
 FILTERS, PLAYS = (1 / 8, 1 / 2, 2.0), (0.1, 0.3, 1.0)
-# Variance of a combination of columns, over the largest, that is rounding.
-RANK = 1e-12
 # Blocks of time that are predicted together, and blocks in all.
 FOLDS, PIECES = 8, 16
 # Most samples of a regression: an inverse takes about 5 ms.
@@ -137,14 +135,14 @@ def reason_of(
     q, turning = at(data.q), torch.tensor(data.angles, device=miss.device)
     state = [q[:, ~turning], q[:, turning].sin(), q[:, turning].cos(), at(data.q, 1)]
     state += [] if data.u is None else [at(data.u)]
-    x, middle = _independent(torch.cat(state, 1)), at.rows[:, SAMPLES // 2]
+    x, middle = torch.cat(state, 1), at.rows[:, SAMPLES // 2]
     hidden = float(noise.square().mean())
     if kicks := _kicks(data, miss, owner):
         return kicks
     # Measured where a force is missing: of 75 recordings with a memory 52 are told, 34 of them by neighbours alone; of
     # 50 without one 8 are, 7 of them by neighbours alone.
     by_state, by_past, by_time = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
-    if not _is_other(lacking, hidden, x, middle) and not (
+    if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle) and not (
         by_state > OTHER * (1 - hidden) and min(by_past, by_time) < HALF * by_state
     ):
         return None if hidden > OTHER else ""
@@ -157,17 +155,6 @@ def reason_of(
         "It misses differently where positions, velocities and inputs are alike: the force depends on the past, or on "
         f"what was not recorded. Try {', or '.join(_ways_to_the_past(data, level))}"
     )
-
-
-def _independent(x: Tensor) -> Tensor:
-    """Combinations of the columns of x (K, m), uncorrelated and of variance 1; constant columns and copies are 0.
-
-    A stiff belt pulls by the small difference of two positions, and a controlled magnet by what is left of its current
-    beside position and velocity: states are alike where they are so in these, too.
-    """
-    x = (x - x.mean(0)) / x.std(0).clamp_min(1e-300)
-    variance, turned = torch.linalg.eigh(x.T @ x / len(x))
-    return x @ turned * torch.where(variance > RANK * variance[-1], variance, torch.inf).rsqrt()
 
 
 def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
