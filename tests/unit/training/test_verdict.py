@@ -384,7 +384,7 @@ HELD = "The motion is unstable and its inputs hold it"
 
 @pytest.mark.parametrize(
     ("windows", "unseen", "free", "fits"),
-    [(0.011, 0.012, 68.0, True), (0.011, 0.012, math.inf, True), (0.05, 0.05, 68.0, False), (0.011, 0.05, 68.0, False),
+    [(0.011, 0.012, 68.0, True), (0.011, 0.012, math.inf, True), (0.05, 0.012, 68.0, False), (0.011, 0.05, 68.0, False),
      (0.011, None, None, True)],
 )  # fmt: skip
 def test_windows_judge_a_motion_that_inputs_hold(windows, unseen, free, fits):
