@@ -1,12 +1,12 @@
 """Named forces beside L, with a learned coefficient each: friction |v| v, v³, q² v and so on, and inputs times u cos q.
 
 The text of a force is a product: a power or a wave of a position (optional), |v|, and a power of the same speed v, the
-speed of a joint or the relative speed of two joints with a damper between them:
+speed of a joint or the relative speed of two joints with a damper between them, where a number before the first speed
+says how far it moves for the second one, as a motor moves a belt:
 
     |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
-    cos(q1) v1     sin(2.5 q2) v1     sin(2.5 v1)     cos(0.8 (v1 - v2))     (0.02 v1 - v2)
-
-The last one is a damper between the rim of a pulley of radius 0.02, whose angle is q1, and a carriage.
+    (20.5 v1 - v2)
+    cos(q1) v1     sin(2.5 q2) v1     sin(2.5 v1)     cos(0.8 (v1 - v2))
 
 Dampers that saturate or act on one side are sums of waves of a speed. `load 2` is a constant force on coordinate 2,
 which no periodic potential of an angle gives. `|v1|` is the difference of viscous friction between the two directions.
@@ -42,7 +42,7 @@ from herglotz.models.term import with_force
 # Highest power of a speed or a position.
 MAX_POWER = 9
 _NUMBER = r"\d+(?:\.\d*)?(?:e[-+]?\d+)?"
-_PAIR = rf"(?:{_NUMBER} )?v\d+ - v\d+"
+_PAIR = rf"(?:-?{_NUMBER} )?v\d+ - v\d+"
 _SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
 _WAVE = rf"(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?"
 _AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
@@ -53,12 +53,13 @@ AIR = "|v| v"
 
 @dataclass(frozen=True)
 class DragFeature:
-    """q_at^a |v|^b v^c of the speed v = v_on, or ratio · v_on − v_of: a force that brakes `on` and drives `of`.
+    """q_at^a |v|^b v^c of the speed v: a force that brakes the coordinate `on` and drives `of`.
 
-    b is 0 or 1, and with b = c = 0 the force is constant. A `dry` feature is q_at^a sgn(v). A `wave`, cos or sin, of
-    rate · q_at replaces the power of q_at; with `of_speed` the wave of rate · v is the whole feature. `air` is |v| v of
-    the whole velocity, on every coordinate. With an `input`, a column of u, −u takes the place of the factors of v: the
-    force drives `on`. With a `power` as well uᵖ v takes their place: the force brakes `on`.
+    v is v_on, or ratio · v_on − v_of with a damper between both. b is 0 or 1, and with b = c = 0 the force is constant.
+    A `dry` feature is q_at^a sgn(v). A `wave`, cos or sin, of rate · q_at replaces the power of q_at; with `of_speed`
+    the wave of rate · v is the whole feature. `air` is |v| v of the whole velocity, on every coordinate. With an
+    `input`, a column of u, −u takes the place of the factors of v: the force drives `on`. With a `power` as well uᵖ v
+    takes their place: the force brakes `on`.
     """
 
     on: int
@@ -67,7 +68,6 @@ class DragFeature:
     b: int = 0
     c: int = 0
     of: int | None = None
-    ratio: float = 1.0
     air: bool = False
     dry: bool = False
     wave: str = ""
@@ -75,6 +75,7 @@ class DragFeature:
     of_speed: bool = False
     input: int | None = None
     power: int = 0
+    ratio: float = 1.0
 
     @property
     def even(self) -> bool:
@@ -145,10 +146,10 @@ def _read(text: str, plain: str) -> DragFeature:
 
 
 def _joints(speed: str) -> dict[str, Any]:
-    """The coordinate `on` of a speed, and for a relative speed the second one, `of`, with the `ratio` of both."""
+    """The coordinate of a speed, and the second one of a relative speed with the ratio of the first."""
     on, *of = (int(k) - 1 for k in re.findall(r"v(\d+)", speed))
-    number = re.match(rf"{_NUMBER} ", speed)
-    return {"on": on, "of": of[0] if of else None, "ratio": float(number[0]) if number else 1.0}
+    number = speed.partition("v")[0].strip()
+    return {"on": on, "of": of[0] if of else None, "ratio": float(number) if number else 1.0}
 
 
 def _place(found: Parts) -> dict[str, Any]:
@@ -169,9 +170,7 @@ def _power_of_speed(found: Parts) -> DragFeature:
 
 def _wave_of_speed(found: Parts) -> DragFeature:
     joints = _joints(found["v"] or found["pair"])
-    return DragFeature(
-        **joints, at=joints["on"], wave=found["wave"], rate=float(found["rate"] or 1), of_speed=True
-    )  # fmt: skip
+    return DragFeature(**joints, at=joints["on"], wave=found["wave"], rate=float(found["rate"] or 1), of_speed=True)
 
 
 def _of_an_input(found: Parts) -> DragFeature:
@@ -203,12 +202,12 @@ _FORMS: tuple[tuple[re.Pattern[str], Callable[[Parts], DragFeature]], ...] = tup
 class Drag(nn.Module):
     """f = −Σ_g θ_g e q̄_j^a |v|^b v^c of the speeds v = e·Δ/h, with F⁻ = c (h/2) f and F⁺ = (h/2) f.
 
-    e has 1 at a joint and, for the relative speed of two joints, their ratio at the first and −1 at the second one;
-    drag through air is f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters of either sign that
-    start at 0: van der Pol's oscillator has negative viscous friction and the term q² v. The part of dry friction that
-    depends on the position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; set-valued friction takes the part
-    `held` at q0. An input that acts through the position is θ u_k q̄_j^a, or θ u_k cos q̄_j; a potential stands for its
-    sensor's zero. An input that brakes is −θ u_kᵖ v.
+    e has 1 at a joint or, for the relative speed of two joints, their ratio and −1 at the second joint; drag through
+    air is f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters of either sign that start at 0:
+    van der Pol's oscillator has negative viscous friction and the term q² v. The part of dry friction that depends on
+    the position is −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; set-valued friction takes the part `held` at
+    q0. An input that acts through the position is θ u_k q̄_j^a, or θ u_k cos q̄_j; a potential stands for its sensor's
+    zero. An input that brakes is −θ u_kᵖ v.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):

@@ -128,8 +128,9 @@ class FitConfig:
     drag
         Forces beside viscous friction, each with a learned coefficient (forced level): "|v1| v1", "q1^2 v1", "|v1|"
         (viscous friction that differs by direction), "|v| v" (a body in air), "(v1 - v2)" (a damper between two
-        coordinates), "load 1", "cos(q1) sgn(v1)" (dry friction that changes with the position), "u1 cos(q1)" (an
-        input that acts through the position), and "u1^2 v1" (one that brakes). See `herglotz.models.drag`.
+        coordinates; "(20.5 v1 - v2)" where these move in proportion), "load 1", "cos(q1) sgn(v1)" (dry friction
+        that changes with the position), "u1 cos(q1)" (an input that acts through the position), and "u1^2 v1" (one
+        that brakes). See `herglotz.models.drag`.
     order
         4: a rule of order 4 from the features, without networks. The parameters are then those of the continuous
         motion, and remain valid at other steps.

@@ -15,8 +15,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.smoothing import local_polynomials
@@ -31,6 +33,62 @@ def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
     None if there are too few independent samples for the n + m + 2 coefficients of a coordinate with m inputs. Samples
     that share half a smoothing window are dependent: their number is divided by the overlap.
     """
+    rows = _regressions(data)
+    if rows is None:
+        return None
+    n, kept = data.dof, torch.zeros(data.dof, data.dof, dtype=torch.bool)
+    for i, row in enumerate(rows):
+        kept[i, row.kept] = True
+    return [(i, j) for i, j in combinations(range(n), 2) if bool(kept[i, j] | kept[j, i])]
+
+
+def proportions(data: Trajectories) -> dict[tuple[int, int], str]:
+    """The ratio ρ of coordinates i < j, counted from 1, of different units between which a force of ρ q_i − q_j acts.
+
+    A difference of coordinates of different units says nothing before one of them is multiplied by a ratio: of a belt,
+    the radius of its pulley. −a_i / a_j of the regression that leaves the smaller share of its acceleration is ρ. None
+    of angles, whose waves repeat.
+    """
+    if len(set(data.units)) == 1 or any(data.angles) or (rows := _regressions(data, dampers=True)) is None:
+        return {}
+    found = {}
+    for i, j in combinations(range(data.dof), 2):
+        own = [row for k, other in ((i, j), (j, i)) if other in (row := rows[k]).kept and float(row.x[i])]
+        best = min(own, key=lambda row: row.left, default=None)
+        if best is not None and data.units[i] != data.units[j] and float(best.x[j]):
+            found[i + 1, j + 1] = _number(-float(best.x[i] / best.x[j]), 7)
+    return found
+
+
+def sizes(data: Trajectories) -> dict[tuple[int, int], str]:
+    """The ratio of the sizes of coordinates i < j, counted from 1, of different units.
+
+    Of many coordinates a force between two need not be of ρ q_i − q_j alone, as of a body on two springs. Without any
+    ratio a force on the smaller coordinate would be a small difference of large terms.
+    """
+    pairs = combinations(range(data.dof), 2)
+    return {
+        (i + 1, j + 1): _number(float(data.balance[j] / data.balance[i]), 3)
+        for i, j in pairs if data.units[i] != data.units[j]
+    }  # fmt: skip
+
+
+def _number(x: float, digits: int) -> str:
+    """A number with a point or an exponent, as `rates` reads the numbers of a term."""
+    text = f"{x:.{digits}g}"
+    return text if "." in text or "e" in text else f"{text}."
+
+
+class _Row(NamedTuple):
+    """The regression of an acceleration: coefficients x, other positions `kept` by it, and the share `left` of it."""
+
+    x: Tensor  # (n + m + 2,) of positions, 1, the own velocity and inputs; (2n + m + 1,) with all velocities
+    kept: list[int]
+    left: float
+
+
+def _regressions(data: Trajectories, *, dampers: bool = False) -> list[_Row] | None:
+    """The regressions of all accelerations, with `dampers` on all velocities; None if there are too few samples."""
     data = data.to(torch.float64, "cpu")
     local = local_polynomials(data)
     if local is None:
@@ -39,39 +97,24 @@ def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
     half = local.half[local.centred, None]
     q, v, a = (local.coefficients[local.centred, k] * math.factorial(k) / half**k for k in range(3))
     u = data.q.new_zeros(data.samples, 0) if data.u is None else data.u
-    count, coefficients = len(q) / overlap, n + 2 + u.shape[1]
-    if count <= coefficients:
+    count, unknowns = len(q) / overlap, u.shape[1] + (2 * n + 1 if dampers else n + 2)
+    if count <= unknowns:
         return None
-    worth, kept = math.log(count) + 2 * math.log(n - 1), torch.zeros(n, n, dtype=torch.bool)
+    worth, rows = math.log(count) + 2 * math.log(max(n - 1, 1)), []
     for i in range(n):
-        X = torch.cat([q, torch.ones_like(half), v[:, i, None], u[local.centred]], 1)
+        X = torch.cat([q, torch.ones_like(half), v if dampers else v[:, i, None], u[local.centred]], 1)
         x = least_squares(X, a[:, i, None])[:, 0]
-        variance = float((a[:, i] - X @ x).square().mean()) / (1 - coefficients / count)
+        left = float((a[:, i] - X @ x).square().mean())
         others = torch.tensor([j for j in range(n) if j != i])
-        kept[i, prune(X.T @ X, x, others, worth * overlap * variance)[0]] = True
-    return [(i, j) for i, j in combinations(range(n), 2) if bool(kept[i, j] | kept[j, i])]
+        kept = prune(X.T @ X, x, others, worth * overlap * left / (1 - unknowns / count))[0]
+        rows.append(_Row(x, kept.tolist(), left / float(a[:, i].var(correction=0).clamp_min(1e-300))))
+    return rows
 
 
-def terms_between(coupled: Collection[tuple[int, int]], data: Trajectories) -> tuple[str, ...]:
-    """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs (`difference`)."""
-    own, between = {}, {f"(q{i + 1} - q{j + 1})": difference("q", i, j, data) for i, j in coupled}
-    for name in lengths(data.angles):
-        form, mark, power = name.partition("^")
-        if len(_coordinates(name, data.angles)) == 1:
-            own[name] = name
-        elif form in between:
-            own[name] = between[form] + mark + power
-    return tuple(own.values())
-
-
-def difference(x: str, i: int, j: int, data: Trajectories) -> str:
-    """The text of the difference of two coordinates or speeds; coordinates of different units count by their size.
-
-    A spring between a metre and a degree would be that of the metre alone, and what it does to the angle a small
-    difference of large terms.
-    """
-    ratio = "" if data.units[i] == data.units[j] else f"{float(data.balance[j] / data.balance[i]):.3g} "
-    return f"({ratio}{x}{i + 1} - {x}{j + 1})"
+def terms_between(coupled: Collection[tuple[int, int]], angles: Sequence[bool]) -> tuple[str, ...]:
+    """The features of the dictionary `lengths` that are of one coordinate, or of two in these pairs."""
+    on = {name: _coordinates(name, angles) for name in lengths(angles)}
+    return tuple(name for name, own in on.items() if len(own) == 1 or own in coupled)
 
 
 def groups(features: Collection[str], angles: Sequence[bool]) -> list[list[int]]:

@@ -8,7 +8,7 @@ learned functions has the waves of all functions besides, with the standard numb
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
@@ -17,7 +17,7 @@ from herglotz.models import ModelConfig
 from herglotz.models.config import POWERS
 from herglotz.models.drag import AIR, parse_drag
 from herglotz.models.features import expand, lengths, revolute, slides, spherical, windings
-from herglotz.training.rates import rates_of
+from herglotz.training.rates import RATIO, rates_of
 from herglotz.training.waves import BRAKES, waves_of
 
 # Highest power of a length in the potential of one coordinate: forces up to x⁵.
@@ -26,6 +26,8 @@ HIGHEST = 6
 WEIGHTS = ("cos(q1)", "sin(q1)")
 # Highest harmonic of one angle.
 WAVES = 3
+# A sum or a difference of two coordinates, or of their speeds.
+PAIR = re.compile(r"\([qv](?P<i>\d+) [-+] [qv](?P<j>\d+)\)")
 COEFFICIENTS = re.compile(r"(potential\.features\.sum|kinetic\.sum|drag|action)\.coefficient(?:\[(\d+)\])?")
 
 
@@ -39,8 +41,9 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
         c = replace(c, diagonal=False)
     # All forces by position of the inputs that the model has some of.
     inputs = {k + 1 for text in c.drag if (k := parse_drag(text, c.angles).input) is not None}
-    features = (*features_of(c.angles), *windings(c.angles))
-    drag = (*drag_of(c.angles), *by_motion(c.angles, sorted(inputs)))
+    ratios = ratios_of((*expand(c.features, c.angles), *c.drag))
+    features = in_proportion((*features_of(c.angles), *windings(c.angles)), ratios)
+    drag = (*in_proportion(drag_of(c.angles), ratios), *by_motion(c.angles, sorted(inputs)))
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
     whole = replace(
         c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
@@ -53,6 +56,22 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
         if set(expand(config.features, c.angles)) <= set(wider.features) and set(config.drag) <= set(wider.drag):
             return wider
     return None
+
+
+def in_proportion(terms: Iterable[str], ratios: Mapping[tuple[int, int], str]) -> tuple[str, ...]:
+    """These terms, where sums and differences of two coordinates i < j have the ratio of the first as a number."""
+
+    def weighted(pair: re.Match[str]) -> str:
+        ratio = ratios.get((int(pair["i"]), int(pair["j"])))
+        return pair[0] if ratio is None else f"({ratio} {pair[0][1:]}"
+
+    return tuple(PAIR.sub(weighted, text) for text in terms)
+
+
+def ratios_of(terms: Iterable[str]) -> dict[tuple[int, int], str]:
+    """The ratios of coordinates, counted from 1, in these terms, as `in_proportion` writes them."""
+    found = (RATIO.fullmatch(text) for text in terms)
+    return {(int(x["i"]), int(x["j"])): x[0][1:].partition(" ")[0] for x in found if x is not None}
 
 
 @cache

@@ -66,22 +66,31 @@ def reason_of_inputs(
     """
     if data.u is None or not model.inputs or not bool(torch.isfinite(states).all()):
         return ""
-    growth = growth_of_noise(model, data, states, max_step)
-    lost, unit = growth >= 1, "" if data.time_unit == "1" else data.time_unit
-    if bool(lost.any()) and leaves_without_inputs(model, data, states, max_step):
-        since = data.t - data.t[list(data.offsets)][data.trajectory]
-        own = "The model, and maybe the motion, is unstable"
-        what = "The motion is unstable and its inputs hold it" if fits else own
-        return (
-            f"{what}: with the inputs as recorded an error of the start as small as the noise grows to the spread of "
-            f"the motion within {size(float(since[lost].min()), unit, digits=2)}, and longer runs tell a wrong start "
-            f"from a wrong force no more. {'Try' if fits else 'If the motion is unstable, try'} several recordings, "
-            "each no longer than that"
-        )
+    if unstable := held_by_inputs(model, data, states, max_step, fits):
+        how = "Try" if fits else "If the motion is unstable, try"
+        return f"{unstable}. {how} several recordings, each no longer than that"
     if (left := unexplained(data, states)) < HALF:
         ways = filter(None, (*SIGNALS, longer))
         return f"{_following(left)}: what they do and other forces make up for each other. Try {', or '.join(ways)}"
     return ""
+
+
+def held_by_inputs(
+    model: ContactLagrangian, data: Trajectories, states: Tensor, max_step: float, fits: bool = True
+) -> str:
+    """That the motion of a model that `fits` is unstable and its inputs hold it, in a sentence; "" if it is not so."""
+    if data.u is None or not model.inputs or not bool(torch.isfinite(states).all()):
+        return ""
+    lost = growth_of_noise(model, data, states, max_step) >= 1
+    if not (bool(lost.any()) and leaves_without_inputs(model, data, states, max_step)):
+        return ""
+    since, unit = data.t - data.t[list(data.offsets)][data.trajectory], "" if data.time_unit == "1" else data.time_unit
+    what = "The motion is unstable and its inputs hold it" if fits else "The model, and maybe the motion, is unstable"
+    return (
+        f"{what}: with the inputs as recorded an error of the start as small as the noise grows to the spread of "
+        f"the motion within {size(float(since[lost].min()), unit, digits=2)}, and longer runs tell a wrong start "
+        "from a wrong force no more"
+    )
 
 
 def reason_of_idle_inputs(

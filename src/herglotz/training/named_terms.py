@@ -15,7 +15,7 @@ from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.models.translations import differences, directions, unchanged
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.dictionary import HIGHEST, WAVES, WEIGHTS, drag_of, features_of
+from herglotz.training.dictionary import HIGHEST, WAVES, WEIGHTS, drag_of, features_of, in_proportion
 from herglotz.training.parameter_vector import ParameterVector
 
 # Minimum ratio of the smaller to the larger excursion from 0. Below it the data say nothing about a kink at 0.
@@ -67,8 +67,13 @@ class NamedTerms:
         return replace(self, **{name: tuple(chosen(name, getattr(self, name))) for name in kinds})
 
 
-def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTerms:
-    """The candidate terms for these coordinates; with translations only terms of L that they leave unchanged."""
+def candidates(
+    data: Trajectories, translations: Sequence[str] = (), ratios: Mapping[tuple[int, int], str] | None = None
+) -> NamedTerms:
+    """The candidate terms for these coordinates; with translations only terms of L that they leave unchanged.
+
+    `ratios` are those of coordinates of different units that move in proportion (`coupled_pairs.proportions`).
+    """
     if translations:
         return _unmoved(data, directions(translations, data.angles))
     angles = data.angles
@@ -76,6 +81,7 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
     # The length |v| of a velocity needs one unit.
     one_unit = len(set(data.units)) == 1
     drag = tuple(text for text in drag_of(angles) if one_unit or text != AIR)
+    features, drag = (in_proportion(texts, ratios or {}) for texts in (features, drag))
     return NamedTerms((*features, *special(data)), drag, dry=True)
 
 

@@ -1,8 +1,9 @@
-"""Rates of waves as arguments of a kernel: one compiled kernel serves recordings of every range.
+"""Rates of waves, and ratios of coordinates, as arguments of a kernel: one kernel serves recordings of every range.
 
 The waves of a learned function are whole multiples j of a longest wave, sin(j (k q + φ)), and k and φ follow from the
 range of a recording (`waves`). Compiled as constants, these numbers would ask for a kernel of its own for every
-recording. A kernel is therefore traced for standard numbers, and takes those of a model as arguments.
+recording. A kernel is therefore traced for standard numbers, and takes those of a model as arguments. So does the ratio
+of two coordinates that move in proportion, (20.5 q1 - q2)^2.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ from herglotz.models.features import expand
 # A wave, and a number in the argument of a wave with the variable that follows, none for a phase. Whole numbers, such
 # as those of the harmonics of an angle, stay constants.
 WAVE = re.compile(r"\b(?:cos|sin)\((?:[^()]|\([^()]*\))*\)")
-NUMBER = re.compile(r"(?<![\w.])(?P<number>\d+\.\d*(?:e[-+]?\d+)?|\d+e[-+]?\d+)(?: ?(?P<of>[qv]\d+|\(v\d+ - v\d+\)))?")
+# A power of a form of two coordinates that move in proportion, or of their speeds, with the ratio of the first.
+_DECIMAL = r"\d+\.\d*(?:e[-+]?\d+)?|\d+e[-+]?\d+"
+RATIO = re.compile(rf"\(-?(?P<number>{_DECIMAL}) [qv](?P<i>\d+) [-+] [qv](?P<j>\d+)\)(?:\^\d+)?")
+NUMBER = re.compile(rf"(?<![\w.])(?P<number>{_DECIMAL})(?: ?(?P<of>[qv]\d+|\(v\d+ - v\d+\)))?")
 VARIABLE = re.compile(r"[qv]\d+")
 # Largest multiple of a base that is looked for.
 MOST = 100
@@ -89,7 +93,7 @@ def buffers_at(model: ContactLagrangian, bases: Sequence[Base], rates: Tensor) -
     """The buffers of a model with multiples of standard numbers, with `rates` (R,) in the place of these numbers."""
     found: dict[str, Tensor] = {}
     for name, module in model.named_modules() if bases else ():
-        with_rates = {Combination: ("form", "phase"), Drag: ("at", "along")}.get(type(module), ())
+        with_rates = {Combination: ("form", "phase"), Drag: ("at", "along", "on")}.get(type(module), ())
         for own in with_rates:
             value = module.get_buffer(own)
             entries = value.flatten()
@@ -106,6 +110,8 @@ def buffers_at(model: ContactLagrangian, bases: Sequence[Base], rates: Tensor) -
 def _numbers(text: str) -> Iterator[tuple[str, float, tuple[int, int]]]:
     """The numbers in the waves of a term: kind, number, and where it stands in the text."""
     factors = WAVE.sub("", text).strip()
+    if ratio := RATIO.fullmatch(text):
+        yield f"{ratio['j']} over {ratio['i']}", float(ratio["number"]), ratio.span("number")
     for wave in WAVE.finditer(text):
         numbers = list(NUMBER.finditer(text, wave.start(), wave.end()))
         shifted = " ".join(VARIABLE.findall(wave[0])) if any(found["of"] is None for found in numbers) else ""

@@ -7,7 +7,7 @@ compared by the inequality of `score`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -23,6 +23,7 @@ from herglotz.models.features import spherical, windings
 from herglotz.progress import FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.coupled_pairs import proportions
 from herglotz.training.following import HALF, unexplained
 from herglotz.training.friction_search import with_dissipation, with_sticking, without_injecting_friction
 from herglotz.training.functions import bands
@@ -68,11 +69,16 @@ Zeroed = tuple["Search", Trial | None, Zeros | None]
 class Search:
     """A search over recordings; `part` is the search of a part of long recordings, otherwise the search itself.
 
-    A step of these data is `step_ratio` steps of the data to be fitted. Functions have the range of `range_data`.
+    A step of these data is `step_ratio` steps of the data to be fitted. Functions have the range of `range_data`, and
+    `ratios` are those of coordinates that move in proportion, by default as these data show them.
     """
 
-    def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False):
+    def __init__(
+        self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False,
+        ratios: Mapping[tuple[int, int], str] | None = None,
+    ):  # fmt: skip
         self.data, self.base, self.config, self.range_data = data, base, config, data
+        self.ratios = proportions(data) if ratios is None else ratios
         self.freedom = FREEDOM if outliers else None
         self.order = 4 if is_precise(data) and data.dof == 1 else 2
         self.fitters: dict[Variant, Fitter] = {}
@@ -85,7 +91,7 @@ class Search:
 
     def of(self, data: Trajectories) -> Search:
         """The same search of other data."""
-        other = Search(data, self.base, self.config, outliers=self.freedom is not None)
+        other = Search(data, self.base, self.config, outliers=self.freedom is not None, ratios=self.ratios)
         other.order, other.range_data = self.order, self.range_data
         return other
 
@@ -93,7 +99,7 @@ class Search:
         """The fitter of a variant, made once."""
         if variant not in self.fitters:
             like = next(iter(self.fitters.values()), None)
-            self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom, like)
+            self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom, like, self.ratios)
         return self.fitters[variant]
 
     @cached_property
@@ -307,7 +313,7 @@ class Search:
 
         Terms that are nearly collinear with others are left out (`special`, `spherical`).
         """
-        local, every = local_polynomials(self.data), candidates(self.data, self.config.translations)
+        local, every = local_polynomials(self.data), candidates(self.data, self.config.translations, self.ratios)
         every = every.only(set(every.names).difference(special(self.data), spherical(self.data.angles)))
         every = every.joined(NamedTerms(drag=self.config.drag))
         start = None if local is None else start_of(self.data, self.base, every, local)
@@ -391,7 +397,12 @@ class Search:
             if moved(trial, problem, trial.theta) <= FINER * max(trial.rms, fitter.floor / ALIKE):
                 break
             fit = other.fit(trial.taken, trial.values, trial.length, trial)
-            if fit is None or trial.replaces(fit):
+            # Finer steps cannot miss what coarser ones meet: from these values the fit has not found its way.
+            if fit is None or fit.rms > MAX_MISFIT * other.spread:
+                break
+            if trial.segments_at_the_noise and not fit.segments_at_the_noise:
+                break
+            if trial.replaces(fit):
                 break
             trial = other.grow(fit)
         return trial
@@ -459,7 +470,7 @@ class Search:
         forces = input_forces(terms)
         data = with_input_terms(self.data, input_columns(terms))
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        drag = (*self.config.drag, *forces)
-        other = Search(data, base, replace(self.config, drag=drag), outliers=self.freedom is not None)
+        config = replace(self.config, drag=(*self.config.drag, *forces))
+        other = Search(data, base, config, outliers=self.freedom is not None, ratios=self.ratios)
         other.order = self.order
         return other

@@ -30,8 +30,9 @@ from herglotz.models.features import expand, lengths, revolute
 from herglotz.training.acting_inputs import asked_terms
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.coupled_pairs import coupled_pairs, difference, terms_between
+from herglotz.training.coupled_pairs import coupled_pairs, sizes, terms_between
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
+from herglotz.training.dictionary import in_proportion
 from herglotz.training.distributed import of_first
 from herglotz.training.found_model import settings as settings_of_trial
 from herglotz.training.kernel import MAX_PARAMETERS
@@ -151,7 +152,7 @@ def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
     names = tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
     springs = tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))
     coupled = coupled_pairs(data) if data.dof > MOST else None
-    return [names, *([] if coupled is None else [terms_between(coupled, data)]), springs]
+    return [names, *([] if coupled is None else [terms_between(coupled, data.angles)]), springs]
 
 
 def kept_structure(
@@ -266,7 +267,8 @@ def search_between_coupled(data: Trajectories, base: Baseline, config: FitConfig
     """
     if (coupled := coupled_pairs(data)) is None:
         return "too few samples to find which coordinates are coupled"
-    terms, dampers = terms_between(coupled, data), tuple(difference("v", i, j, data) for i, j in coupled)
+    dampers = in_proportion((f"(v{i + 1} - v{j + 1})" for i, j in coupled), sizes(data))
+    terms = in_proportion(terms_between(coupled, data.angles), sizes(data))
     offered = replace(config, dtype="float64", device="cpu", level="forced", features=terms)
     tried = (Search(data, base, replace(offered, drag=drag), outliers=outliers) for drag in (dampers, ()))
     found = next((x for x in tried if len(x.fitter(Variant(x.order)).start) <= MAX_PARAMETERS), None)

@@ -57,12 +57,12 @@ class TrajectoryFit:
 
     @property
     def misfit(self) -> Tensor:
-        """Residuals of the complete samples in use, (N', n), in units of q."""
+        """Residuals of the complete samples in use, (N', n), in units of q over the balance."""
         return self.problem.misfit(self.path)[self.problem.used & self.problem.data.complete]
 
     @property
     def noise(self) -> float:
-        """Scale of the residuals, in units of q: RMS, or with a robust loss the median absolute deviation."""
+        """Scale of the residuals, in units of q over the balance: RMS, or a robust scale."""
         return scale_of(self.misfit) if self.problem.freedom else float(self.misfit.square().mean().sqrt())
 
     @property

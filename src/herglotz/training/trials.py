@@ -17,7 +17,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import input_terms_of
-from herglotz.data.noise import AT_THE_NOISE, coarse, precision, relative_spread
+from herglotz.data.noise import AT_THE_NOISE, coarse, precision, precisions, relative_spread
 from herglotz.data.smoothing import slopes, smoothed
 from herglotz.models.features import windings
 from herglotz.training.baseline import Baseline
@@ -173,6 +173,41 @@ class Trial:
         return self.whole and self.rms <= EXACT_ENOUGH * self.fitter.spread
 
     @cached_property
+    def unstable(self) -> bool:
+        """True if the model meets the samples of its segments to the noise, and in longer ones noise would be `lost`.
+
+        Without the joints, whose misfit of an unstable motion is that of the ends of segments.
+        """
+        if self.whole or not self.lost:
+            return False
+        r = self._held_out.fitted_residuals([range(self.problem.P)])[0][self.problem.data.complete]
+        return float(r.square().mean().sqrt()) <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
+
+    @cached_property
+    def lost(self) -> bool:
+        """True if an error of the start as small as the noise grows to the spread of the motion in longer segments.
+
+        In two segments, one after the other, by the linearised steps of this model: as an unstable motion does. Longer
+        segments would tell a wrong start from a wrong force no more.
+        """
+        problem, grid, data = self.problem, self.problem.grid, self.problem.data
+        n, d, spread = problem.n, problem.d, data.q.std(0, correction=0).clamp_min(1e-300)[:, None]
+        noise = (precisions(data).to(data.q) * data.balance).diag()  # (n, n)
+
+        def size(error: Tensor) -> Tensor:
+            return (error / spread).square().sum((-2, -1)).div(n).sqrt().nan_to_num(torch.inf)
+
+        # Growth by a factor G in one segment is growth by about G² in two, and slower growth is less.
+        slopes = problem.slopes_at_samples(self.theta, self.path)[..., problem.P : problem.P + n]
+        if self.whole or float(size(slopes @ noise).max()) ** 2 < float(size(noise)):
+            return False
+        moved = problem.sensitivities(self.theta, self.path, held=True).detach()  # (S, K + 1, d, d)
+        first = torch.cat([noise, noise.new_zeros(d - n, n)]).expand(grid.segments, d, n)
+        ends = moved[torch.arange(grid.segments), grid.end] @ first
+        first = torch.where(grid.joined[:, None, None], ends.roll(1, 0), first)
+        return bool((size(grid.at_samples((moved @ first[:, None])[..., :n, :])) >= 1).any())
+
+    @cached_property
     def lacks_nothing(self) -> bool:
         """True if the misfit of whole trajectories is about the noise and white, or too small to matter."""
         return self.at_the_noise and (self.misses_next_to_nothing or are_white(self.problem, self.path))
@@ -198,31 +233,34 @@ class Trial:
     def gain(self, simple: Trial, more: int = 0) -> float:
         """`Score.gain` over a simpler model, with `more` further numbers; ±infinite if segments differ in length.
 
-        The model that follows longer segments is better.
+        The model that follows longer segments is better, as far as noise lets them be followed (`of_one_length`).
         """
-        if self.length != simple.length:
+        if (pair := of_one_length(self, simple)) is None:
             return math.inf if self.length > simple.length else -math.inf
+        rich, other = pair
         offered = max(self.fitter.offered, simple.fitter.offered)
-        return replace(self.score, zeros=more).gain(simple.score, offered)
+        return replace(rich.score, zeros=more).gain(other.score, offered)
 
     def foretells(self, other: Trial) -> bool:
         """True if this model misses held-out blocks clearly less than another, whatever the numbers of both cost.
 
-        The model that follows longer segments is better.
+        The model that follows longer segments is better, as far as noise lets them be followed (`of_one_length`).
         """
-        if self.length != other.length:
+        if (pair := of_one_length(self, other)) is None:
             return self.length > other.length
-        return self.score.clearly_better(other.score)
+        return pair[0].score.clearly_better(pair[1].score)
 
     def fits_better(self, simple: Trial, zeros: int = 0) -> bool:
         """True if this model, with `zeros` of sensors as further numbers, replaces a model with the same offers.
 
-        By the residuals of both fits (`fitted_score`); the model that follows longer segments is better.
+        By the residuals of both fits (`fitted_score`); the model that follows longer segments is better, as far as
+        noise lets them be followed (`of_one_length`).
         """
-        if self.length != simple.length:
+        if (pair := of_one_length(self, simple)) is None:
             return self.length > simple.length
-        theirs = fitted_score(simple.problem, simple.path, self.fitter.floor)
-        own = fitted_score(self.problem, self.path, self.fitter.floor, zeros)
+        rich, other = pair
+        theirs = fitted_score(other.problem, other.path, self.fitter.floor)
+        own = fitted_score(rich.problem, rich.path, self.fitter.floor, zeros)
         return own.replaces(theirs, self.fitter.offered)
 
     @property
@@ -253,16 +291,17 @@ class Fitter:
     """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
 
     `like` is another fitter of the same data, which shares its segments and noise levels. Numbers are scalar
-    parameters, by name; `keys` has the term of each number. Features in the settings take the place of `candidates`.
+    parameters, by name; `keys` has the term of each number. Features in the settings take the place of `candidates`;
+    `ratios` are those of the candidates.
     """
 
     def __init__(
         self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None,
-        like: Fitter | None = None,
+        like: Fitter | None = None, ratios: Mapping[tuple[int, int], str] | None = None,
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
         bands = variant.functions
-        terms = NamedTerms(config.features) if config.features else candidates(data, config.translations)
+        terms = NamedTerms(config.features) if config.features else candidates(data, config.translations, ratios)
         terms = terms.joined(NamedTerms(tuple(windings(data.angles)))) if variant.windings else terms
         terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
         self.terms = terms = replace(terms, dissipation=variant.dissipation)
@@ -400,8 +439,12 @@ class Fitter:
         return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
-        """The model over segments of the next length; None if there is none or the model does not follow so long."""
-        if trial.whole:
+        """The model over segments of the next length; None if there is none or the model does not follow so long.
+
+        None, too, if a model at the noise lets noise grow to the spread in these: held-out blocks of such segments
+        compare starts, and no forces. Of a model that misses more, it may be the model that is unstable.
+        """
+        if trial.whole or trial.unstable:
             return None
         length = self.lengths[self.lengths.index(trial.length) + 1]
         found = self.fit(trial.taken, trial.values, length, trial)
@@ -453,6 +496,21 @@ def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
     if path is None:
         return math.inf
     return float((problem.misfit(path) - trial.problem.misfit(trial.path)).square().mean().sqrt())
+
+
+def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:
+    """Two models over segments of one length; None if their segments differ, and longer ones say more.
+
+    Segments of an unstable motion are as long as they can be if noise grows to the spread in longer ones
+    (`Trial.unstable`). A model that misses longer ones by more than the noise follows them with a motion less
+    unstable than that of a model at the noise of the shorter ones: the two are compared over these.
+    """
+    if own.length == other.length:
+        return own, other
+    long, short = (own, other) if own.length > other.length else (other, own)
+    if long.segments_at_the_noise or not short.unstable or (same := long.fitter.over(long, short.length)) is None:
+        return None
+    return (same, short) if long is own else (short, same)
 
 
 def likeliest(trial: Trial, most: int) -> Trial:

@@ -38,6 +38,7 @@ from herglotz.stepping import Stepper, state_of
 from herglotz.training.errors_of_runs import EXACT_ENOUGH, Errors
 from herglotz.training.feedback import (
     caveat_of_inputs,
+    held_by_inputs,
     reason_of_idle_inputs,
     reason_of_inputs,
     reason_of_set_points,
@@ -84,7 +85,8 @@ def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tens
     if found is None:
         return data.q.new_full((1, data.dof), torch.inf)
     miss = found.misfit
-    return miss if found.problem.freedom is None else miss * (scale_of(miss) / miss.square().mean().sqrt())
+    by = 1.0 if found.problem.freedom is None else scale_of(miss) / miss.square().mean().sqrt()
+    return miss * by * data.balance
 
 
 def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: float | None) -> TrajectoryFit | None:
@@ -180,7 +182,8 @@ def judged(
         "driven": train.u is not None, "level": task.config.level, "angles": _never_turned(train),
         "columns": ways_of_columns(train),
     }  # fmt: skip
-    return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond)} | kept_numbers
+    held = partial(held_by_inputs, model, train, states, task.base.model_step)
+    return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond, held)} | kept_numbers
 
 
 def _never_turned(data: Trajectories) -> bool:
@@ -289,22 +292,29 @@ def in_words(
     misread: str = "",
     caveat: str = "",
     beyond: Callable[[], str] = str,
+    held: Callable[[], str] = str,
 ) -> str:
     """One of the three verdicts, with numbers and, if the model does not fit, a remedy.
 
     `shown` gives the reason of a model that misses the training data, or of one that does not, with a remedy
     (`herglotz.training.missed`, `herglotz.training.feedback`); `misread` says what is wrong with the recording,
-    `caveat` what a model that fits rests on, and `beyond` says why unseen data differ from the training data.
+    `caveat` what a model that fits rests on, and `beyond` says why unseen data differ from the training data. `held`
+    says that inputs hold an unstable motion: no free run over all unseen time follows it, and windows at the noise
+    judge alone.
     """
     free, missed = errors.free or 0.0, errors.missed
     if misread:
         return f"{FAILS}: {errors}. {misread}"
     follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
-    if not follows or not math.isfinite(free):
+    met = not missed and errors.unseen is not None and errors.unseen <= AT_THE_NOISE * errors.limit
+    unstable = held() if met and not free <= errors.lost else ""
+    if not follows or not (math.isfinite(free) or unstable):
         return f"{FAILS}: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     # Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: {_unseen_motion(errors)}"
+    if unstable:
+        return f"{_fits(replace(errors, free=None))}: {errors}. {unstable}"
     # Two motions of one kind that know nothing of each other differ by √2 of their spread. The errors of a start and
     # those of a model know nothing of each other, either.
     chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread

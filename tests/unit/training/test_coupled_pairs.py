@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, structure
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.coupled_pairs import coupled_pairs, groups, terms_between
+from herglotz.training.coupled_pairs import coupled_pairs, groups, proportions, terms_between
 from herglotz.training.search import Search
 from herglotz.training.structure import many_are_free, search_of_many
 from herglotz.training.trials import Variant
@@ -104,7 +105,7 @@ def test_few_samples_couple_nothing():
 
 def test_terms_between_pairs():
     # fails if a pair that nothing couples has a term, or one of a coupled pair or of a single coordinate is lost
-    names = terms_between([(0, 1), (2, 3)], chain(4))
+    names = terms_between([(0, 1), (2, 3)], (False,) * 4)
     assert set(names) == {
         *(f"(q{i} - q{j})^{k}" for i, j in ((1, 2), (3, 4)) for k in (2, 3, 4)),
         *(f"q{i}^{k}" for i in range(1, 5) for k in (3, 4)),
@@ -194,3 +195,70 @@ def test_numbers_that_a_kernel_takes_are_offered(monkeypatch, most, taken):
     assert found.sigma is None
     assert offered == ([] if taken is None else [taken])
     assert ("too many forces" in found.reason) is (taken is None)
+
+
+def drive(ratio=20.0, h=0.001, samples=1200, seed=0):
+    """A motor [rad] and a carriage [mm] on a belt, with a torque that jumps: exact motion by exp(hA), with noise.
+
+    φ″ = −2 φ′ + 5000 u − F/10, x″ = −2 x′ + F/1.5 with the belt's force F = 2000 (ρ φ − x) + 1 (ρ φ′ − x′), ρ = ratio.
+    """
+    k, d = 2000.0, 1.0
+    A = torch.tensor(
+        [[0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [-k * ratio / 10, k / 10, -2 - d * ratio / 10, d / 10, 5000],
+         [k * ratio / 1.5, -k / 1.5, d * ratio / 1.5, -2 - d / 1.5, 0], [0, 0, 0, 0, 0]],
+        dtype=torch.float64,
+    )  # fmt: skip
+    make, step = torch.Generator().manual_seed(seed), torch.linalg.matrix_exp(h * A)
+    x, path, u = torch.zeros(5, dtype=torch.float64), [], []
+    for n in range(samples):
+        if n % 60 == 0:
+            x[4] = 1.2 * float(torch.rand((), generator=make)) - 0.6
+        path, u = [*path, x[:2]], [*u, x[4].clone()]
+        x = torch.cat([(step @ x)[:4], x[4:]])
+    q = torch.stack(path)
+    q = q + torch.tensor([1e-4, 2e-3]) * torch.randn(q.shape, generator=make, dtype=q.dtype)
+    t = h * torch.arange(samples, dtype=torch.float64)
+    data = Trajectories.of(t, q, u=torch.stack(u)[:, None], hold="zero")
+    return replace(data, names=("motor", "carriage"), units=("rad", "mm"))
+
+
+def test_a_belt_pulls_by_a_difference_of_two_units():
+    # fails if a difference of coordinates is that of their numbers in any units: what holds motor [rad] and carriage
+    # [mm] together was three terms, none of which alone was better, and a stiff belt was not found
+    data = drive()
+    (ratio,) = proportions(data).values()
+    assert float(ratio) == pytest.approx(20.0, rel=1e-4)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    fitter = search.fitter(Variant(2, substeps=2))
+    taken = {f"({ratio} q1 - q2)^2", f"({ratio} v1 - v2)"}
+    assert taken <= {offer.name for offer in fitter.offers}
+    found = search.climbed(fitter, fitter.simple | taken, {})
+    assert found is not None
+    assert found.segments_at_the_noise
+    assert taken <= found.taken
+    value = {fitter.keys[name]: x for name, x in found.values.items()}
+    # V = ½ k (ρ φ − x)² over the mass 10/ρ of the motor, and so the damper.
+    assert value[f"({ratio} q1 - q2)^2"] == pytest.approx(2000 / 20 / 10 / 2, rel=0.05)
+    assert value[f"({ratio} v1 - v2)"] == pytest.approx(1 / 20 / 10, rel=0.1)
+
+
+@pytest.mark.parametrize("changes", [{"units": ("mm", "mm")}, {"angles": (True, False)}])
+def test_one_unit_and_angles_have_no_ratio(changes):
+    # fails if the differences of coordinates of one unit, which springs have, get another ratio
+    assert proportions(replace(drive(samples=400), **changes)) == {}
+
+
+def test_a_damper_in_proportion_brakes_both():
+    # fails if the force on the first coordinate lacks the ratio: power and loss would differ
+    config = ModelConfig(
+        angles=(False, False), level="forced", scale=(1.0, 1.0), speed=(1.0, 1.0), stiffness=(0.0, 0.0),
+        tilt=(0.0, 0.0), potential_width=0, rate=0.0, drag=("(2.5 v1 - v2)",),
+    )  # fmt: skip
+    model: Any = ContactLagrangian(config)
+    v = torch.tensor([[0.7, -0.4]], dtype=torch.float64)
+    with torch.no_grad():
+        model.drag.coefficient.fill_(3.0)
+        forces = model.forces(0 * v, 0.1 * v, torch.zeros(1).double(), torch.full((1,), 0.1).double())
+    total = (forces[0] + forces[1]) / 0.1
+    slip = 2.5 * 0.7 + 0.4
+    assert total[0].tolist() == pytest.approx([-3 * 2.5 * slip, 3 * slip])

@@ -13,7 +13,8 @@ from herglotz.cli.common import exit_code
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
-from herglotz.training import fit
+from herglotz.training import FitConfig, fit
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.errors_of_runs import Errors
 from herglotz.training.feedback import (
     acting_set_points,
@@ -26,6 +27,8 @@ from herglotz.training.feedback import (
 )
 from herglotz.training.following import unexplained
 from herglotz.training.foresight import Foresight
+from herglotz.training.search import Search
+from herglotz.training.trials import Variant, of_one_length
 from herglotz.training.verdict import in_words
 from runge_kutta import step
 
@@ -83,6 +86,35 @@ def test_the_reason_is_what_is_measured(stiffness, moved, expected):
         assert said == pytest.approx(t, rel=0.05)
     assert reason_of_inputs(model, replace(data, u=None), states, H) == ""
     assert reason_of_inputs(model, data, states * math.nan, H) == ""
+
+
+@pytest.mark.parametrize(("stiffness", "last"), [(-9.0, 80), (9.0, K - 1)])
+def test_segments_of_an_unstable_motion_end_where_noise_is_lost(stiffness, last):
+    # fails if segments of a balanced motion grow until an error of the start, e^(3 t) times the noise, is the motion:
+    # held-out blocks then compared starts, and a cart with a pole lost what couples the two
+    _, data, _ = balanced(stiffness)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    fitter = search.fitter(Variant(2))
+    trial = fitter.fit({"q1^2", "friction.input_map"}, {}, 20, None, 30)
+    assert trial is not None
+    assert not trial.lost
+    assert fitter.grow(trial).length == last
+    assert fitter.grow(trial).unstable is (stiffness < 0)
+
+
+@pytest.mark.parametrize(
+    ("unstable", "at_the_noise", "compared"), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_wrong_motion_that_is_stable_does_not_win_by_its_length(unstable, at_the_noise, compared):
+    # fails if a model that misses long segments replaces the law of an unstable motion, which follows short ones to the
+    # noise; or if an unstable model of short segments replaces one that meets longer ones
+    same = SimpleNamespace(length=80)
+    long: Any = SimpleNamespace(
+        length=640, segments_at_the_noise=at_the_noise, fitter=SimpleNamespace(over=lambda *_: same)
+    )
+    short: Any = SimpleNamespace(length=80, unstable=unstable)
+    assert of_one_length(long, short) == ((same, short) if compared else None)
+    assert of_one_length(short, long) == ((short, same) if compared else None)
 
 
 def test_inputs_that_hold_a_motion():

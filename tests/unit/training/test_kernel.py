@@ -55,6 +55,14 @@ MODELS = {
         diagonal=True,
         drag=("(v1 - v2)", "|v| v"),
     ),
+    "lengths in proportion": replace(
+        JOINTS,
+        angles=(False, False),
+        features=("(2.5 q1 - q2)^2", "(2.5 q1 + q2)^3", "q1^3"),
+        coupled=False,
+        diagonal=True,
+        drag=("(2.5 v1 - v2)", "|v1| v1"),
+    ),
     "own structure": replace(PENDULUM, alike=False, stiffness=(1.0,)),
     "waves of one length": waves(middle=0.3, half=1.7, speed=2.0),
     "waves of several kinds": replace(

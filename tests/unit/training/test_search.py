@@ -599,6 +599,28 @@ def test_friction_that_holds_is_compared_at_steps_short_enough(coarse, told):
     assert with_sticking(search, smooth) is (smooth if coarse or told is False else fine)
 
 
+@pytest.mark.parametrize(
+    ("met", "rms", "at_the_noise", "replaced"),
+    [(True, 0.011, True, True), (True, 0.02, False, False), (False, 0.02, False, True), (False, 26.0, False, False)],
+)
+def test_finer_steps_replace_a_model_at_the_noise_at_the_noise(met, rms, at_the_noise, replaced, monkeypatch):
+    # fails if a fit that has lost its way, from 1.2 to 2.1 or 2300 mm of a balanced pole, counts as that of finer steps
+    monkeypatch.setattr(search_module, "moved", lambda *_: 1.0)
+    search = searched(Trajectories.of(torch.arange(9.0), torch.arange(9.0) ** 2))
+    fine: Any = SimpleNamespace(rms=rms, segments_at_the_noise=at_the_noise, fitter=None)
+    other: Any = SimpleNamespace(
+        variant=Variant(2, substeps=64), problem=lambda _: SimpleNamespace(of=lambda *_: None), numbers=lambda _: [],
+        spread=100.0, fit=lambda *_: fine, grow=lambda trial: trial,
+    )  # fmt: skip
+    fine.fitter = other
+    monkeypatch.setattr(search, "fitter", lambda _: other)
+    trial: Any = SimpleNamespace(
+        fitter=SimpleNamespace(variant=Variant(2), floor=1e-9), length=9, taken=frozenset(), theta=None, rms=0.01,
+        problem=SimpleNamespace(sigma=1.0), values={}, segments_at_the_noise=met, replaces=lambda _: False,
+    )  # fmt: skip
+    assert search.finer(trial) is (fine if replaced else trial)
+
+
 @pytest.mark.parametrize(("rms", "joins"), [(0.2, True), (0.3, False)])
 def test_a_model_that_goes_astray_takes_no_place(rms, joins, monkeypatch):
     # fails if a model that misses a quarter of the spread replaces one that follows: unstable motion, whose own score

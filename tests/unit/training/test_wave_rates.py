@@ -37,6 +37,19 @@ def test_other_numbers_and_other_kinds_of_waves_have_other_bases(terms):
     assert len(rates_of(terms).values) == 2
 
 
+def test_coordinates_have_one_ratio_and_one_kernel():
+    # fails if each radius of a pulley asks for a kernel of its own, or powers and speeds have a ratio each
+    texts = [f"({{}} q1 - q2)^{k}" for k in (2, 3, 4)] + ["({} q1 + q2)^4", "({} v1 - v2)"]
+    found = []
+    for ratio in ("19.99998", "0.33332"):
+        own = tuple(text.format(ratio) for text in texts)
+        rates = rates_of(own)
+        assert list(rates.values.values()) == [float(ratio)]
+        found.append(rates.standard(own))
+    assert found[0] == found[1]
+    assert len(rates_of(("(2.5 q1 - q2)^2", "(2.5 q1 - q3)^2")).values) == 2
+
+
 def test_whole_numbers_are_constants():
     # fails if a harmonic of an angle, a power or an index is an argument
     rates = rates_of(("cos(3q1)", "sin(2q2) v1 v2", "q1^4", "cos(q1 - q2) v1 v2", "cos(2 q1) sgn(v1)", "|v1| v1"))
