@@ -27,6 +27,7 @@ with the current u1 has u1² v.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -42,8 +43,9 @@ from herglotz.models.term import with_force
 # Highest power of a speed or a position.
 MAX_POWER = 9
 _NUMBER = r"\d+(?:\.\d*)?(?:e[-+]?\d+)?"
-_PAIR = rf"(?:-?{_NUMBER} )?v\d+ - v\d+"
-_SPEED = rf"(?:(?P<v>v\d+)|\((?P<pair>{_PAIR})\))"
+_PLAIN_PAIR = r"v\d+ - v\d+"
+_PAIR = rf"(?:-?{_NUMBER} )?{_PLAIN_PAIR}"
+_SPEED, _PLAIN_SPEED = (rf"(?:(?P<v>v\d+)|\((?P<pair>{pair})\))" for pair in (_PAIR, _PLAIN_PAIR))
 _WAVE = rf"(?P<wave>cos|sin)\((?:(?P<rate>{_NUMBER}) ?)?"
 _AT = rf"(?:{_WAVE}q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?)"
 _INPUTS = (rf"u(?P<input>\d+) {_AT}(?: on q(?P<on>\d+))?", r"u(?P<input>\d+)(?:\^(?P<power>\d+))? v(?P<on>\d+)")
@@ -119,7 +121,8 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     powers = map(int, re.findall(r"\^(\d+)", plain))
     refuse({
         f"drag '{text}': the coordinates are numbered 1 … {n}": not {f.on, f.at, f.of} <= {None, *range(n)},
-        f"drag '{text}': v{f.on + 1} - v{f.on + 1} is 0; name two coordinates": f.of == f.on,
+        f"drag '{text}': v{f.on + 1} is named twice; name two coordinates": f.of == f.on,
+        f"drag '{text}': the number before v{f.on + 1} is {f.ratio:g}": not 0 < abs(f.ratio) < math.inf,
         f"drag '{text}': inputs are numbered from 1": f.input == -1,
         f"drag '{text}': powers are whole numbers from 1 to {MAX_POWER}": not all(1 <= k <= MAX_POWER for k in powers),
     })  # fmt: skip
@@ -189,7 +192,7 @@ _FORMS: tuple[tuple[re.Pattern[str], Callable[[Parts], DragFeature]], ...] = tup
     (re.compile(pattern), read)
     for pattern, read in (
         (rf"(?:{_AT} )?(?:\|(?P<size>v\d+|{_PAIR})\| )?{_SPEED}(?:\^(?P<c>\d+))?", _power_of_speed),
-        (rf"{_WAVE}{_SPEED}\)", _wave_of_speed),
+        (rf"{_WAVE}{_PLAIN_SPEED}\)", _wave_of_speed),
         (rf"{_AT} sgn\(v(?P<on>\d+)\)", lambda found: _on_a_joint(found, **_place(found), dry=True)),
         (r"load (?P<on>\d+)", _on_a_joint),
         (r"\|v(?P<on>\d+)\|", lambda found: _on_a_joint(found, b=1)),

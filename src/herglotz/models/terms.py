@@ -409,16 +409,6 @@ class FeatureKinetic(nn.Module):
         return of_mean_and_velocity(value, by_q.movedim(-1, 0), by_v, second, phase.h)
 
 
-def mass_matrix(kinetic: nn.Module, q: Tensor) -> Tensor:
-    """The mass matrix of a kinetic term at positions q (k, n), (k, n, n)."""
-    if isinstance(kinetic, FeatureKinetic):
-        return mass_matrix(kinetic.base, q) + kinetic.mass(q)
-    if isinstance(kinetic, PositionKinetic):
-        return kinetic.mass(q)
-    assert isinstance(kinetic, Kinetic), "a model has no other kinetic term"
-    return kinetic.mass().expand(len(q), -1, -1)
-
-
 def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | PositionKinetic | FeatureKinetic:
     """Return the K of a model: a constant or position-dependent mass, and the named features with velocities."""
     n = config.dof

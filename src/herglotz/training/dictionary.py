@@ -41,7 +41,8 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
         c = replace(c, diagonal=False)
     # All forces by position of the inputs that the model has some of.
     inputs = {k + 1 for text in c.drag if (k := parse_drag(text, c.angles).input) is not None}
-    ratios = ratios_of((*expand(c.features, c.angles), *c.drag))
+    # Waves of angles repeat, whatever the ratio of a damper between two.
+    ratios = {} if any(c.angles) else ratios_of((*expand(c.features, c.angles), *c.drag))
     features = in_proportion((*features_of(c.angles), *windings(c.angles)), ratios)
     drag = (*in_proportion(drag_of(c.angles), ratios), *by_motion(c.angles, sorted(inputs)))
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))

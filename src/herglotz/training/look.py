@@ -223,9 +223,8 @@ def _with_terms(
         plain = replace(settings, sticking=user_settings.sticking)
 
         def find() -> Structure:
-            if few:
-                return known or search(kept, base, plain, outliers=seen.outliers, holds=holds)
-            return search_of_many(kept, base, plain, outliers=seen.outliers, holds=holds)
+            named = search if few else search_of_many
+            return known or named(kept, base, plain, outliers=seen.outliers, holds=holds)
 
         found = kept_structure("terms", find, base, settings, stages)
         seen = replace(seen, structure=found.reason, found=found)

@@ -69,6 +69,7 @@ EXPLAINED = 1e-7
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent", "dissipation")  # fmt: skip
 VISCOUS = "friction.viscous"
+WHY_INPUT_TERMS = "held-out blocks of time are missed by less with them"
 # What a search may find about the recording beside its terms; `look` reads the data so.
 READING = ("hold", "input_terms", "zeros", "drifts", "turning")
 
@@ -131,7 +132,8 @@ def many_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
     """
     c, driven = user_settings, data.u is not None and user_settings.use_inputs
     noisy = driven or any(data.angles) or not is_precise(data)
-    return _nothing_named(c) and data.dof > MOST and c.objective == "auto" and noisy
+    alone = c.objective == "auto" and not c.input_map
+    return _nothing_named(c) and data.dof > MOST and alone and noisy
 
 
 def _nothing_named(c: FitConfig) -> bool:
@@ -202,16 +204,19 @@ def search(
     if found is None:
         return Structure(config, base, "no dictionary of terms: what follows a part of the data does not follow all")
     if asked.hold:
-        better = "the data are missed by less, or met with fewer terms"
-        why["hold"] = f"with hold {asked.hold} {better} than with {data.hold}"
+        why["hold"] = _why_hold(asked.hold, data.hold)
     if asked.input_terms:
-        why["input_terms"] = "held-out blocks of time are missed by less with them"
+        why["input_terms"] = WHY_INPUT_TERMS
     if differ is not None:
         zeros, why["zeros"] = tuple(differ[0].flatten().tolist()), in_words(*differ, reference_of(data))
     plain = _of_trial(found, data, asked.wanted.config, config, base, asked.read)
     return plain._replace(
         hold=asked.hold, input_terms=asked.input_terms, zeros=zeros, drifts=rates, why=tuple(why.items())
     )
+
+
+def _why_hold(found: str, other: str) -> str:
+    return f"with hold {found} the data are missed by less, or met with fewer terms than with {other}"
 
 
 def search_of_many(
@@ -235,11 +240,14 @@ def search_of_many(
     wanted = search_between_coupled(data, own, config, outliers=outliers)
     if isinstance(wanted, str):
         return without(wanted)
-    found, hold, terms = _pared_down(wanted), "", ()
-    if found is not None and (hold := wanted.part.better_hold(found, holds)):
+    found, hold, terms, why = _pared_down(wanted), "", (), {}
+    # A part with longer steps has means of the inputs, which say little of a hold over one step.
+    if found is not None and wanted.part.step_ratio == 1 and (hold := wanted.part.better_hold(found, holds)):
+        why["hold"] = _why_hold(hold, wanted.data.hold)
         wanted = wanted.of(replace(wanted.data, hold=hold))
         found = _pared_down(wanted)
     if found is not None and data.u is not None and (terms := asked_terms(wanted.part, found)):
+        why["input_terms"] = WHY_INPUT_TERMS
         wanted = wanted.driven_by(terms)
         found = _pared_down(wanted)
     if wanted.part is not wanted:
@@ -248,9 +256,10 @@ def search_of_many(
         return without("the terms of one coordinate and of two miss the data by more than the noise")
     if turning:
         # `look` searches again, with positions on a line, whose inputs and sizes differ.
-        return Structure(config, base, "terms of positions on a line meet the data", turning=False)
+        met = "terms of positions on a line meet the data"
+        return Structure(config, base, met, turning=False, why=(("turning", met),))
     plain = _of_trial(found, data, wanted.config, config, base, wanted.part)
-    return plain._replace(hold=hold, input_terms=input_columns(terms))
+    return plain._replace(hold=hold, input_terms=input_columns(terms), why=tuple(why.items()))
 
 
 def _pared_down(search: Search) -> Trial | None:
@@ -267,10 +276,13 @@ def search_between_coupled(data: Trajectories, base: Baseline, config: FitConfig
     """
     if (coupled := coupled_pairs(data)) is None:
         return "too few samples to find which coordinates are coupled"
-    dampers = in_proportion((f"(v{i + 1} - v{j + 1})" for i, j in coupled), sizes(data))
-    terms = in_proportion(terms_between(coupled, data.angles), sizes(data))
+    ratios = sizes(data)
+    dampers = in_proportion((f"(v{i + 1} - v{j + 1})" for i, j in coupled), ratios)
+    terms = in_proportion(terms_between(coupled, data.angles), ratios)
     offered = replace(config, dtype="float64", device="cpu", level="forced", features=terms)
-    tried = (Search(data, base, replace(offered, drag=drag), outliers=outliers) for drag in (dampers, ()))
+    tried = (
+        Search(data, base, replace(offered, drag=drag), outliers=outliers, ratios=ratios) for drag in (dampers, ())
+    )
     found = next((x for x in tried if len(x.fitter(Variant(x.order)).start) <= MAX_PARAMETERS), None)
     return "too many forces act between coordinates" if found is None else found
 

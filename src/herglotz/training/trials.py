@@ -188,9 +188,11 @@ class Trial:
         """True if an error of the start as small as the noise grows to the spread of the motion in longer segments.
 
         In two segments, one after the other, by the linearised steps of this model: as an unstable motion does. Longer
-        segments would tell a wrong start from a wrong force no more.
+        segments would tell a wrong start from a wrong force no more. False where the noise is unknown.
         """
         problem, grid, data = self.problem, self.problem.grid, self.problem.data
+        if self.whole or not math.isfinite(self.fitter.precision):
+            return False
         n, d, spread = problem.n, problem.d, data.q.std(0, correction=0).clamp_min(1e-300)[:, None]
         noise = (precisions(data).to(data.q) * data.balance).diag()  # (n, n)
 
@@ -199,7 +201,7 @@ class Trial:
 
         # Growth by a factor G in one segment is growth by about G² in two, and slower growth is less.
         slopes = problem.slopes_at_samples(self.theta, self.path)[..., problem.P : problem.P + n]
-        if self.whole or float(size(slopes @ noise).max()) ** 2 < float(size(noise)):
+        if float(size(slopes @ noise).max()) ** 2 < float(size(noise)):
             return False
         moved = problem.sensitivities(self.theta, self.path, held=True).detach()  # (S, K + 1, d, d)
         first = torch.cat([noise, noise.new_zeros(d - n, n)]).expand(grid.segments, d, n)

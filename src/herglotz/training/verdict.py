@@ -314,7 +314,7 @@ def in_words(
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: {_unseen_motion(errors)}"
     if unstable:
-        return f"{_fits(replace(errors, free=None))}: {errors}. {unstable}"
+        return ". ".join(filter(None, (f"{_fits(replace(errors, free=None))}: {errors}", unstable, caveat)))
     # Two motions of one kind that know nothing of each other differ by √2 of their spread. The errors of a start and
     # those of a model know nothing of each other, either.
     chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread

@@ -120,7 +120,9 @@ def test_more_coordinates_than_a_search_takes_are_free_where_they_have_noise():
     assert not many_are_free(chain(4, noise=0.0), FitConfig())
     assert many_are_free(replace(chain(4, noise=0.0), angles=(True,) * 4, units=("rad",) * 4), FitConfig())
     assert many_are_free(replace(chain(4, noise=0.0), u=torch.zeros_like(chain(4).q)), FitConfig())
-    named: list[dict[str, Any]] = [{"features": ("chain",)}, {"objective": "residual"}, {"level": "linear"}]
+    named: list[dict[str, Any]] = [
+        {"features": ("chain",)}, {"objective": "residual"}, {"level": "linear"}, {"input_map": (1.0, 0.0, 0.0, 0.0)}
+    ]  # fmt: skip
     for told in named:
         assert not many_are_free(chain(4), FitConfig(**told))
 
@@ -177,6 +179,8 @@ def test_a_wall_that_moves_drives_angles_by_a_spring_and_a_damper(monkeypatch):
     plan = run.metrics["plan"]
     assert (plan["network"], plan["turning"], plan["input_terms"]) == ("none", False, ("u'",))
     assert set(plan["drag"]) == {"(v1 - v2)", "(v2 - v3)", "(v3 - v4)"}
+    assert plan["reasons"]["turning"] == "terms of positions on a line meet the data"
+    assert plan["reasons"]["input_terms"] == "held-out blocks of time are missed by less with them"
     assert run.metrics["verdict"].startswith("fits to the noise")
     gains = run.model.get_parameter("friction.input_map").detach()
     # The spring, 1, and the damper, 0.2, of the first body.

@@ -2,6 +2,7 @@
 
 import math
 import re
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -100,6 +101,11 @@ def test_segments_of_an_unstable_motion_end_where_noise_is_lost(stiffness, last)
     assert not trial.lost
     assert fitter.grow(trial).length == last
     assert fitter.grow(trial).unstable is (stiffness < 0)
+    # fails if noise that no window of nine readings tells counts as noise that grows to the spread
+    grown = fitter.grow(trial)
+    unknown: Any = copy(fitter)
+    unknown.precision = math.inf
+    assert not replace(grown, fitter=unknown).lost
 
 
 @pytest.mark.parametrize(

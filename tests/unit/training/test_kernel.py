@@ -63,6 +63,7 @@ MODELS = {
         diagonal=True,
         drag=("(2.5 v1 - v2)", "|v1| v1"),
     ),
+    "joints with a geared damper": replace(JOINTS, drag=("(2.5 v1 - v2)",)),
     "own structure": replace(PENDULUM, alike=False, stiffness=(1.0,)),
     "waves of one length": waves(middle=0.3, half=1.7, speed=2.0),
     "waves of several kinds": replace(

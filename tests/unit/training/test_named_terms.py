@@ -194,11 +194,13 @@ def test_a_recurrence_in_blocks_is_the_recurrence(K):
 @pytest.mark.parametrize(
     ("text", "says"),
     [("q1 q1", "write"), ("|v2| v1", "are one speed"), ("v3", "numbered 1 … 2"), ("q1^2 v2", "not periodic"),
-     ("v1^10", "from 1 to 9"), ("(v1 - v1)", "is 0"), ("(v1 - v3)", "numbered 1 … 2"), ("v1 - v2", "write"),
+     ("v1^10", "from 1 to 9"), ("(v1 - v1)", "named twice"), ("(2.5 v2 - v2)", "named twice"),
+     ("(0 v1 - v2)", "v1 is 0"), ("(1e999 v1 - v2)", "v1 is inf"), ("sin(2.5 (20.5 v1 - v2))", "write"),
+     ("(v1 - v3)", "numbered 1 … 2"), ("v1 - v2", "write"),
      ("|v1| (v1 - v2)", "are one speed"), ("q1 sgn(v1)", "not periodic"), ("cos(q3) sgn(v1)", "numbered 1 … 2"),
      ("q2^10 sgn(v1)", "from 1 to 9"), ("q2^0 v1", "from 1 to 9"), ("sgn(v1)", "write"),
      ("cos(q1) sgn(v3)", "numbered 1 … 2"), ("sin(2 v3)", "numbered 1 … 2"), ("cos(v1 - v2)", "write"),
-     ("cos((v2 - v2))", "is 0"), ("sin(2 v1) v1", "write")],
+     ("cos((v2 - v2))", "named twice"), ("sin(2 v1) v1", "write")],
 )  # fmt: skip
 def test_wrong_drag_is_an_input_error(text, says):
     # fails if a text is read as another force

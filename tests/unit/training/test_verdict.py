@@ -394,6 +394,8 @@ def test_windows_judge_a_motion_that_inputs_hold(windows, unseen, free, fits):
     text = in_words(errors, KNOWN, GOOD, lambda *_: "shown", held=lambda: HELD)
     assert text.startswith("fits to the noise: ") is fits
     assert (HELD in text) is (fits and free is not None)
+    # fails if what the model rests on is left out beside the instability
+    assert in_words(errors, KNOWN, GOOD, caveat="rests on", held=lambda: HELD).endswith("rests on") is fits
     # fails if a motion that is stable is not refused for the same free run
     assert free is None or not in_words(errors, KNOWN, GOOD).startswith("fits")
 

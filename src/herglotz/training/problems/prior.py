@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torch.func import jacrev, vmap
 from herglotz.errors import refuse
 from herglotz.models import ContactLagrangian
 from herglotz.models.jet import coordinates
-from herglotz.models.terms import AffineDamping, mass_matrix
+from herglotz.models.terms import AffineDamping
 from herglotz.training.baseline import Baseline
 from herglotz.training.dictionary import keys_of
 from herglotz.training.parameter_vector import ParameterVector
@@ -58,9 +58,10 @@ class Prior:
       it would switch the network off: with a last layer that starts at 0, only the prior acts on the first layer.)
     * The damping rate, the drag coefficients (per unit of position) and the rates of the full level's units are N(their
       start, `rate_spread`²), with `wide_rates` at least N(start, start²): the damping rate of a falling body is many
-      times the rate of its fall. Viscous friction over the mass of its coordinate is N(0, `rate_spread`²), dry friction
-      over that mass and the speed of the coordinate, too. The excess at breakaway is N(0, (0.01 F)²), and the
-      logarithms of the widths of dry friction are N(their start, 0.5²).
+      times the rate of its fall. Viscous friction is N(0, (m `rate_spread`)²), dry friction N(0, (m `rate_spread`
+      speed)²), with the mass m of motions in proportion to the `balance` of their units: the first mass is 1, and so
+      are all of one unit. The excess at breakaway is N(0, (0.01 F)²), and the logarithms of the widths of dry friction
+      are N(their start, 0.5²).
     * A `herglotz.models.Term` has its own spread, and the waves of functions have `spreads`, around 0.
     """
 
@@ -75,6 +76,7 @@ class Prior:
         rate_spread: float = 1.0,
         wide_rates: bool = True,
         spreads: Mapping[str, float] | None = None,
+        balance: Sequence[float] = (),
     ):
         self.parameters = ParameterVector(model)
         self.start, self.departure = self.parameters.get(), departure
@@ -95,8 +97,9 @@ class Prior:
             own, features = model.potential.baseline(self.grid, 1).gradient, model.potential.features
             if features is not None and not bool(own.any()):
                 own = features(self.grid, 1).gradient
-            # Masses of the coordinates at the start: the first one is 1, and the others have the units of the data.
-            self.mass = mass_matrix(model.kinetic, self.grid).diagonal(0, -2, -1).abs().mean(0)
+        # Motions in proportion to the balance have the same kinetic energy; `speed` is the fastest one, in all units.
+        sizes = low.new_tensor(balance or [1.0] * len(low))
+        self.mass, self.speed = (sizes[0] / sizes).square(), (speed / sizes).max() * sizes
         # RMS force of the baseline.
         self.force = float(own.square().mean().sqrt()) or 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
@@ -139,7 +142,7 @@ class Prior:
             (self._index(*NETWORKS), weight),
             (self._index("damping.rate", "damping.drag", "action.rate"), rate_spread),
             self._each("friction.viscous", rate_spread * self.mass * (SPLIT if len(self.mass) == 1 else 1.0)),
-            self._each("friction.coulomb", rate_spread * self.mass * self.mass.new_tensor(model.config.speed)),
+            self._each("friction.coulomb", rate_spread * self.mass * self.speed),
             (self._index("friction.breakaway"), BREAKAWAY * self.force),
             (self._index("friction.log"), WIDTH),
             *(
@@ -185,7 +188,7 @@ def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None, 
     typical = min(v / s for v, s in zip(base.speed, base.scale, strict=True))
     return Prior(
         model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical,
-        wide_rates=wide_rates, spreads=base.spreads,
+        wide_rates=wide_rates, spreads=base.spreads, balance=base.balance,
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.noise import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
-from herglotz.models.terms import mass_matrix
+from herglotz.models.terms import FeatureKinetic, PositionKinetic
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.arrowhead import Arrowhead, Sums, eliminated
 from herglotz.training.distributed import everywhere, world
@@ -79,10 +79,17 @@ class JointMasses:
         if self._made is None or not torch.equal(self._made[0], theta):
             with torch.enable_grad():
                 theta = theta.detach().clone().requires_grad_()
-                mass = self.parameters.evaluated(theta, lambda model: mass_matrix(model.kinetic, self.q))
+                mass = self.parameters.evaluated(theta, lambda model: _mass(model.kinetic, self.q))
                 mass = mass.diagonal(0, -2, -1).abs().mean(0).clamp_min(torch.finfo(theta.dtype).tiny ** 0.5)
             self._made = theta, mass
         return self._made
+
+
+def _mass(kinetic: Any, q: Tensor) -> Tensor:
+    """The mass matrix of a kinetic term at positions (k, n), (k, n, n)."""
+    if isinstance(kinetic, FeatureKinetic):
+        return _mass(kinetic.base, q) + kinetic.mass(q)
+    return kinetic.mass(q) if isinstance(kinetic, PositionKinetic) else kinetic.mass().expand(len(q), -1, -1)
 
 
 class ShootingProblem(StatesProblem):
