@@ -246,7 +246,9 @@ def search_of_many(
         why["hold"] = _why_hold(hold, wanted.data.hold)
         wanted = wanted.of(replace(wanted.data, hold=hold))
         found = _pared_down(wanted)
-    if found is not None and data.u is not None and (terms := asked_terms(wanted.part, found)):
+    # The rate of the ground is little of what moves many storeys beside the ground itself.
+    driven = found is not None and data.u is not None
+    if driven and (terms := asked_terms(wanted.part, found, until_white=True)):
         why["input_terms"] = WHY_INPUT_TERMS
         wanted = wanted.driven_by(terms)
         found = _pared_down(wanted)

@@ -173,7 +173,7 @@ def test_a_wall_that_moves_drives_angles_by_a_spring_and_a_damper(monkeypatch):
     # fails if many driven coordinates, or angles, get a network, or if no rate of the input is offered: a network
     # missed such a chain by 9 times the noise; or if a network is fitted before the recording is read anew
     monkeypatch.setattr(import_module("herglotz.training.look"), "_probe", None)
-    driven = with_dampers(wall=(0.9, 2.3), trajectories=4, steps=120)
+    driven = with_dampers(wall=(0.9, 2.3), trajectories=3, steps=60)
     driven = replace(driven, angles=(True,) * 4, units=("rad",) * 4)
     run = fit(driven, FitConfig(train_fraction=1.0), progress=False)
     plan = run.metrics["plan"]

@@ -153,7 +153,7 @@ class Prior:
             *((torch.tensor([i]), spread) for i, spread in self.waves.items()),
         ]
         index = torch.cat([index for index, _ in spreads]).to(self.start.device)
-        own = [torch.as_tensor(spread).to(self.start).expand(len(index)) for index, spread in spreads if len(index)]
+        own = [torch.as_tensor(spread).to(self.start).expand(len(index)) for index, spread in spreads]
         return index, torch.cat(own)
 
     def _each(self, prefix: str, spreads: Tensor) -> tuple[Tensor, Tensor]:
