@@ -247,8 +247,9 @@ def search_of_many(
         wanted = wanted.of(replace(wanted.data, hold=hold))
         found = _pared_down(wanted)
     # The rate of the ground is little of what moves many storeys beside the ground itself.
-    driven = found is not None and data.u is not None
-    if driven and (terms := asked_terms(wanted.part, found, until_white=True)):
+    if found is not None and data.u is not None:
+        terms = asked_terms(wanted.part, found, until_white=True)
+    if terms:
         why["input_terms"] = WHY_INPUT_TERMS
         wanted = wanted.driven_by(terms)
         found = _pared_down(wanted)
