@@ -35,7 +35,6 @@ class Baseline:
     `scale` and `speed` are the largest |q| and |q̇|, `low` and `high` the range of q. `max_step` is the longest recorded
     step that is no gap, `model_step` the longest model step along a trajectory. `input_map` has accelerations per unit
     of each input, row by row; `start` known values of parameters, `spreads` prior deviations of terms, both by name.
-    `balance` are the sizes of the motion in different units (`Trajectories.balance`).
     """
 
     angles: tuple[bool, ...]
@@ -51,7 +50,6 @@ class Baseline:
     input_map: tuple[float, ...] = ()  # (n · m)
     start: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     spreads: Mapping[str, float] = field(default_factory=dict)
-    balance: tuple[float, ...] = ()  # (n)
 
     @property
     def inputs(self) -> int:
@@ -117,7 +115,6 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
         high=q.amax(0),
         input_map=tuple(x[2 * n + 1 : 2 * n + 1 + n * m]),
         start=start,
-        balance=tuple(data.balance.tolist()),
     )
 
 

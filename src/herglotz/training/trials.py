@@ -228,6 +228,16 @@ class Trial:
         self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
         return found
 
+    @cached_property
+    def _shorter(self) -> dict[int, Trial | None]:
+        return {}
+
+    def over(self, length: int) -> Trial | None:
+        """This model over shorter segments (`Fitter.over`), fitted once for every length."""
+        if length not in self._shorter:
+            self._shorter[length] = self.fitter.over(self, length)
+        return self._shorter[length]
+
     def replaces(self, simple: Trial) -> bool:
         """True if this richer model replaces a simpler model."""
         return self.gain(simple) > 0
@@ -510,7 +520,7 @@ def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:
     if own.length == other.length:
         return own, other
     long, short = (own, other) if own.length > other.length else (other, own)
-    if long.segments_at_the_noise or not short.unstable or (same := long.fitter.over(long, short.length)) is None:
+    if long.segments_at_the_noise or not short.unstable or (same := long.over(short.length)) is None:
         return None
     return (same, short) if long is own else (short, same)
 

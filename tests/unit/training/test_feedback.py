@@ -115,9 +115,7 @@ def test_a_wrong_motion_that_is_stable_does_not_win_by_its_length(unstable, at_t
     # fails if a model that misses long segments replaces the law of an unstable motion, which follows short ones to the
     # noise; or if an unstable model of short segments replaces one that meets longer ones
     same = SimpleNamespace(length=80)
-    long: Any = SimpleNamespace(
-        length=640, segments_at_the_noise=at_the_noise, fitter=SimpleNamespace(over=lambda *_: same)
-    )
+    long: Any = SimpleNamespace(length=640, segments_at_the_noise=at_the_noise, over=lambda _: same)
     short: Any = SimpleNamespace(length=80, unstable=unstable)
     assert of_one_length(long, short) == ((same, short) if compared else None)
     assert of_one_length(short, long) == ((short, same) if compared else None)

@@ -50,19 +50,3 @@ def test_a_large_rate_is_as_free_as_it_is_large(rate, spread):
     assert float(narrow.spread[narrow.index == at]) == 1.0
     others = prior.spread[prior.index != at]
     torch.testing.assert_close(others, prior_of(1, "linear")[0].spread[prior.index != at])
-
-
-def test_friction_is_as_free_as_the_unit_of_its_coordinate():
-    # fails if friction of a radian beside millimetres, whose mass in these units is a million, is held to that of the
-    # millimetre, if coordinates of one unit differ, or if numbers that the model does not have shift the others
-    one = {"stiffness": (1.0,) * 3, "tilt": (0.0,) * 3, "scale": (1.0,) * 3, "speed": (2.0, 3e-3, 4.0)}
-    config = ModelConfig(
-        angles=(False,) * 3, level="forced", coulomb=True, diagonal=True, absent=("friction.viscous[0]",), **one
-    )
-    model, ends = ContactLagrangian(config).double(), torch.ones(3, dtype=torch.float64)
-    prior = Prior(model, -ends, ends, departure=None, rate_spread=0.1, balance=(1.0, 1e-3, 1.0))
-    names = [prior.parameters.numbers[i] for i in prior.index.tolist()]
-    spread = dict(zip(names, prior.spread.tolist(), strict=True))
-    assert "friction.viscous[0]" not in spread
-    assert [spread[f"friction.viscous[{i}]"] for i in (1, 2)] == pytest.approx([1e5, 0.1])
-    assert [spread[f"friction.coulomb[{i}]"] for i in range(3)] == pytest.approx([0.4, 400.0, 0.4])

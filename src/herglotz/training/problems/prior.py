@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -56,12 +55,11 @@ class Prior:
     * The damping's network G(q̄, v) (affine level) has there an RMS of N(0, (τ r)²), r the typical rate of the motion.
     * Every network weight is N(its start, `weight`²), a weak prior against drift of undetermined weights. (Centred at 0
       it would switch the network off: with a last layer that starts at 0, only the prior acts on the first layer.)
-    * The damping rate, the drag coefficients (per unit of position) and the rates of the full level's units are N(their
-      start, `rate_spread`²), with `wide_rates` at least N(start, start²): the damping rate of a falling body is many
-      times the rate of its fall. Viscous friction is N(0, (m `rate_spread`)²), dry friction N(0, (m `rate_spread`
-      speed)²), with the mass m of motions in proportion to the `balance` of their units: the first mass is 1, and so
-      are all of one unit. The excess at breakaway is N(0, (0.01 F)²), and the logarithms of the widths of dry friction
-      are N(their start, 0.5²).
+    * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
+      friction (the first mass is 1) are N(their start, `rate_spread`²), and with `wide_rates` the first three at least
+      N(start, start²): the damping rate of a falling body is many times the rate of its fall. Dry friction is
+      N(0, (`rate_spread` speed)²), its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their
+      start, 0.5²).
     * A `herglotz.models.Term` has its own spread, and the waves of functions have `spreads`, around 0.
     """
 
@@ -76,7 +74,6 @@ class Prior:
         rate_spread: float = 1.0,
         wide_rates: bool = True,
         spreads: Mapping[str, float] | None = None,
-        balance: Sequence[float] = (),
     ):
         self.parameters = ParameterVector(model)
         self.start, self.departure = self.parameters.get(), departure
@@ -97,9 +94,6 @@ class Prior:
             own, features = model.potential.baseline(self.grid, 1).gradient, model.potential.features
             if features is not None and not bool(own.any()):
                 own = features(self.grid, 1).gradient
-        # Motions in proportion to the balance have the same kinetic energy; `speed` is the fastest one, in all units.
-        sizes = low.new_tensor(balance or [1.0] * len(low))
-        self.mass, self.speed = (sizes[0] / sizes).square(), (speed / sizes).max() * sizes
         # RMS force of the baseline.
         self.force = float(own.square().mean().sqrt()) or 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
@@ -141,8 +135,8 @@ class Prior:
         spreads = [
             (self._index(*NETWORKS), weight),
             (self._index("damping.rate", "damping.drag", "action.rate"), rate_spread),
-            self._each("friction.viscous", rate_spread * self.mass * (SPLIT if len(self.mass) == 1 else 1.0)),
-            self._each("friction.coulomb", rate_spread * self.mass * self.speed),
+            (self._index("friction.viscous"), rate_spread * (SPLIT if len(model.config.scale) == 1 else 1.0)),
+            (self._index("friction.coulomb"), rate_spread * max(model.config.speed)),
             (self._index("friction.breakaway"), BREAKAWAY * self.force),
             (self._index("friction.log"), WIDTH),
             *(
@@ -153,14 +147,7 @@ class Prior:
             *((torch.tensor([i]), spread) for i, spread in self.waves.items()),
         ]
         index = torch.cat([index for index, _ in spreads]).to(self.start.device)
-        own = [torch.as_tensor(spread).to(self.start).expand(len(index)) for index, spread in spreads]
-        return index, torch.cat(own)
-
-    def _each(self, prefix: str, spreads: Tensor) -> tuple[Tensor, Tensor]:
-        """Places of the numbers of a parameter that has one for each coordinate, and their spreads out of (n,)."""
-        index = self._index(prefix)
-        places = [re.search(r"\[(\d+)\]", self.parameters.numbers[i]) for i in index.tolist()]
-        return index, spreads[[int(place[1]) if place else 0 for place in places]]
+        return index, torch.cat([self.start.new_full((len(index),), spread) for index, spread in spreads])
 
     def _index(self, *prefixes: str) -> Tensor:
         return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
@@ -188,7 +175,7 @@ def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None, 
     typical = min(v / s for v, s in zip(base.speed, base.scale, strict=True))
     return Prior(
         model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical,
-        wide_rates=wide_rates, spreads=base.spreads, balance=base.balance,
+        wide_rates=wide_rates, spreads=base.spreads,
     )  # fmt: skip
 
 
