@@ -233,7 +233,7 @@ class Trial:
         return {}
 
     def over(self, length: int) -> Trial | None:
-        """This model over shorter segments (`Fitter.over`), fitted once for every length."""
+        """The model over shorter segments (`Fitter.over`), fitted once for every length."""
         if length not in self._shorter:
             self._shorter[length] = self.fitter.over(self, length)
         return self._shorter[length]
