@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from herglotz.progress import MORE_TERMS, inside, part
-from herglotz.training.offers import needed
 from herglotz.training.search import Search
 from herglotz.training.trials import ITERATIONS, Trial, Variant, likeliest
 
@@ -38,8 +37,7 @@ def _joined(search: Search, best: Trial) -> Trial | None:
         return None
     taken = best.taken & {offer.name for offer in (*fitter.offers, *fitter.loads)}
     # A named term that is a wave of a function is in the model only with the band of that wave.
-    bands = [own.name for own in fitter.variant.functions if best.taken & set(own.texts)]
-    taken |= needed(fitter.offers, bands)
+    taken |= {own.name for own in fitter.variant.functions if best.taken & set(own.texts)}
     same = fitter.fit(taken, fitter.values_of(best), best.length, best)
     found = same and search.settled(search.finer(same))
     if found is None or found.lacks_nothing:

@@ -7,8 +7,7 @@ of an angle are sums of the harmonics of the angle. Functions of a speed, and of
 sin whose period is the interval.
 
 The prior keeps a function at 0 where the data say nothing, so all waves can join a model together. The waves of an
-octave are a band with a prior variance of its own. A model with a band has the bands of all longer waves, too: a model
-takes a function up to some resolution. A wave is a named term: stepping, printing and export need no code
+octave are a band with a prior variance of its own. A wave is a named term: stepping, printing and export need no code
 for waves.
 """
 
@@ -42,15 +41,13 @@ class Band(NamedTuple):
     """Waves of a function that join a model together, with one prior variance.
 
     `name` reads V(q1) 1, damping(q1) 1, mass(q1) 2 or friction(v1) 1, for example. `rates` are the angular rates k of
-    the waves, per unit of the coordinate; `longest` is the rate of the longest wave of the whole function. `on` names
-    the band of the next longer waves, or is empty.
+    the waves, per unit of the coordinate; `longest` is the rate of the longest wave of the whole function.
     """
 
     name: str
     texts: tuple[str, ...]
     rates: tuple[float, ...]
     longest: float
-    on: str = ""
 
     @property
     def brakes(self) -> bool:
@@ -130,7 +127,7 @@ def _octaves(name: str, waves: list[Wave]) -> Iterator[Band]:
     octave = lambda wave: max(2, math.floor(round(wave[1] / longest, 6)).bit_length())  # noqa: E731
     for number, (_, part) in enumerate(groupby(rest, octave), 1):
         texts, rates = zip(*part, strict=True)
-        yield Band(f"{name} {number}", texts, rates, longest, f"{name} {number - 1}" if number > 1 else "")
+        yield Band(f"{name} {number}", texts, rates, longest)
 
 
 def _interval(data: Trajectories, form: Form) -> tuple[float, float]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.training.held_out import BLOCKS, HeldOut
-from herglotz.training.offers import needed, standing
+from herglotz.training.offers import standing
 from herglotz.training.score import Score, scores
 from herglotz.training.trials import Trial
 
@@ -84,9 +84,9 @@ class Moves:
         return trial.values | values, trial.path.x[:, 0, : trial.problem.d] + starts
 
     def joining(self, at: Offers) -> list[Offers]:
-        """Sets better than `at` with one more offer and the offers that it needs, the best first."""
-        offers = self.fitter.offers
-        return self._better(at, [at | needed(offers, [offer.name]) for offer in offers if offer.name not in at])
+        """Sets better than `at` with one more offer and the offer that it depends on, the best first."""
+        others = [offer for offer in self.fitter.offers if offer.name not in at]
+        return self._better(at, [at | {offer.name, offer.on or offer.name} for offer in others])
 
     def _without(self, at: Offers, gone: Collection[str]) -> Offers:
         """The offers `at` without those in `gone` and without offers that depend on them."""

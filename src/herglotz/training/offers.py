@@ -75,7 +75,7 @@ def offers_of(
             if (stem in SIMPLE and number not in of_terms) or key in springs or (key == WEIGHTS[0] and not bands):
                 simple.add(key)
     place = dict(zip(keys, numbers, strict=True))
-    found += [Offer(band.name, tuple(place[text] for text in band.texts), on=band.on) for band in bands]
+    found += [Offer(band.name, tuple(place[text] for text in band.texts)) for band in bands]
     return tuple(always), found, frozenset(simple)
 
 
@@ -86,22 +86,10 @@ def _offer(number: str, key: str, stem: str, numbers: Collection[str]) -> Offer:
     return Offer(key, (number,), (shape,) if shape != number and shape in numbers else (), on)
 
 
-def needed(offers: Iterable[Offer], names: Iterable[str]) -> frozenset[str]:
-    """The offers of these names and those that they depend on (`Offer.on`), one after the other."""
-    on, found = {offer.name: offer.on for offer in offers}, set[str]()
-    for name in names:
-        while name and name not in found:
-            found.add(name)
-            name = on.get(name, "")
-    return frozenset(found)
-
-
 def standing(offers: Iterable[Offer], taken: Collection[str]) -> frozenset[str]:
-    """The offers in `taken` without those of which a needed offer is missing (`needed`)."""
-    on, left = {offer.name: offer.on for offer in offers}, frozenset(taken)
-    while gone := {name for name in left if on.get(name) and on[name] not in left}:
-        left -= gone
-    return left
+    """The offers in `taken` whose own `Offer.on`, if any, is in `taken` too."""
+    on = {offer.name: offer.on for offer in offers}
+    return frozenset(name for name in taken if not on.get(name) or on[name] in taken)
 
 
 def without_offers(model: ContactLagrangian, offers: list[Offer]) -> None:
