@@ -216,6 +216,7 @@ def search(
 
 
 def _why_hold(found: str, other: str) -> str:
+    """The reason of a hold that was found in the place of another."""
     return f"with hold {found} the data are missed by less, or met with fewer terms than with {other}"
 
 
@@ -246,7 +247,7 @@ def search_of_many(
         why["hold"] = _why_hold(hold, wanted.data.hold)
         wanted = wanted.of(replace(wanted.data, hold=hold))
         found = _pared_down(wanted)
-    # The rate of the ground is little of what moves many storeys beside the ground itself.
+    # A building on a shaken ground is met to about the noise without the force by the rate of the ground.
     if found is not None and data.u is not None:
         terms = asked_terms(wanted.part, found, until_white=True)
     if terms:

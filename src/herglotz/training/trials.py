@@ -165,7 +165,7 @@ class Trial:
     @property
     def segments_at_the_noise(self) -> bool:
         """True if the misfit of the segments is about the noise of the data."""
-        return self.rms <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
+        return self.rms <= self.fitter.about_the_noise
 
     @property
     def misses_next_to_nothing(self) -> bool:
@@ -181,7 +181,7 @@ class Trial:
         if self.whole or not self.lost:
             return False
         r = self._held_out.fitted_residuals([range(self.problem.P)])[0][self.problem.data.complete]
-        return float(r.square().mean().sqrt()) <= max(AT_THE_NOISE * self.fitter.precision, self.fitter.floor)
+        return float(r.square().mean().sqrt()) <= self.fitter.about_the_noise
 
     @cached_property
     def lost(self) -> bool:
@@ -358,6 +358,11 @@ class Fitter:
         """Names of the offers of a force at rest, for which a zero of the sensor can stand."""
         own = {key for key, (parameter, _) in own_terms(self.data.angles).items() if parameter == TILT}
         return own.union(key for number, key in self.keys.items() if number.startswith(TILT))
+
+    @property
+    def about_the_noise(self) -> float:
+        """Largest misfit that counts as noise, in units of q over the balance."""
+        return max(AT_THE_NOISE * self.precision, self.floor)
 
     @property
     def exact(self) -> bool:

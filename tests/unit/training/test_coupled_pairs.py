@@ -188,6 +188,15 @@ def test_a_wall_that_moves_drives_angles_by_a_spring_and_a_damper(monkeypatch):
     assert gains[1:].abs().max() < 0.02
 
 
+def test_the_rate_of_a_wall_is_found_in_noise():
+    # fails if a model at about the noise, 1.3 times as much, is asked for no term of its inputs: the damper to the wall
+    # was lost, and errors went on from sample to sample
+    driven = with_dampers(noise=0.03, trajectories=6, steps=80, wall=(0.9, 2.3))
+    found = search_of_many(driven, estimate_baseline(driven), FitConfig().resolved(driven), outliers=False)
+    assert found.input_terms == ("u'",)
+    assert found.sigma == pytest.approx(0.03, rel=0.05)
+
+
 @pytest.mark.parametrize(("most", "taken"), [(36, 36), (35, 33), (32, None)])
 def test_numbers_that_a_kernel_takes_are_offered(monkeypatch, most, taken):
     # fails if a search without a kernel begins, whose fits take minutes, or if terms go with dampers that are too many
