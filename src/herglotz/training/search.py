@@ -18,7 +18,7 @@ from herglotz.data.input_terms import with_input_terms
 from herglotz.data.noise import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
-from herglotz.models.drag import input_columns, input_forces
+from herglotz.models.drag import input_columns, input_forces, parse_drag
 from herglotz.models.features import spherical, windings
 from herglotz.progress import FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline, estimate_baseline
@@ -408,10 +408,14 @@ class Search:
         return trial
 
     def on_a_line(self) -> Search:
-        """The search with every angle taken for a position on a line, as of a coil spring."""
+        """The search with every angle taken for a position on a line, as of a coil spring.
+
+        Forces of the inputs that do not depend on an angle, as a brake, are offers on a line, too.
+        """
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
-        return Search(data, base, replace(self.config, drag=()), outliers=self.freedom is not None)
+        drag = tuple(force for force in self.config.drag if not parse_drag(force, self.data.angles).wave)
+        return Search(data, base, replace(self.config, drag=drag), outliers=self.freedom is not None)
 
     def zeros(
         self, trial: Trial, start: Tensor | None = None, taken: Tensor | None = None

@@ -865,6 +865,16 @@ def test_an_angle_with_a_spring_is_a_position_on_a_line():
     assert again.metrics["extrapolation_rms"] == run.metrics["extrapolation_rms"]
 
 
+def test_a_brake_by_an_input_is_an_offer_on_a_line_too():
+    # fails if it is not, when Pohl's wheel keeps its waves and misses unseen time by 1 300 times the noise; or if a
+    # force that turns with an angle is, which a position on a line has no name for
+    t = 0.05 * torch.arange(80, dtype=torch.float64)
+    data = Trajectories.of(t, t.cos(), u=t[:, None].sin(), names=("a",), units=("rad",), angles=(True,))
+    driven = Search(data, estimate_baseline(data), FitConfig()).driven_by(("u1 cos(q1)", "u1^2 v1"))
+    assert driven.config.drag == ("u1 cos(q1)", "u1^2 v1")
+    assert driven.on_a_line().config.drag == ("u1^2 v1",)
+
+
 def test_a_weight_on_a_torsion_spring_is_found():
     # θ″ = −7 θ − 12 sin θ − 0.15 θ′: fails if a weight is no offer on a line, or joins a model that powers complete
     # already: θ, θ³ and θ⁵ were found in its place
