@@ -30,7 +30,8 @@ class Errors:
     held out; `free` is inf if the free run fails or diverges. `noise` is the precision of the data, inf if unknown.
     With `unit` None all numbers are over the spread; with `degrees` numbers in rad are printed in deg. `out` training
     samples with gross errors are left out of the errors. The precision of the coordinates `rough`, not of all, exceeds
-    half their spread.
+    half their spread. Two runs within the recorded ranges differ by `reach` at most, the RMS of the ranges; inf if
+    these are unknown.
     """
 
     windows: float
@@ -42,6 +43,7 @@ class Errors:
     degrees: bool = False
     out: int = 0
     rough: tuple[str, ...] = ()
+    reach: float = math.inf
 
     @property
     def limit(self) -> float:

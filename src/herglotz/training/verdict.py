@@ -7,12 +7,12 @@ Three errors are compared with the precision of the data, which is estimated fro
   run, whichever are nearer to the data;
 * one free run over the whole unseen part, `extrapolation_rms`.
 
-A model is rejected if a free run loses the motion, unless the uncertainty of the start state explains the loss: chaotic
-motion leaves every model in the long run. A free run that fails or diverges always rejects the model. So does a large
-uncertainty of the model itself (`foresight`): many models fit a recording that is too short. So does a misfit above the
-noise if the data themselves show a cause that the user can remove (`misread`). Errors of several coordinates are
-divided by the spread of each. If a recording is too short to show its noise, the misfit of the training data replaces
-the noise.
+A model is rejected if a free run loses the motion, unless the uncertainty of the start state explains the loss, which
+then is no error of the model: chaotic motion leaves every model in the long run. A free run that fails or diverges
+always rejects the model. So does a large uncertainty of the model itself (`foresight`): many models fit a recording
+that is too short. So does a misfit above the noise if the data themselves show a cause that the user can remove
+(`misread`). Errors of several coordinates are divided by the spread of each. If a recording is too short to show its
+noise, the misfit of the training data replaces the noise.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does not fit"
 # Standard deviations of a free run, by the uncertainty of its start, within which a loss of the motion is no error.
 CHANCE = 3.0
+OF_THE_START = "The one run misses no more than what the fit leaves open of its start: no law follows it for longer"
 # Standard errors by which a free run has to be better than the mean of the data.
 CLEARLY = 2.0
 # Most recordings of the same kind, as the root of their number: nobody records 900 times as much.
@@ -201,7 +202,8 @@ def _errors(kept: Trajectories, unit: Tensor, missed: tuple[Tensor, Tensor | Non
     names = () if all(rough) else tuple(name for name, own in zip(kept.names, rough, strict=True) if own)
     assert windows is not None
     spread = _rms(scaled.q - scaled.q.mean(0))
-    return Errors(windows, unseen, free, precision(scaled), spread, named, in_degrees, out, names)
+    reach = _rms(scaled.q.amax(0) - scaled.q.amin(0))
+    return Errors(windows, unseen, free, precision(scaled), spread, named, in_degrees, out, names, reach)
 
 
 def unseen_outlier(seen: Look, everywhere: Tensor) -> str:
@@ -315,14 +317,17 @@ def in_words(
         return f"{FAILS}: {_unseen_motion(errors)}"
     if unstable:
         return ". ".join(filter(None, (f"{_fits(replace(errors, free=None))}: {errors}", unstable, caveat)))
-    # Two motions of one kind that know nothing of each other differ by √2 of their spread. The errors of a start and
-    # those of a model know nothing of each other, either.
-    chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread
+    # Runs within the recorded ranges differ by no more than these. The errors of a start and those of a model know
+    # nothing of each other.
+    chance = 0.0 if ahead is None else min(CHANCE * ahead.start * errors.spread, errors.reach)
     if free > math.hypot(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    return ". ".join(filter(None, (f"{_fits(errors)}: {errors}", shown(True) if missed else caveat)))
+    # The rest of the sentence is about the model: an error that its start explains is none of its own.
+    of_start = not free <= AT_THE_NOISE * errors.limit and free <= math.hypot(AT_THE_NOISE * errors.limit, chance)
+    fits = f"{_fits(replace(errors, free=None) if of_start else errors)}: {errors}"
+    return ". ".join(filter(None, (fits, OF_THE_START if of_start else "", shown(True) if missed else caveat)))
 
 
 def _fits(errors: Errors) -> str:

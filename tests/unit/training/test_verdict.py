@@ -20,7 +20,7 @@ from herglotz.training.errors_of_runs import Errors
 from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
 from herglotz.training.left_out import LeftOut
-from herglotz.training.verdict import in_words
+from herglotz.training.verdict import OF_THE_START, in_words
 
 evaluate_module = importlib.import_module("herglotz.training.evaluate")
 GOOD = {"follows_data": True, "objective": "trajectory"}
@@ -35,7 +35,9 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
         (0.011, 0.012, 0.013, KNOWN, "fits to the noise"),
         (0.011, None, None, None, "fits to the noise"),
         (0.011, 0.012, 0.02, KNOWN, "fits, worse than the noise by a factor of 2:"),
-        (0.011, 0.012, 1.2, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 1.2e+02:"),  # chaos
+        (0.011, 0.012, 1.2, replace(KNOWN, start=0.5), "fits to the noise:"),  # chaos
+        (0.03, 0.012, 1.2, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 3:"),
+        (0.011, 0.012, 1.2, replace(KNOWN, start=0.399), "fits, worse than the noise by a factor of 1.2e+02:"),
         (
             0.011,
             0.012,
@@ -66,9 +68,11 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
 )
 def test_words(windows, unseen, free, ahead, expected):
     # fails if an error is left out of the comparison, a lost or broken free run passes without the excuse of its start,
-    # what the data leave open passes, or a NaN compares as small
-    text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0), ahead, GOOD)
+    # an error that the start explains counts as one of the model, what the data leave open passes, or a NaN compares as
+    # small
+    text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0, reach=1.4), ahead, GOOD)
     assert text.startswith(expected)
+    assert (OF_THE_START in text) == (free == 1.2 and ahead is not None and ahead.start == 0.5)
     assert ("Try " in text) == (expected.startswith("does not fit"))
 
 
