@@ -30,8 +30,7 @@ class Errors:
     held out; `free` is inf if the free run fails or diverges. `noise` is the precision of the data, inf if unknown.
     With `unit` None all numbers are over the spread; with `degrees` numbers in rad are printed in deg. `out` training
     samples with gross errors are left out of the errors. The precision of the coordinates `rough`, not of all, exceeds
-    half their spread. Two runs within the recorded ranges differ by `reach` at most, the RMS of the ranges; inf if
-    these are unknown.
+    half their spread.
     """
 
     windows: float
@@ -43,7 +42,6 @@ class Errors:
     degrees: bool = False
     out: int = 0
     rough: tuple[str, ...] = ()
-    reach: float = math.inf
 
     @property
     def limit(self) -> float:

@@ -60,7 +60,7 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does not fit"
 # Standard deviations of a free run, by the uncertainty of its start, within which a loss of the motion is no error.
 CHANCE = 3.0
-OF_THE_START = "The one run misses no more than what the fit leaves open of its start: no law follows it for longer"
+OF_THE_START = "What the fit leaves open of its start explains the error of the one run"
 # Standard errors by which a free run has to be better than the mean of the data.
 CLEARLY = 2.0
 # Most recordings of the same kind, as the root of their number: nobody records 900 times as much.
@@ -202,8 +202,7 @@ def _errors(kept: Trajectories, unit: Tensor, missed: tuple[Tensor, Tensor | Non
     names = () if all(rough) else tuple(name for name, own in zip(kept.names, rough, strict=True) if own)
     assert windows is not None
     spread = _rms(scaled.q - scaled.q.mean(0))
-    reach = _rms(scaled.q.amax(0) - scaled.q.amin(0))
-    return Errors(windows, unseen, free, precision(scaled), spread, named, in_degrees, out, names, reach)
+    return Errors(windows, unseen, free, precision(scaled), spread, named, in_degrees, out, names)
 
 
 def unseen_outlier(seen: Look, everywhere: Tensor) -> str:
@@ -317,9 +316,9 @@ def in_words(
         return f"{FAILS}: {_unseen_motion(errors)}"
     if unstable:
         return ". ".join(filter(None, (f"{_fits(replace(errors, free=None))}: {errors}", unstable, caveat)))
-    # Runs within the recorded ranges differ by no more than these. The errors of a start and those of a model know
-    # nothing of each other.
-    chance = 0.0 if ahead is None else min(CHANCE * ahead.start * errors.spread, errors.reach)
+    # Two motions of one kind that know nothing of each other differ by √2 of their spread. The errors of a start and
+    # those of a model know nothing of each other, either.
+    chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread
     if free > math.hypot(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:

@@ -70,7 +70,7 @@ def test_words(windows, unseen, free, ahead, expected):
     # fails if an error is left out of the comparison, a lost or broken free run passes without the excuse of its start,
     # an error that the start explains counts as one of the model, what the data leave open passes, or a NaN compares as
     # small
-    text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0, reach=1.4), ahead, GOOD)
+    text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0), ahead, GOOD)
     assert text.startswith(expected)
     assert (OF_THE_START in text) == (free == 1.2 and ahead is not None and ahead.start == 0.5)
     assert ("Try " in text) == (expected.startswith("does not fit"))
