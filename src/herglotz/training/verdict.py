@@ -323,8 +323,8 @@ def in_words(
         return f"{FAILS} beyond the recording: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    # The rest of the sentence is about the model: an error that its start explains is none of its own.
-    of_start = not free <= AT_THE_NOISE * errors.limit and free <= math.hypot(AT_THE_NOISE * errors.limit, chance)
+    # A loss that the start explains is no error of the model.
+    of_start = free > errors.lost
     fits = f"{_fits(replace(errors, free=None) if of_start else errors)}: {errors}"
     return ". ".join(filter(None, (fits, OF_THE_START if of_start else "", shown(True) if missed else caveat)))
 

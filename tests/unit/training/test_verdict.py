@@ -37,7 +37,7 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
         (0.011, 0.012, 0.02, KNOWN, "fits, worse than the noise by a factor of 2:"),
         (0.011, 0.012, 1.2, replace(KNOWN, start=0.5), "fits to the noise:"),  # chaos
         (0.03, 0.012, 1.2, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 3:"),
-        (0.011, 0.012, 1.2, replace(KNOWN, start=0.399), "fits, worse than the noise by a factor of 1.2e+02:"),
+        (0.011, 0.012, 0.09, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 9:"),  # not lost
         (
             0.011,
             0.012,
@@ -72,7 +72,7 @@ def test_words(windows, unseen, free, ahead, expected):
     # small
     text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0), ahead, GOOD)
     assert text.startswith(expected)
-    assert (OF_THE_START in text) == (free == 1.2 and ahead is not None and ahead.start == 0.5)
+    assert (OF_THE_START in text) == (expected.startswith("fits") and free == 1.2)
     assert ("Try " in text) == (expected.startswith("does not fit"))
 
 
