@@ -209,7 +209,7 @@ def _is_better(other: Trial, trial: Trial, read: Search) -> bool:
     Free runs over held-out time must not say otherwise. Of models that are alike the simpler one is better.
     """
     length = min(trial.length, other.length)
-    turning, line = (x if x.length == length else x.fitter.over(x, length) for x in (trial, other))
+    turning, line = (x if x.length == length else x.over(length) for x in (trial, other))
     if turning is None or line is None or read.better(turning, line) is turning:
         return turning is None and line is not None
     its, ahead = (x.fitter.free_run_score(x) for x in (turning, line))

@@ -323,7 +323,7 @@ def in_words(
         return f"{FAILS} beyond the recording: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    # A loss that the start explains is no error of the model.
+    # What is lost here is so by its start, which is no error of the model.
     of_start = free > errors.lost
     fits = f"{_fits(replace(errors, free=None) if of_start else errors)}: {errors}"
     return ". ".join(filter(None, (fits, OF_THE_START if of_start else "", shown(True) if missed else caveat)))
