@@ -124,5 +124,6 @@ def optimised_c(_unoptimised_c):
     """C as the package compiles it."""
     _unoptimised_c.undo()
     kernel._kernel.cache_clear()
+    kernel._places.cache_clear()
     yield
     leave_out_optimisation(_unoptimised_c.setattr)

@@ -6,6 +6,7 @@ Gross errors are samples that no smooth motion explains, and readings of a senso
 from __future__ import annotations
 
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -28,6 +29,8 @@ AT_THE_NOISE = 1.5
 TAIL = 5.0
 # Windows, evenly spread: more do not change an RMS.
 MAX_WINDOWS = 4000
+# Roughnesses (D, n) of recordings by degrees: each is asked for a dozen times in a fit.
+_KNOWN: WeakKeyDictionary[Trajectories, dict[tuple[int, ...], Tensor]] = WeakKeyDictionary()
 
 
 def roughness(data: Trajectories, degree: int = DEGREE) -> float:
@@ -39,7 +42,15 @@ def roughness(data: Trajectories, degree: int = DEGREE) -> float:
     return float(_residuals(data, (degree,)).square().mean().sqrt())
 
 
-def _residuals(data: Trajectories, degrees: Sequence[int]) -> Tensor:
+def _residuals(data: Trajectories, degrees: tuple[int, ...]) -> Tensor:
+    """`_residuals_of`, computed once for a recording."""
+    known = _KNOWN.setdefault(data, {})
+    if degrees not in known:
+        known[degrees] = _residuals_of(data, degrees)
+    return known[degrees]
+
+
+def _residuals_of(data: Trajectories, degrees: tuple[int, ...]) -> Tensor:
     """`roughness` of every coordinate by its own readings, (D, n), of recordings that agree at one degree or more."""
     q = data.q / data.balance
     if data.observed is None:

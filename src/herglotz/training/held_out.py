@@ -65,16 +65,15 @@ class HeldOut:
         self.fitted_rows = rows[..., : P + 1] - rows[..., P + 1 :] @ self.following[segment]
         # The same, each sample for the fit without its block.
         self.rows = rows[..., : P + 1].clone()
-        for k in range(len(self.equations) - 1):
-            mine = (piece[:, 1] == k).nonzero()[:, 0]
-            s, own = piece[mine, 0], grams[mine]
-            kept = whole[s] - own
-            # Segments that lie inside the block.
-            gone = torch.isin(s, piece[piece[:, 1] != k, 0], invert=True)[:, None, None]
-            self.equations[k] += torch.where(gone, 0.0, _reduced(kept, P)).sum(0) - each[s].sum(0)
-            at, place = (self.block == k).nonzero()[:, 0], torch.zeros(len(piece), dtype=torch.long, device=r.device)
-            place[mine] = torch.arange(len(mine), device=r.device)
-            self.rows[at] -= rows[at][..., P + 1 :] @ _following(torch.where(gone, own, kept), P)[place[of[at]]]
+        left_out = piece[:, 1] >= 0
+        s, block = piece[left_out].T
+        kept = whole[s] - grams[left_out]
+        # Segments that lie inside a block have one piece.
+        gone = (torch.bincount(piece[:, 0])[s] == 1)[:, None, None]
+        self.equations.index_add_(0, block, torch.where(gone, 0.0, _reduced(kept, P)) - each[s])
+        at, place = (self.block >= 0).nonzero()[:, 0], left_out.cumsum(0) - 1
+        starts = _following(torch.where(gone, grams[left_out], kept), P)
+        self.rows[at] -= rows[at][..., P + 1 :] @ starts[place[of[at]]]
 
     def residuals(self, sets: Sequence[Sequence[int]]) -> Tensor:
         """Held-out residuals over the balance, (C, N, n), for C sets of numbers; NaN if a set has no solution.

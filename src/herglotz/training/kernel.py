@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,23 +84,32 @@ def kernel_of(model: ContactLagrangian, parameters: ParameterVector | None = Non
         compiler()
     except InputError:
         return None
+    if (found := _places(config)) is None:
+        return None
+    kernel, place, rates = found
+    rest = torch.zeros(len(kernel.numbers), dtype=torch.float64)
+    numbers = list(place)
+    if parameters is not None and len(parameters.numbers) < len(numbers):
+        rest[torch.tensor(list(place.values()))] = ParameterVector(model).get()
+        numbers = parameters.numbers
+    chosen = torch.tensor([place[name] for name in numbers], dtype=torch.long)
+    rest[chosen] = 0.0
+    sharpest = dict(model.named_buffers()).get("friction.sharpest", rest.new_zeros(model.dof))
+    return Placed(kernel, chosen, rest, torch.cat([sharpest, rates]))
+
+
+@lru_cache(maxsize=256)
+def _places(config: ModelConfig) -> tuple[Kernel, dict[str, int], Tensor] | None:
+    """The kernel of a configuration, the place of each number of the model in θ, and the rates of waves (R,)."""
     rates = rates_of(terms_of(config))
     features, drag = rates.standard(expand(config.features, config.angles)), rates.standard(config.drag)
     kernel = _kernel(_whole(replace(config, features=features, drag=drag)))
     if kernel is None:
         return None
-    every = ParameterVector(model)
-    keys = [rates.texts.get(key, key) for key in keys_of(every.numbers, config)]
-    place = dict(zip(every.numbers, (kernel.place[key] for key in keys), strict=True))
-    rest = torch.zeros(len(kernel.numbers), dtype=torch.float64)
-    numbers = every.numbers
-    if parameters is not None and len(parameters.numbers) < len(numbers):
-        rest[torch.tensor(list(place.values()))] = every.get()
-        numbers = parameters.numbers
-    chosen = torch.tensor([place[name] for name in numbers], dtype=torch.long)
-    rest[chosen] = 0.0
-    sharpest = dict(model.named_buffers()).get("friction.sharpest", rest.new_zeros(model.dof))
-    return Placed(kernel, chosen, rest, torch.cat([sharpest, kernel.rates(rates.values)]))
+    numbers = ParameterVector(ContactLagrangian(config)).numbers
+    keys = (rates.texts.get(key, key) for key in keys_of(numbers, config))
+    place = {name: kernel.place[key] for name, key in zip(numbers, keys, strict=True)}
+    return kernel, place, kernel.rates(rates.values)
 
 
 def structure(config: ModelConfig) -> ModelConfig:

@@ -72,7 +72,7 @@ class StatesProblem(LeastSquares, ABC):
     """An objective over the parameters, then states (q, p[, s]) on a grid of model steps.
 
     s is an unknown only if positions depend on s: a state has d = 2n + 1 numbers then, else 2n. `scale` and `speed` are
-    the sizes of q and q̇, `action` that of s, `mass` the ratio of p to q̇.
+    the sizes of q and q̇, `action` that of s.
     """
 
     def __init__(self, model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, **settings: Any):
@@ -81,10 +81,9 @@ class StatesProblem(LeastSquares, ABC):
         self.d = states_of(model)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())
-        self.mass = self._masses(model)  # (n,)
 
-    def _masses(self, model: ContactLagrangian) -> Tensor:
-        """Median of h · diag(mixed Hessian) over steps of the data, (n,); 1 if that is 0 or infinite."""
+    def masses_of(self, model: ContactLagrangian) -> Tensor:
+        """The ratio p/q̇: the median of h · diag(mixed Hessian) over steps of the data, (n,); 1 if 0 or infinite."""
         steps = self.data.steps()
         some = torch.linspace(0, len(steps.h) - 1, min(MASS_STEPS, len(steps.h)), device=steps.h.device).round().long()
         i, h = steps.index[some], steps.h[some]

@@ -117,6 +117,8 @@ class ShootingProblem(StatesProblem):
         self.s, self._noise, self.jointed = s, None, bool(grid.joined.any())
         # Defects of momenta at joints are divided by the masses.
         self.masses = JointMasses(self.parameters, data.q)
+        # Of a model whose masses do not move.
+        self.mass = self.masses_of(model) if self.jointed and not self.masses.move else torch.ones_like(self.scale)
         self._weigh()
         self._solved: tuple[Tensor, Path | None] | None = None
         # The last path, from which the next solve starts, and its unknowns.

@@ -54,6 +54,7 @@ class SmoothingProblem(StatesProblem):
         # Standard deviations that an unknown force adds in a step: to v, to q by way of v, to p, and to s.
         v = (self.deviations * self.speed / self.scale).expand(*grid.h.shape, n)
         s = (self.sigma * v.new_tensor([self.action]) / self.scale.max()).expand(*grid.h.shape, 1)
+        self.mass = self.masses_of(model)  # (n,)
         self.w = process * torch.cat([grid.h[..., None] / 3**0.5 * v, self.mass * v, s], -1)[..., :d]  # (S, K, d)
         self._stepped_at: tuple[Tensor, tuple[Tensor, Tensor] | None] | None = None
 
