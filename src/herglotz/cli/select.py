@@ -23,10 +23,10 @@ from herglotz.cli.flags import (
 )
 
 DESCRIPTION = """\
-Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
-and keep the level of fewest parameters that is not beaten beyond its spread. RUN receives the chosen run (as from
-`herglotz fit`), selection.json and selection.png. The last line is the verdict on the chosen run; the exit code is 3
-where it does not fit.
+Fit every level of the ladder on the first part of each trajectory, from several seeds unless it is beaten at the first,
+compare free runs over the rest, and keep the level of fewest parameters that is not beaten beyond its spread. RUN
+receives the chosen run (as from `herglotz fit`), selection.json and selection.png. The last line is the verdict on the
+chosen run; the exit code is 3 where it does not fit.
 
 examples:
   herglotz select pendulum.csv --out runs/selected
@@ -39,7 +39,7 @@ FLAGS = (
     *RUN,
     flag("--levels", f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); "
          "default: all but full, and auto where nothing is said of the terms; with recorded inputs u: forced and auto"),
-    flag("--seeds", "fits a level (default %(default)s)", type=count, default=3),
+    flag("--seeds", "fits a level that is not beaten at the first seed (default %(default)s)", type=count, default=3),
     *PROGRESS,
     *MACHINE,
     *READING,

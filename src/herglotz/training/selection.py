@@ -39,7 +39,7 @@ TIMED_STEPS = 20
 
 @dataclass(frozen=True)
 class Candidate:
-    """One level, fitted from several seeds.
+    """One level, fitted from one seed or several.
 
     `errors` are held-out RMS errors of free runs, in units of q, inf for a failed run; `step_us` is the processor time
     of one step of one trajectory, in µs.
@@ -140,12 +140,13 @@ def select(
     resume: bool = False,
     **reading: Any,
 ) -> Selection:
-    """Fit every level from every seed on the first part of each trajectory; score free runs over the rest.
+    """Fit every level on the first part of each trajectory; score free runs over the rest.
 
     The held-out time is divided into blocks (at least five in all); the score of a fit is the RMS over its blocks. The
-    level with the fewest trained parameters is chosen among those that the best level does not beat; of equals, the
-    first. The best level beats another by the rule of the prior's strengths (`cross_validation.beaten`) between the
-    median seeds, and if the other's error is outside the best level's own range over seeds.
+    best level beats another by the rule of the prior's strengths (`cross_validation.beaten`). Levels that are beaten at
+    the first seed are fitted once, the others from every seed. The level with the fewest trained parameters is chosen
+    among those that the best level does not beat; of equals, the first. The median seeds are compared, and a level is
+    not beaten whose error is inside the best level's own range over seeds.
 
     Parameters
     ----------
@@ -154,7 +155,8 @@ def select(
     levels
         Levels of `herglotz.models.LEVELS`, and "auto", the default of `fit`. None: those of `levels_for`.
     seeds
-        Fits per level, with seeds config.seed, config.seed + 1, …; one if nothing is random (no network, no batch).
+        Fits per level, with seeds config.seed, config.seed + 1, …; one if the level is beaten at the first seed, or if
+        nothing is random (no network, no batch).
     config
         All other settings of the fits; `train_fraction` must be below 1.
     out
@@ -182,29 +184,39 @@ def select(
     })  # fmt: skip
     data = as_trajectories(data, **reading)
     levels = levels_for(data, config) if levels is None else levels
-    candidates, ladder = [], [level for level in LADDER if level in levels]
+    ladder, done = [level for level in LADDER if level in levels], 0
     began, silent = time.monotonic(), progress is False or (progress is None and not sys.stderr.isatty())
 
-    def one(level: str, seed: int) -> Run:
+    def one(level: str, seed: int, planned: int) -> Run:
+        """A fit, of as many as are planned."""
+        nonlocal done
         folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
         settings = replace(config, level=level, seed=seed)
         run = fit(data, settings, out=folder, progress=progress, resume=resume)
+        done += 1
         if not silent:
-            done, rms = len(candidates) * seeds + seed - config.seed + 1, run.metrics.get("extrapolation_rms")
-            left = (time.monotonic() - began) / done * (len(ladder) * seeds - done)
+            rms, left = run.metrics.get("extrapolation_rms"), (time.monotonic() - began) / done * (planned - done)
             error = "fails" if rms is None else f"{rms:.3g}"
-            text = f"fit {done} of {len(ladder) * seeds}: {run.decided.level}, seed {seed}: held-out RMS {error}"
+            text = f"fit {done} of {planned}: {run.decided.level}, seed {seed}: held-out RMS {error}"
             tell(f"{text}; about {left:.0f} s left")
         return replace(run, reading=reading_told(reading, data.names))
 
-    for level in ladder:
-        runs = [one(level, config.seed)]
-        drawn = runs[0].model.config.networks or config.batch
-        runs += [one(level, config.seed + k) if drawn else runs[0] for k in range(1, seeds)]
-        errors = torch.stack([block_errors(run) for run in runs])
-        candidates.append(Candidate(level, tuple(runs), errors, step_cost(runs[0])))
+    runs = {level: [one(level, config.seed, len(ladder))] for level in ladder}
+    errors = {level: block_errors(first) for level, (first,) in runs.items()}
+    best = min(errors.values(), key=lambda x: float(x.square().mean()))
+    again = [
+        level
+        for level, (first,) in runs.items()
+        if (first.model.config.networks or config.batch) and (errors[level] is best or not beaten(errors[level], best))
+    ]
+    for level in again:
+        runs[level] += [one(level, config.seed + k, len(ladder) + len(again) * (seeds - 1)) for k in range(1, seeds)]
+    candidates = [
+        Candidate(level, tuple(own), torch.stack([block_errors(run) for run in own]), step_cost(own[0]))
+        for level, own in runs.items()
+    ]
     return Selection(tuple(candidates), _simplest(candidates))
 
 
