@@ -373,7 +373,10 @@ def longest_step(run: FittedRun) -> float:
 
 
 def free_run(run: FittedRun, max_step: float) -> Tensor:
-    """Positions of free runs of all recordings from their first states, with steps up to `max_step`, (N, n)."""
+    """Positions of free runs of all recordings from their first states, with steps up to `max_step`, (N, n).
+
+    NaN if the runs cannot be solved at once: they end, or are not near the data.
+    """
     data, states = run.data.unwrapped(), run.states.joined.detach().clone()
-    run_on(run.stepper, data, states, (1,) * len(data), max_step)
+    run_on(run.stepper, data, states, (1,) * len(data), max_step, one_by_one=False)
     return states[:, : data.dof].detach()

@@ -39,11 +39,18 @@ def states_everywhere(
 
 
 def run_on(
-    stepper: Stepper, data: Trajectories, states: Tensor, known: Sequence[int], max_step: float
+    stepper: Stepper,
+    data: Trajectories,
+    states: Tensor,
+    known: Sequence[int],
+    max_step: float,
+    *,
+    one_by_one: bool = True,
 ) -> SegmentGrid | None:
     """Fill in `states` (N, 2n+1) by a free run from the last of the `known` leading samples of each trajectory.
 
-    NaN from a failed step on. Return the grid of the model steps; None if all samples are known.
+    NaN from a failed step on. Return the grid of the model steps; None if all samples are known. `one_by_one`: as for
+    `free_runs`.
     """
     before = [k - 1 if k < length else length for k, length in zip(known, data.lengths, strict=True)]
     rows = (~leading(data.lengths, before)).nonzero()[:, 0].to(states.device)
@@ -53,22 +60,31 @@ def run_on(
     grid = segment_grid(rest, rest.samples, max_step)
     # A hold may take the inputs of earlier samples into account.
     u = step_inputs(cast(ContactLagrangian, stepper.L_d), data, replace(grid, row=rows[grid.row]))
-    states[rows] = grid.at_samples(free_runs(stepper, rest, grid, states[rows[grid.start_sample]], u))
+    runs = free_runs(stepper, rest, grid, states[rows[grid.start_sample]], u, one_by_one=one_by_one)
+    states[rows] = grid.at_samples(runs)
     return grid
 
 
-def free_runs(stepper: Stepper, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None) -> Tensor:
+def free_runs(
+    stepper: Stepper,
+    data: Trajectories,
+    grid: SegmentGrid,
+    start: Tensor,
+    u: Tensor | None,
+    *,
+    one_by_one: bool = True,
+) -> Tensor:
     """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1); NaN from a failed step on.
 
-    Near the data all steps are solved at once, with the data as initial guess; else one by one. If a start is NaN, its
-    run is NaN.
+    Near the data all steps are solved at once, with the data as initial guess; else one by one, which takes minutes for
+    1e5 steps, or with `one_by_one` false not at all: all runs are NaN then. If a start is NaN, its run is NaN.
     """
     known, model = torch.isfinite(start).all(-1), cast(ContactLagrangian, stepper.L_d)
     nodes = near_data(model, data, grid, start, u) if bool(known.all()) else None
     if nodes is not None:
         return nodes
     nodes = start.new_full((len(start), grid.longest + 1, start.shape[-1]), torch.nan)
-    if bool(known.any()):
+    if one_by_one and bool(known.any()):
         with torch.no_grad():
             inputs = None if u is None else u[known]
             out = stepper.rollout(*state_of(start[known]), h=grid.h[known], inputs=inputs)

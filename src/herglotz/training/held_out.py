@@ -53,26 +53,32 @@ class HeldOut:
         rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d) of numbers, residual, start
         segment = problem.grid.segment
         piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
-        grams = _grams(rows * by, of, len(piece))  # (Q, P + 1 + d, P + 1 + d)
-        whole = grams.new_zeros(problem.grid.segments, *grams.shape[1:]).index_add_(0, piece[:, 0], grams)
-        self.following, each = _following(whole, P), _reduced(whole, P)
+        weighted = rows * by
+        own = _by_start(weighted, of, len(piece), P)  # (Q, d, P + 1 + d)
+        whole = own.new_zeros(problem.grid.segments, *own.shape[1:]).index_add_(0, piece[:, 0], own)
+        self.following = _following(whole, P)
         _, A, b = problem.prior_equations(theta)
-        self.equations = (each.sum(0) + torch.cat([A, b[:, None]], 1)).repeat(int(self.block.max()) + 2, 1, 1)
+        fit = _summed(weighted, P) - _products(whole[..., :P], self.following) + torch.cat([A, b[:, None]], 1)
+        self.equations = fit.repeat(int(self.block.max()) + 2, 1, 1)
         # With joints the samples alone have another optimum.
         if not problem.jointed:
             self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
         # [J, r] with the states following, of the fit to all samples.
         self.fitted_rows = rows[..., : P + 1] - rows[..., P + 1 :] @ self.following[segment]
-        # The same, each sample for the fit without its block.
+        # The starts of the pieces that are left out follow the rest of their segments; segments that lie inside a block
+        # have one piece.
+        out = piece[:, 1] >= 0
+        s, block = piece[out].T
+        gone, kept = (torch.bincount(piece[:, 0])[s] == 1)[:, None, None], whole[s] - own[out]
+        starts = _following(torch.where(gone, own[out], kept), P)
+        before, after = whole[s][..., :P], torch.where(gone, 0.0, kept[..., :P])
+        for k in range(len(self.equations) - 1):
+            mine, at = block == k, self.block == k
+            eliminated = _products(before[mine], self.following[s[mine]]) - _products(after[mine], starts[mine])
+            self.equations[k] += eliminated - _summed(weighted[at], P)
+        # [J, r], each sample for the fit without its block.
         self.rows = rows[..., : P + 1].clone()
-        left_out = piece[:, 1] >= 0
-        s, block = piece[left_out].T
-        kept = whole[s] - grams[left_out]
-        # Segments that lie inside a block have one piece.
-        gone = (torch.bincount(piece[:, 0])[s] == 1)[:, None, None]
-        self.equations.index_add_(0, block, torch.where(gone, 0.0, _reduced(kept, P)) - each[s])
-        at, place = (self.block >= 0).nonzero()[:, 0], left_out.cumsum(0) - 1
-        starts = _following(torch.where(gone, grams[left_out], kept), P)
+        at, place = self.block >= 0, out.cumsum(0) - 1
         self.rows[at] -= rows[at][..., P + 1 :] @ starts[place[of[at]]]
 
     def residuals(self, sets: Sequence[Sequence[int]]) -> Tensor:
@@ -200,21 +206,26 @@ def blocks(data: Trajectories) -> Tensor:
     return torch.cat(parts)
 
 
-def _grams(rows: Tensor, of: Tensor, count: int) -> Tensor:
-    """Σ row rowᵀ of each piece, (Q, w, w); a piece is a run of consecutive samples."""
+def _by_start(rows: Tensor, of: Tensor, count: int, P: int) -> Tensor:
+    """Σ startᵀ row of each piece, (Q, d, P + 1 + d); a piece is a run of consecutive samples."""
     counts = torch.bincount(of, minlength=count).tolist()
     parts = [part.flatten(0, 1) for part in rows.split(counts)]
-    return torch.stack([part.T @ part for part in parts])
+    return torch.stack([part[:, P + 1 :].T @ part for part in parts])
 
 
-def _following(grams: Tensor, P: int) -> Tensor:
+def _summed(rows: Tensor, P: int) -> Tensor:
+    """[C, b_θ]: Σ Jᵀ [J, r], (P, P + 1)."""
+    return _products(rows[..., :P], rows[..., : P + 1])
+
+
+def _products(x: Tensor, y: Tensor) -> Tensor:
+    """Σ xᵀ y over the leading axes of x (Q, d, P) and y (Q, d, W), (P, W)."""
+    return x.flatten(0, 1).T @ y.flatten(0, 1)
+
+
+def _following(by_start: Tensor, P: int) -> Tensor:
     """T⁻¹ [B, b_x] of each segment, (S, d, P + 1): minus (derivatives of its start by the numbers, own step)."""
-    T = grams[:, P + 1 :, P + 1 :]
+    T = by_start[..., P + 1 :]
     size = T.diagonal(dim1=-2, dim2=-1)
     T = T + torch.diag_embed(RIDGE * size + torch.finfo(T.dtype).tiny ** 0.5)
-    return torch.linalg.solve(T, grams[:, P + 1 :, : P + 1])
-
-
-def _reduced(grams: Tensor, P: int) -> Tensor:
-    """[C − Bᵀ T⁻¹ B, b_θ − Bᵀ T⁻¹ b_x] of each segment, with its start eliminated, (S, P, P + 1)."""
-    return grams[:, :P, : P + 1] - grams[:, :P, P + 1 :] @ _following(grams, P)
+    return torch.linalg.solve(T, by_start[..., : P + 1])

@@ -293,8 +293,10 @@ def function_posterior(posterior: Laplace) -> FunctionPosterior:
 def mass_at(model: ContactLagrangian, q: Tensor, h: float) -> Tensor:
     """m(q) = −h ∂²K/∂q₀∂q₁ at rest, (n, n, K), at positions q (K, n)."""
     n = q.shape[-1]
-    K = model.terms(Phase(q, q, torch.full_like(q[:, 0], h), 2, model.config)).K
-    return q.new_zeros(n, n, len(q)) if K is None else -h * K.hessian()[:n, n:].movedim(-1, 2)
+    if not model.config.baseline:
+        return q.new_zeros(n, n, len(q))
+    K = model.kinetic(Phase(q, q, torch.full_like(q[:, 0], h), 2, model.config))
+    return -h * K.hessian()[:n, n:].movedim(-1, 2)
 
 
 def by_numbers(model: ContactLagrangian, function: Callable[[ContactLagrangian], Tensor], theta: Tensor) -> Tensor:
