@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.func import jacrev
+from torch.func import jacfwd, jacrev
 
 from herglotz.data.splits import leading
 from herglotz.errors import InputError, refuse
@@ -300,10 +300,17 @@ def mass_at(model: ContactLagrangian, q: Tensor, h: float) -> Tensor:
 
 
 def by_numbers(model: ContactLagrangian, function: Callable[[ContactLagrangian], Tensor], theta: Tensor) -> Tensor:
-    """∂f/∂θ, (..., P), of a function f of a model at the numbers θ (P,), which are written into the model."""
+    """∂f/∂θ, (..., P), of a function f of a model at the numbers θ (P,), which are written into the model.
+
+    By columns if f has more values than there are numbers: 1e4 values of a chain of 32 bodies by 4 numbers took minutes
+    by rows.
+    """
     numbers = ParameterVector(model)
     numbers.set(theta)
-    J = jacrev(lambda theta: numbers.evaluated(theta, function))(numbers.get())
+    with torch.no_grad():
+        values = function(model).numel()
+    jacobian = jacfwd if values > len(theta) else jacrev
+    J = jacobian(lambda theta: numbers.evaluated(theta, function))(numbers.get())
     assert isinstance(J, Tensor)
     return J
 
