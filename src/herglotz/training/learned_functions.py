@@ -29,12 +29,12 @@ h^p, and Jᵀr of model steps h and h/2 is extrapolated (Richardson). Held-out e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.func import jacfwd, jacrev
+from torch.func import jacrev
 
 from herglotz.data.splits import leading
 from herglotz.errors import InputError, refuse
@@ -157,7 +157,7 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
             mean = std = [None] * len(value)
         else:
             posterior = function_posterior(of)
-            std = posterior.std(by_numbers(posterior.model, lines.values, posterior.theta)).split(points)
+            std = [posterior.std(J) for J in lines.by_numbers(posterior.model, posterior.theta)]
             mean = lines.values(posterior.model).split(points)
     found = []
     for (kind, i, (x, low, high)), y, m, s in zip(lines.parts, value, mean, std, strict=True):
@@ -194,10 +194,19 @@ class _Lines:
         pairs = ((j, k) for j in range(len(m)) for k in range(j, len(m)))
         return [*found, *(("mass", (j, k, i), at) for j, k in pairs if _varies(m[j, k], m))]
 
-    def values(self, model: ContactLagrangian) -> Tensor:
-        """All functions of a model in the gauge of this module, concatenated, float64."""
+    def values(self, model: ContactLagrangian, parts: Sequence[Part] | None = None) -> Tensor:
+        """Functions of a model in the gauge of this module, by default all, concatenated, float64."""
         unit = mass_at(model, self.some, self.h)[0, 0].double().cpu().mean()
-        return torch.cat([self._value(model, kind, of, *line) / unit for kind, of, line in self.parts])
+        every = self.parts if parts is None else parts
+        return torch.cat([self._value(model, kind, of, *line) / unit for kind, of, line in every])
+
+    def by_numbers(self, model: ContactLagrangian, theta: Tensor) -> Iterator[Tensor]:
+        """The derivatives (K, P) of each function by the numbers of a model at θ.
+
+        One function at a time: backwards through all of them, each value would cost as much as all values.
+        """
+        for part in self.parts:
+            yield by_numbers(model, lambda m, part=part: self.values(m, [part]), theta)
 
     def _value(
         self, model: ContactLagrangian, kind: str, of: tuple[int, ...], x: Tensor, low: float, high: float
@@ -300,17 +309,10 @@ def mass_at(model: ContactLagrangian, q: Tensor, h: float) -> Tensor:
 
 
 def by_numbers(model: ContactLagrangian, function: Callable[[ContactLagrangian], Tensor], theta: Tensor) -> Tensor:
-    """∂f/∂θ, (..., P), of a function f of a model at the numbers θ (P,), which are written into the model.
-
-    By columns if f has more values than there are numbers: 1e4 values of a chain of 32 bodies by 4 numbers took minutes
-    by rows.
-    """
+    """∂f/∂θ, (..., P), of a function f of a model at the numbers θ (P,), which are written into the model."""
     numbers = ParameterVector(model)
     numbers.set(theta)
-    with torch.no_grad():
-        values = function(model).numel()
-    jacobian = jacfwd if values > len(theta) else jacrev
-    J = jacobian(lambda theta: numbers.evaluated(theta, function))(numbers.get())
+    J = jacrev(lambda theta: numbers.evaluated(theta, function))(numbers.get())
     assert isinstance(J, Tensor)
     return J
 

@@ -15,7 +15,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.plots import plot_learned
 from herglotz.training import Plan, fit, laplace, learned_functions
 from herglotz.training.cross_validation import FOLDS, data_rows, foretold_errors, held_out_errors
-from herglotz.training.learned_functions import FunctionPosterior, _Lines, by_numbers, function_posterior
+from herglotz.training.learned_functions import FunctionPosterior, _Lines, function_posterior, mass_at
 from herglotz.training.parameter_vector import ParameterVector
 
 INF = float("inf")
@@ -63,7 +63,7 @@ def test_the_numbers_of_a_model_alone_say_too_little_of_its_functions(fitted):
     law, posterior = fitted
     run, P = posterior.run, len(posterior.theta)
     lines = _Lines(run, 101, 0.0)
-    J = by_numbers(run.model, lines.values, posterior.theta)
+    J = torch.cat(list(lines.by_numbers(run.model, posterior.theta)))
     std = ((J @ posterior.covariance[:P, :P]) * J).sum(1).sqrt()[101:202].numpy()
     force = by_kind(learned_functions(run))["force"]
     missed = np.abs(truth(law, run, force) - force.value.numpy())
@@ -127,7 +127,7 @@ def test_derivatives_by_numbers_are_those_of_differences(fitted):
     run = fitted[1].run
     numbers, lines = ParameterVector(run.model), _Lines(run, 5, 0.0)
     theta = numbers.get()
-    J = by_numbers(run.model, lines.values, theta)
+    J = torch.cat(list(lines.by_numbers(run.model, theta)))
     for i in range(len(theta)):
         ends = []
         for side in (1e-5, -1e-5):
@@ -135,6 +135,18 @@ def test_derivatives_by_numbers_are_those_of_differences(fitted):
             ends.append(lines.values(run.model).detach())
         numbers.set(theta)
         torch.testing.assert_close(J[:, i], (ends[0] - ends[1]) / 2e-5, rtol=1e-6, atol=1e-8)
+
+
+def test_masses_and_derivatives_cost_no_more_than_they_need(fitted, monkeypatch):
+    # fails if the potential is evaluated for a mass, which took minutes of the figures of a chain of 32 bodies, or if
+    # the derivatives of one function are taken through all functions
+    run = fitted[1].run
+    lines, seen = _Lines(run, 5, 0.0), []
+    monkeypatch.setattr(type(run.model.potential), "forward", lambda *_: pytest.fail("a potential for a mass"))
+    assert mass_at(run.model, lines.some, run.h).shape == (1, 1, len(lines.some))
+    monkeypatch.undo()
+    monkeypatch.setattr(_Lines, "_value", lambda *parts: seen.append(parts[2]) or parts[4])
+    assert len(list(lines.by_numbers(run.model, ParameterVector(run.model).get()))) == len(seen) == len(lines.parts)
 
 
 def test_a_model_of_networks_has_the_posterior_of_its_numbers(fitted):

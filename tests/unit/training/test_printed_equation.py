@@ -25,6 +25,7 @@ from herglotz.training.equation import (
     Term,
     _is_lost,
     _sensors,
+    departure,
     equation_of,
     notes_of,
     without_bound,
@@ -356,6 +357,15 @@ def test_a_motion_that_leaves_the_world_has_no_departure():
     data = Trajectories.of(torch.arange(21).double(), q, angles=(False,))
     lost = [_is_lost(cast(Any, SimpleNamespace(data=data, prediction=x))) for x in (q, -0.4 * q, -q, 1e20 * q, q / 0)]
     assert lost == [False, False, True, True, True]
+
+
+def test_a_motion_that_is_not_solved_at_once_has_no_departure(monkeypatch):
+    # fails if the motion of numbers that are far off is stepped one by one: 5e4 steps took four minutes
+    run = run_of(*MODELS["waves"])
+    monkeypatch.setattr(Stepper, "rollout", lambda *_, **__: pytest.fail("stepped one by one"))
+    assert departure(run) is not None
+    monkeypatch.setattr("herglotz.training.free_run.near_data", lambda *_: None)
+    assert departure(run) is None
 
 
 def test_the_numbers_of_an_equation_are_those_of_short_steps():
