@@ -66,8 +66,6 @@ static int hz_increment(const double x[hz_X], double h, const double *u, const d
 #if hz_STICKS
   double stiffness[hz_N], bound[hz_N];
   hz_rest(x, h, u, theta, constants, gate, fixed, z, stiffness, bound);
-  for (i = 0; i < hz_N; i++)
-    if (fabs(delta[i]) > 0) z[i] = delta[i] + (delta[i] > 0 ? bound[i] : -bound[i]);
 #define hz_AT(z) hz_evaluate(x, z, h, u, theta, constants, stiffness, bound, gate, fixed, F, J)
 #else
   for (i = 0; i < hz_N; i++) z[i] = delta[i];
@@ -183,19 +181,14 @@ long hz_sweep(long S, const long *begin, const double *h, const double *u, const
   hz_prepare(theta, constants, on, gate, fixed);
   for (s = 0; s < S && failed < 0; s++) {
     double *const here = x + s * hz_X, *const own = delta + s * hz_N, *const D = Z ? Z + s * hz_D * W : 0;
-    /* Of the last step, and of the one before: increments over h. */
-    double last[hz_N], earlier[hz_N];
+    double before = begin[s] < begin[s + 1] ? h[begin[s]] : 1;
     /* The start, then the end of every step. */
     for (k = begin[s] - 1; k < begin[s + 1]; k++) {
       if (k >= begin[s]) {
         const double *const input = hz_M ? u + k * hz_M : 0;
         double end[hz_N + 1], A[hz_D * hz_D], G[hz_D * hz_P], c;
-        /* The guess of the increment is linear in the last two; with set-valued friction 0, where that turns back. */
-        if (k > begin[s])
-          for (i = 0; i < hz_N; i++) {
-            const double rate = k > begin[s] + 1 ? 2 * last[i] - earlier[i] : last[i];
-            own[i] = hz_STICKS && !(rate * last[i] > 0) ? 0 : h[k] * rate;
-          }
+        for (i = 0; i < hz_N; i++) own[i] *= h[k] / before;
+        before = h[k];
         if (!hz_increment(here, h[k], input, theta, constants, gate, fixed, own)) {
           failed = s;
           break;
@@ -207,8 +200,6 @@ long hz_sweep(long S, const long *begin, const double *h, const double *u, const
           hz_finish(here, own, h[k], input, theta, constants, gate, fixed, end);
         }
         for (i = 0; i < hz_N; i++) {
-          earlier[i] = last[i];
-          last[i] = own[i] / h[k];
           here[i] += own[i];
           here[hz_N + i] = end[i];
         }
