@@ -65,8 +65,8 @@ class HeldOut:
             self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
         # [J, r] with the states following, of the fit to all samples.
         self.fitted_rows = rows[..., : P + 1] - rows[..., P + 1 :] @ self.following[segment]
-        # The starts of the pieces that are left out follow the rest of their segments; segments that lie inside a block
-        # have one piece.
+        # The start of a piece that is left out follows the rest of its segment or, if the segment lies inside the block
+        # and so has one piece, the piece.
         out = piece[:, 1] >= 0
         s, block = piece[out].T
         gone, kept = (torch.bincount(piece[:, 0])[s] == 1)[:, None, None], whole[s] - own[out]
