@@ -7,8 +7,10 @@ have may act all the same. The Bayesian information criterion leaves a term out 
 that a free run meets to the noise count in A: a force that they would show is no larger.
 
 Free runs go on from the end of the training part for `TURNS` turns of the motion or over the whole unseen part,
-whichever is longer; recorded inputs are repeated where there are no more. Samples do not count where the uncertainty of
-the start alone is large, because the motion is chaotic there, nor where the run has left the recorded range.
+whichever is longer; recorded inputs are repeated where there are no more. A chaotic motion is lost by its start alone,
+whatever the law; from then on two motions know nothing of each other. All uncertainties grow there at one rate, and one
+that is a few times larger loses the motion only a little earlier: samples count for half of the time until the start
+alone loses it. Samples where the run has left the recorded range do not count.
 """
 
 from __future__ import annotations
@@ -69,12 +71,15 @@ RUNS = 4
 class Foresight:
     """The uncertainty of free runs: RMS over samples, over the spread of each coordinate.
 
-    `start` is the uncertainty by the start states, over the unseen part. `parameters` is that by the parameters over
-    the `horizon`, the time beyond the training part. `hidden` is the largest change by a term that the fit does not
-    have, of this `name`. `reached`: all steps were solved.
+    `unseen` is the uncertainty by start states and parameters over the unseen part, `apart` the distance of two motions
+    of this kind that know nothing of each other. `followed` is the time after which the start alone is uncertain, inf
+    if it stays known. `parameters` is the uncertainty over the `horizon`, the time beyond the training part. `hidden`
+    is the largest change by a term that the fit does not have, of this `name`. `reached`: all steps were solved.
     """
 
-    start: float
+    unseen: float
+    apart: float
+    followed: float
     parameters: float
     hidden: float
     name: str
@@ -125,7 +130,7 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
         path = ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))
     beat()
     if ahead is None or path is None:
-        return Foresight(math.inf, math.inf, 0.0, "", runs.horizon, False)
+        return Foresight(math.inf, math.sqrt(2), math.inf, math.inf, 0.0, "", runs.horizon, False)
     spread = task.data.q.std(0, correction=0).clamp_min(1e-300)
     A, Z = dense(A).double(), ahead.slopes_at_samples(theta, path).double()
     q = ahead.grid.at_samples(path.x[..., : problem.n])
@@ -133,7 +138,8 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     # Under a controller the unseen part is more of the same: no rest of the inputs tells what they do.
     free = seen.data.u is None or unexplained(seen.data, states) >= HALF
     told = A + _of_unseen(Z, q, problem, runs, seen.data) if free else A
-    return _summary(A, told, Z / spread[:, None], problem, runs, absent, inside)
+    apart = _apart(seen.data, task.data, spread)
+    return _summary(A, told, Z / spread[:, None], problem, runs, absent, inside, apart)
 
 
 @dataclass(frozen=True)
@@ -150,6 +156,23 @@ class _Ahead:
     def unseen(self) -> Tensor:
         """Samples of the unseen part, (N,) bool."""
         return self.beyond & (self.rows >= 0)
+
+    def known_for(self, uncertain: Tensor) -> Tensor:
+        """The time beyond the training part until the first `uncertain` sample, (N,) bool, of each run; inf if none."""
+        first = []
+        for t, there, out in zip(
+            *(x.split(list(self.data.lengths)) for x in (self.data.t, self.beyond, uncertain)), strict=True
+        ):
+            lost = (there & out).nonzero()[:, 0]
+            first.append(float(t[lost[0]] - t[there][0]) if len(lost) else math.inf)
+        return torch.tensor(first)
+
+    def within(self, times: Tensor) -> Tensor:
+        """Samples beyond the training part, up to these times (runs,) from its end on, (N,) bool."""
+        parts = zip(
+            *(x.split(list(self.data.lengths)) for x in (self.data.t, self.beyond)), times.tolist(), strict=True
+        )
+        return torch.cat([there & (t - t[there][0] <= most) for t, there, most in parts])
 
     @classmethod
     def of(cls, train: Trajectories, data: Trajectories, problem: ShootingProblem, turn: float) -> _Ahead:
@@ -255,9 +278,10 @@ def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> Named
 
 
 def _of_unseen(Z: Tensor, q: Tensor, problem: ShootingProblem, runs: _Ahead, data: Trajectories) -> Tensor:
-    """JᵀJ of those unseen samples of `data` that free runs, at q with sensitivities Z (N, n, P + d), meet to the noise.
+    """JᵀJ of the unseen samples of `data` in free runs, at q with sensitivities Z (N, n, P + d).
 
-    A run that misses more shows that a force is missing.
+    All samples count of a run that meets them to the noise. A run that misses more counts as one reading of this error:
+    a force that is missing may make all of it.
     """
     found = Z.new_zeros(2 * [problem.P + problem.grid.segments * problem.d])
     every = torch.arange(len(q), device=q.device).split(list(runs.data.lengths))
@@ -266,21 +290,20 @@ def _of_unseen(Z: Tensor, q: Tensor, problem: ShootingProblem, runs: _Ahead, dat
         at = runs.rows[rows]
         there = torch.ones_like(q[rows]) if data.observed is None else data.observed[at]
         r = there * (q[rows] - data.q[at]) / problem.deviations
-        if float(r.square().sum()) <= AT_THE_NOISE**2 * float(there.sum()):
-            J = (Z[rows] * (there / problem.deviations)[..., None]).flatten(0, 1)
-            own = problem.places(segment)
-            found[own[:, None], own] += J.T @ J
+        J, missed = (Z[rows] * (there / problem.deviations)[..., None]).flatten(0, 1), float(r.square().sum())
+        own = problem.places(segment)
+        found[own[:, None], own] += J.T @ J / (1.0 if missed <= AT_THE_NOISE**2 * float(there.sum()) else missed)
     return found
 
 
 def _summary(
     A: Tensor, told: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]],
-    inside: Tensor,
+    inside: Tensor, apart: float,
 ) -> Foresight:  # fmt: skip
     """The variances of free runs from their sensitivities Z (N, n, P + d) over the spread, and JᵀJ of all unknowns.
 
     A is JᵀJ of the training part, `told` that with the unseen samples. Only samples `inside` the recorded range, (N,)
-    bool, count.
+    bool, count. `apart` is that of `Foresight`.
     """
     P = problem.P
     names = [name for name, at in absent.items() for _ in at]
@@ -293,13 +316,33 @@ def _summary(
         parameters.append(((z @ C[own][:, own]) * z).sum(-1).mean(-1))
         hidden.append((z @ follow[own]).square().mean(1))
     of_start, of_all, by_term = torch.cat(start), torch.cat(parameters), torch.cat(hidden)
-    counts = runs.beyond & inside & (of_start.sqrt() < UNCERTAIN)
+    followed = runs.known_for(of_start.sqrt() >= UNCERTAIN)
+    counts = runs.within(followed / 2) & inside
     by_term = by_term[counts].sum(0) / max(1, int(counts.sum()))
     worst = int(by_term.argmax()) if names else -1
+    lost = runs.beyond & ~runs.within(followed)
+    of_unseen = torch.where(lost, of_all.new_tensor(apart**2).maximum(of_all), of_all)[runs.unseen]
     return Foresight(
-        start=_root(of_start[runs.unseen]), parameters=_root(of_all[counts]), horizon=runs.horizon, reached=True,
+        unseen=_root(of_unseen), apart=apart, followed=float(followed.min()),
+        parameters=_root(of_all[counts]), horizon=runs.horizon, reached=True,
         hidden=float(by_term[worst].sqrt()) if names else 0.0, name=names[worst] if names else "",
     )  # fmt: skip
+
+
+def _apart(data: Trajectories, train: Trajectories, spread: Tensor) -> float:
+    """The RMS distance of two motions of this kind that know nothing of each other, over the spread of each coordinate.
+
+    √2 where motions stay about a place. Where they wander, as of a pendulum that turns over, positions that lie as far
+    apart in time as the unseen part is long tell more.
+    """
+    moved = []
+    for one, seen in zip(data, train.lengths, strict=True):
+        ahead = one.samples - seen
+        if ahead:
+            both = one.complete[ahead:] & one.complete[:-ahead]
+            moved.append(((one.q[ahead:] - one.q[:-ahead]) / spread)[both])
+    far = torch.cat(moved).square().mean().sqrt() if any(map(len, moved)) else spread.new_zeros(())
+    return max(math.sqrt(2), float(far))
 
 
 def _open(A: Tensor, absent: dict[str, list[int]], problem: ShootingProblem) -> tuple[Tensor, Tensor]:

@@ -7,12 +7,12 @@ Three errors are compared with the precision of the data, which is estimated fro
   run, whichever are nearer to the data;
 * one free run over the whole unseen part, `extrapolation_rms`.
 
-A model is rejected if a free run loses the motion, unless the uncertainty of the start state explains the loss, which
-then is no error of the model: chaotic motion leaves every model in the long run. A free run that fails or diverges
-always rejects the model. So does a large uncertainty of the model itself (`foresight`): many models fit a recording
-that is too short. So does a misfit above the noise if the data themselves show a cause that the user can remove
-(`misread`). Errors of several coordinates are divided by the spread of each. If a recording is too short to show its
-noise, the misfit of the training data replaces the noise.
+A model is rejected if a free run loses the motion, unless the uncertainty of its start and of the parameters explains
+the loss, which then is no error of the model: chaotic motion leaves every model in the long run. A free run that fails
+or diverges always rejects the model. So does a large uncertainty while the start alone lets the motion be followed
+(`foresight`): many models fit a recording that is too short. So does a misfit above the noise if the data themselves
+show a cause that the user can remove (`misread`). Errors of several coordinates are divided by the spread of each. If a
+recording is too short to show its noise, the misfit of the training data replaces the noise.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
 FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does not fit"
-# Standard deviations of a free run, by the uncertainty of its start, within which a loss of the motion is no error.
+# Standard deviations of a free run, by what the fit leaves open, within which a loss of the motion is no error.
 CHANCE = 3.0
-OF_THE_START = "What the fit leaves open of its start explains the error of the one run"
+OF_WHAT_IS_OPEN = "What the fit leaves open of its start and of its numbers explains the error of the one run"
 # Standard errors by which a free run has to be better than the mean of the data.
 CLEARLY = 2.0
 # Most recordings of the same kind, as the root of their number: nobody records 900 times as much.
@@ -316,17 +316,23 @@ def in_words(
         return f"{FAILS}: {_unseen_motion(errors)}"
     if unstable:
         return ". ".join(filter(None, (f"{_fits(replace(errors, free=None))}: {errors}", unstable, caveat)))
-    # Two motions of one kind that know nothing of each other differ by √2 of their spread. The errors of a start and
-    # those of a model know nothing of each other, either.
-    chance = 0.0 if ahead is None else min(CHANCE * ahead.start, math.sqrt(2)) * errors.spread
+    # The errors of what is left open and those of a model know nothing of each other.
+    chance = 0.0 if ahead is None else min(CHANCE * ahead.unseen, ahead.apart) * errors.spread
     if free > math.hypot(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics, shown)}"
-    # What is lost here is so by its start, which is no error of the model.
-    of_start = free > errors.lost
-    fits = f"{_fits(replace(errors, free=None) if of_start else errors)}: {errors}"
-    return ". ".join(filter(None, (fits, OF_THE_START if of_start else "", shown(True) if missed else caveat)))
+    # What is lost here is so by what is left open, which is no error of the model.
+    by_chance = free > errors.lost
+    fits = f"{_fits(replace(errors, free=None) if by_chance else errors)}: {errors}"
+    why = _why_by_chance(cast(Foresight, ahead)) if by_chance else ""
+    return ". ".join(filter(None, (fits, why, shown(True) if missed else caveat)))
+
+
+def _why_by_chance(ahead: Foresight) -> str:
+    if not math.isfinite(ahead.followed):
+        return OF_WHAT_IS_OPEN
+    return f"{OF_WHAT_IS_OPEN}: after {ahead.followed:.3g} units of time the start alone loses it, whatever the law"
 
 
 def _fits(errors: Errors) -> str:

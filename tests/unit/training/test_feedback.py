@@ -202,7 +202,9 @@ def test_a_fit_says_what_the_effect_of_following_inputs_rests_on(signal, told):
 
 def test_the_verdict_says_what_the_inputs_leave():
     # fails if the recording of a balanced motion is said to be too short, or the unseen part to differ from the other
-    ahead = Foresight(start=0.0, parameters=0.4, hidden=0.02, name="q1^3", horizon=7.0, reached=True)
+    ahead = Foresight(
+        unseen=0.0, apart=2**0.5, followed=math.inf, parameters=0.4, hidden=0.02, name="q1^3", horizon=7.0, reached=True
+    )
     good = {"follows_data": True, "objective": "trajectory"}
     unstable = lambda *_: "It is unstable. Try shorter ones"  # noqa: E731
     said = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), ahead, good, unstable)

@@ -42,15 +42,56 @@ def _driven_axis(seed: int, count: int = 150, h: float = 0.09) -> Trajectories:
     return Trajectories.of((k * h).repeat(3), torch.cat(parts), 3 * (count,), u=torch.cat(inputs)[:, None], hold="zero")
 
 
-@pytest.mark.parametrize(("name", "value"), [("AT_THE_NOISE", 0.0), ("unexplained", lambda *_: 0.0)])
-def test_unseen_samples_that_are_met_tell_of_hidden_forces(name, value, monkeypatch):
+def test_unseen_samples_that_are_met_tell_of_hidden_forces(monkeypatch):
     # fails if a force that the unseen part would show may still act: a servo axis, met to the noise over all unseen
     # time, was refused with exit code 3 for a force x⁵ that nothing shows; or if that counts where it tells nothing
     data = _driven_axis(5)
     assert fit(data, progress=False).metrics["verdict"].startswith("fits to the noise")
-    # The unseen part is missed, or its inputs follow from the state as under a controller, and counts for nothing.
-    monkeypatch.setattr(foresight, name, value)
+    # Inputs that follow from the state, as under a controller: the unseen part counts for nothing.
+    monkeypatch.setattr(foresight, "unexplained", lambda *_: 0.0)
     assert fit(data, progress=False).metrics["verdict"].startswith("does not fit: too little was recorded")
+
+
+def _runs(beyond: int, *lengths: int) -> _Ahead:
+    """Runs of these numbers of samples 0.1 apart, all recorded, that go on beyond the training part after `beyond`."""
+    t = 0.1 * torch.cat([torch.arange(length, dtype=torch.float64) for length in lengths])
+    data = Trajectories.of(t, 0 * t, lengths)
+    return _Ahead(data, torch.arange(len(t)), list(range(len(lengths))), t > 0.1 * beyond + 0.05, 1.0)
+
+
+@pytest.mark.parametrize(("missed", "weight"), [(1.4, 1.0), (1.6, 1 / (4 * 1.6**2)), (math.inf, 0.0)])
+def test_a_run_that_misses_unseen_samples_is_one_reading(missed, weight):
+    # fails if such a run tells nothing (a run over 50 s met to 1.8 times the noise: "too little was recorded"), tells
+    # as much as one at the noise, or if samples of the training part count
+    runs, Z = _runs(1, 6), torch.randn(6, 1, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    problem = SimpleNamespace(
+        P=1, d=2, grid=SimpleNamespace(segments=1), deviations=0.5, places=lambda _: torch.arange(3)
+    )  # fmt: skip
+    q = runs.data.q + torch.tensor([9.0, 9.0, 1.0, -1.0, 1.0, -1.0], dtype=torch.float64)[:, None] * 0.5 * missed
+    found = foresight._of_unseen(Z, q, cast(Any, problem), runs, runs.data)
+    J = Z[2:, 0] / 0.5
+    torch.testing.assert_close(found, weight * J.T @ J)
+
+
+def test_a_chaotic_motion_counts_for_half_of_the_time_until_its_start_loses_it():
+    # fails if the time is counted from the start of a run, that of another run, or not at all
+    runs = _runs(2, 10, 8)
+    lost = torch.zeros(18, dtype=torch.bool)
+    lost[[1, 7, 9]] = True  # sample 1 is of the training part
+    known = runs.known_for(lost)
+    assert known.tolist() == [pytest.approx(0.4), math.inf]
+    assert runs.within(known / 2).nonzero()[:, 0].tolist() == [3, 4, 5, *range(13, 18)]
+
+
+def test_two_motions_that_wander_are_farther_apart_than_two_about_a_place():
+    # fails if the distance of a pendulum that turns over is that of one that swings (free runs that chaos explains were
+    # refused), or a swing that repeats itself counts as no distance
+    t = 0.1 * torch.arange(300, dtype=torch.float64)
+    swing, turns = torch.sin(2 * math.pi * t / 10), torch.where(t < 20, 0.0, t - 20)
+    for q, expected in ((swing, math.sqrt(2)), (turns, 10 / math.sqrt(3))):
+        data = Trajectories.of(t, q)
+        found = foresight._apart(data, Trajectories.of(t[:200], q[:200]), torch.ones(1, dtype=torch.float64))
+        assert found == pytest.approx(expected if q is swing else max(math.sqrt(2), expected / math.sqrt(2)), rel=0.02)
 
 
 def test_runs_that_go_on_by_one_sample_are_followed():
@@ -110,7 +151,7 @@ def test_the_start_is_asked_for_over_the_unseen_samples_alone(monkeypatch):
             monkeypatch.setattr(foresight, "TURNS", turns)
             found = foresee(*arguments)
             assert found is not None
-            starts.append(found.start)
+            starts.append(found.unseen)
         return found
 
     monkeypatch.setattr(verdict, "foresee", for_longer_and_longer)

@@ -20,13 +20,15 @@ from herglotz.training.errors_of_runs import Errors
 from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
 from herglotz.training.left_out import LeftOut
-from herglotz.training.verdict import OF_THE_START, in_words
+from herglotz.training.verdict import OF_WHAT_IS_OPEN, in_words
 
 evaluate_module = importlib.import_module("herglotz.training.evaluate")
 GOOD = {"follows_data": True, "objective": "trajectory"}
 
 
-KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=7.0, reached=True)
+KNOWN = Foresight(
+    unseen=0.0, apart=2**0.5, followed=math.inf, parameters=0.01, hidden=0.02, name="q1^3", horizon=7.0, reached=True
+)
 
 
 @pytest.mark.parametrize(
@@ -35,14 +37,14 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
         (0.011, 0.012, 0.013, KNOWN, "fits to the noise"),
         (0.011, None, None, None, "fits to the noise"),
         (0.011, 0.012, 0.02, KNOWN, "fits, worse than the noise by a factor of 2:"),
-        (0.011, 0.012, 1.2, replace(KNOWN, start=0.5), "fits to the noise:"),  # chaos
-        (0.03, 0.012, 1.2, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 3:"),
-        (0.011, 0.012, 0.09, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 9:"),  # not lost
+        (0.011, 0.012, 1.2, replace(KNOWN, unseen=0.5), "fits to the noise:"),  # chaos
+        (0.03, 0.012, 1.2, replace(KNOWN, unseen=0.5), "fits, worse than the noise by a factor of 3:"),
+        (0.011, 0.012, 0.09, replace(KNOWN, unseen=0.5), "fits, worse than the noise by a factor of 9:"),  # not lost
         (
             0.011,
             0.012,
             1.5,
-            replace(KNOWN, start=9.0),
+            replace(KNOWN, unseen=9.0),
             "does not fit beyond the recording",
         ),  # no chaos leaves the world
         (0.011, 0.012, 1.2, KNOWN, "does not fit beyond the recording"),
@@ -56,7 +58,7 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
             0.011,
             0.012,
             math.inf,
-            replace(KNOWN, start=math.inf),
+            replace(KNOWN, unseen=math.inf),
             "does not fit",
         ),  # it left the world: no start explains
         (0.2, 0.012, 0.013, KNOWN, "does not fit"),
@@ -72,7 +74,7 @@ def test_words(windows, unseen, free, ahead, expected):
     # small
     text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0), ahead, GOOD)
     assert text.startswith(expected)
-    assert (OF_THE_START in text) == (expected.startswith("fits") and free == 1.2)
+    assert (OF_WHAT_IS_OPEN in text) == (expected.startswith("fits") and free == 1.2)
     assert ("Try " in text) == (expected.startswith("does not fit"))
 
 
@@ -99,9 +101,12 @@ def test_a_free_run_that_is_lost_alone_is_no_other_part(unseen, told, said, unsa
 def test_what_a_start_and_a_model_do_to_a_free_run_adds_up():
     # fails if a chaotic motion whose start explains nearly all of an error is refused: 3 × 0.03 of the start and 0.1
     # that a model may have
-    ahead = replace(KNOWN, start=0.03)
+    ahead = replace(KNOWN, unseen=0.03, followed=0.5)
     told = [in_words(Errors(0.011, 0.011, free, noise=0.01, spread=1.0), ahead, GOOD) for free in (0.13, 0.14)]
     assert [text.startswith("does not fit") for text in told] == [False, True]
+    assert told[0].endswith(
+        "explains the error of the one run: after 0.5 units of time the start alone loses it, whatever the law"
+    )
 
 
 def test_angles_that_may_be_positions_on_a_line():
