@@ -34,7 +34,7 @@ HELP = "check the identities of the theory"
 FLAGS = (
     flag("target", "a scene, the folder of a run, or an exported file", metavar="SCENE|RUN|FILE"),
     flag("--h", "step (default: the scene's or the model's own)", type=positive),
-    flag("--samples", "states to check at (default %(default)s)", type=count, default=64),
+    flag("--samples", "states to check at (default 64, and fewer beyond 10 coordinates)", type=count),
     flag("--steps", "steps of the checks along motions (default %(default)s)", type=count, default=8),
     flag("--seed", "seed of the states (default %(default)s)", type=seed, default=0),
     flag("--against", "run that a file was exported from (default: a run with its weights nearby)",
@@ -48,8 +48,9 @@ FLAGS = (
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify and report; 1 when a check fails."""
-    if arguments.samples < 1 or arguments.steps < 2:
-        raise InputError(f"--samples must be >= 1 and --steps >= 2, got {arguments.samples} and {arguments.steps}")
+    if arguments.samples == 0 or arguments.steps < 2:
+        samples = "" if arguments.samples is None else f"{arguments.samples} and "
+        raise InputError(f"--samples must be >= 1 and --steps >= 2, got {samples}{arguments.steps}")
     import_torch()
     target = arguments.target
     if Path(target).is_file():

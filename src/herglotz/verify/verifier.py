@@ -55,7 +55,7 @@ def verify(
     target: Any,
     *,
     h: float | None = None,
-    samples: int = 64,
+    samples: int | None = None,
     steps: int = 8,
     seed: int = 0,
     tolerance: float | None = None,
@@ -79,7 +79,8 @@ def verify(
     h
         Step, in the target's unit of time; by default that of the target. Required for an L_d and for a pair.
     samples, steps, seed
-        Number of states, number of steps from each state, and seed of the drawn states.
+        Number of states (by default 64, and fewer beyond 10 coordinates), number of steps from each state, and seed of
+        the drawn states.
     tolerance
         Bound on every identity, relative to the size of its terms. The defaults are 1e-11 (contact, with L_d) and 1e-10
         in float64, 5e-4 and 1e-3 in float32, and 1e-9 and 2e-3 for a file without derivatives (machine code, C beyond 8

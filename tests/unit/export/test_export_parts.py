@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.codegen.interpret import MATHEMATICS
-from herglotz.codegen.trace import example_batch, traced
+from herglotz.codegen.trace import PRIMES, example_batch, traced
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export import export_run
@@ -55,6 +55,22 @@ def test_what_a_trace_leaves_out_changes_nothing(kept):
     assert torch.equal(graph(x)[0], function(x))
     written = {str(node.target) for node in graph.code.nodes if node.op == "call_function"}
     assert bool(written & {"aten.add.Tensor", "aten.mul.Tensor"}) == kept
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: (x * torch.linspace(0, 1, PRIMES[0]).double()).sum(-1),
+        lambda x: (x * torch.linspace(0, 1, 2 * PRIMES[0]).double()[: PRIMES[1]]).sum(-1),
+        lambda x: (x.expand(-1, 5000).reshape(5000 * len(x), 1) * 2).reshape(len(x), 5000).sum(-1),
+    ],
+)
+def test_a_graph_holds_for_any_batch(function):
+    # fails if a size that the example's batch divides is taken for the batch, or a large multiple of the batch for a
+    # fixed size (derivatives of 32 coordinates: files of them stepped one batch size alone)
+    graph = traced(function, (torch.rand(example_batch(set()), 1, dtype=torch.float64),))
+    x = torch.rand(5, 1, dtype=torch.float64)
+    torch.testing.assert_close(graph(x)[0], function(x))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from herglotz.export import differences
 from herglotz.scenes import scene
 from herglotz.stepping import State
 from herglotz.verify import verify
@@ -95,3 +96,18 @@ def test_a_sample_beside_a_failed_step_is_left_out_and_counted():
     report = verify((walled, State(q.abs() + 0.01, 0.1 * p, s)), h=0.001, steps=2)
     assert "left out: a step beside them failed" in report["derivative"].note
     assert report["derivative"].passed
+
+
+def test_points_of_many_coordinates_step_in_small_batches(monkeypatch):
+    # fails if all points step at once (32 coordinates: 14 GB), or if pieces are put together in another order
+    sizes = []
+
+    def f(y):
+        sizes.append(len(y))
+        return torch.stack([y[:, 0] * y[:, 1], y[:, 1].sin(), y[:, 2] + y[:, 0] ** 3], -1)
+
+    x = torch.rand(5, 3, dtype=torch.float64)
+    whole = differences.central_differences(f, x, torch.full((3,), 0.01).double())
+    monkeypatch.setattr(differences, "BATCH", 64)
+    torch.testing.assert_close(differences.central_differences(f, x, torch.full((3,), 0.01).double()), whole)
+    assert sizes == [120, *17 * [7], 1]

@@ -37,6 +37,15 @@ def test_an_L_d_alone_is_verified(L_d, n):
         assert float(states.p[:, 0].std()) > 100 * float(states.p[:, 1].std())
 
 
+@pytest.mark.parametrize(("n", "samples", "expected"), [(10, None, 64), (32, None, 6), (32, 9, 9)])
+def test_many_coordinates_are_verified_at_fewer_states(n, samples, expected):
+    # fails if the default takes 64 states of any number of coordinates (32: more than 200 s), or a given number changes
+    model = ContactLagrangian(ModelConfig((False,) * n, "linear", (1.0,) * n, (1.0,) * n, (1.0,) * n, (0.0,) * n))
+    states = subject(model, 0.1, samples, 0).states
+    assert states.q.shape == (expected, n)
+    assert states.s.shape == (expected,)
+
+
 def test_momenta_and_actions_belong_to_the_drawn_velocities():
     # fails if p is −FL⁻, or s0 is 0: a gauge, 50 (q1 − q0), makes p = v + 50
     states = subject(lambda q0, q1, s0, h: pendulum(q0, q1, s0, h) + 50.0 * (q1 - q0).sum(-1), 0.05, 64, 0).states
