@@ -100,6 +100,7 @@ def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
 
 def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figure: Path) -> None:
     from herglotz.data.units import size
+    from herglotz.training.equation import ON_SCREEN
     from herglotz.training.uncertainty import determined
 
     data = result.data
@@ -116,7 +117,7 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figu
     # The equation has the coefficients of named terms with their standard deviations.
     if result.metrics.get("equation"):
         print("Learned equation:")
-        print(*(f"  {line}" for line in str(result.equation()).splitlines()), sep="\n")
+        print(*(f"  {line}" for line in result.equation().text(ON_SCREEN).splitlines()), sep="\n")
     print("Value ± standard deviation (the first mass is 1):")
     for x in physical:
         print(fill(f"{x.words}: {x}", COLUMNS, initial_indent="  ", subsequent_indent="      "))

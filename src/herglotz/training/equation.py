@@ -40,6 +40,8 @@ BRACKETS = "in brackets: standard deviation, of the last digits or as ±, by noi
 WAVE = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<speeds>(?: [^ ()]+′²?)*)")
 # More waves of one form with the same speeds are printed as a function, below the lines.
 MAX_WAVES = 6
+# Most waves of a function that are printed on the screen: five lines.
+ON_SCREEN = 24
 # Lines break between terms, not inside a term.
 TOGETHER = "\N{NO-BREAK SPACE}"
 # Digits of the zero and the scale of a sensor.
@@ -120,11 +122,16 @@ class Equation:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
+        return self.text()
+
+    def text(self, most: float = math.inf) -> str:
+        """The lines; of functions with more than `most` waves their number alone."""
         lines = [line for left in self.lefts for line in self._lines_of(left)]
         seen = [term for term in self.terms if term.is_seen(self._digits)]
         for name in dict.fromkeys(term.function for term in seen if term.function):
             waves = [term.wave(self._digits) for term in seen if term.function == name]
-            lines += _wrapped(name.split(")")[0] + ")", waves)
+            told = waves if len(waves) <= most else [f"+ a sum of {len(waves)} waves (metrics.json)"]
+            lines += _wrapped(name.split(")")[0] + ")", told)
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
         sizes = (term.size(self._digits) for term in self.terms if not term.function)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +17,8 @@ from herglotz.training.trades import listed
 
 # Columns of a printed table.
 COLUMNS = 80
+# A term that is a wave of a linear form of the coordinates, and most such terms that are listed one by one.
+WAVE, MAX_WAVES = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<factors>(?: [^ ()]+)*)"), 6
 # Starting values of the baseline; all other names in `Plan.start` are parameters of the model.
 STARTS = ("stiffness", "tilt", "rate")
 # Settings of a fit that a plan holds under the same name, beside the objective.
@@ -208,8 +212,19 @@ def in_words(name: str, value: Any, unit: str = "") -> str:
     if name == "forces":
         return ", ".join(FORCES[force] for force, on in value.items() if on) or "masses and viscous friction alone"
     if isinstance(value, tuple):
-        return ", ".join(_plainly(x) for x in value) or "none"
+        return ", ".join(_gathered([_plainly(x) for x in value])) or "none"
     return size(value, unit) if name == "sigma" and value is not None else _plainly(value)
+
+
+def _gathered(terms: list[str]) -> list[str]:
+    """The terms, with one entry for more than `MAX_WAVES` waves of the same coordinates: 22 waves of q1, q2."""
+    of = [WAVE.fullmatch(term) for term in terms]
+    keys = [x and (", ".join(sorted(set(re.findall(r"[a-z]\d+", x["form"])))), x["factors"]) for x in of]
+    found, counts = {}, Counter(keys)
+    for term, key in zip(terms, keys, strict=True):
+        many = key is not None and counts[key] > MAX_WAVES
+        found[f"{counts[key]} waves of {key[0]}{' by' if key[1] else ''}{key[1]}" if many else term] = None
+    return list(found)
 
 
 def _plainly(value: Any) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from herglotz.data import Trajectories
 from herglotz.data.units import as_recorded, common_unit, size, span
-from herglotz.training.equation import Equation
+from herglotz.training.equation import ON_SCREEN, Equation
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.left_out import from_then_on
 from herglotz.training.properties import by_property, inverse
@@ -89,7 +89,8 @@ def summary(run: FittedRun) -> str:
         lines.append(fill(f"Note: {run.metrics['extrapolation_status']}", COLUMNS))
     equation = run.metrics.get("equation")
     if equation:
-        lines += ["Learned equation:", *(f"  {line}" for line in str(Equation.from_dict(equation)).splitlines())]
+        shown = Equation.from_dict(equation).text(ON_SCREEN)
+        lines += ["Learned equation:", *(f"  {line}" for line in shown.splitlines())]
     return "\n".join([*lines, fill(f"Verdict: {run.metrics.get('verdict', 'not judged')}", COLUMNS)])
 
 

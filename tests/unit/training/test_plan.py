@@ -16,7 +16,7 @@ from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, choose, fit, look
 from herglotz.training.choose import RULES, answers, choose_objective
-from herglotz.training.plan import DECISIONS, WORDS
+from herglotz.training.plan import DECISIONS, WORDS, in_words as plan_in_words
 from herglotz.training.stages import Stages
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "trajectory.md"
@@ -151,3 +151,13 @@ def test_the_plan_in_words():  # fails if a newcomer reads names of fields, or o
     assert words["numbers that are 0"] == "viscous friction (2), the map from inputs to forces"
     idle = ("hold", "delay", "lag", "drag", "substeps", "restarts", "departures", "continues_probe")
     assert not {WORDS[name] for name in idle} & set(words)
+
+
+def test_the_waves_of_a_function_are_one_entry_of_the_plan():
+    # fails if a function fills the screen (160 waves), if waves of other coordinates or by speeds are counted with
+    # them, or a few harmonics are counted in place of named
+    waves = tuple(f"cos({k} q1 - 2.5 q2)" for k in range(1, 8))
+    brakes = tuple(f"sin({k} q1) v1" for k in range(1, 9))
+    few = ("q1^2", "cos(q1)", "sin(q1)")
+    text = "q1^2, cos(q1), sin(q1), 7 waves of q1, q2, 8 waves of q1 by v1"
+    assert plan_in_words("features", (*few, *waves, *brakes)) == text

@@ -406,3 +406,14 @@ def test_waves_of_which_no_digit_is_printed_are_left_out():
     assert text.splitlines()[0] == "x″ = 0.000(2) x′ + f1(x)"
     assert text.splitlines()[1] == "f1(x) = 0.200 cos(2 x) + 0.100 cos(5 x)"
     assert "f2" not in text
+
+
+def test_the_screen_has_no_long_functions():
+    # fails if a function of the plane fills the screen (250 waves: 300 lines), if a short one is left out, or if the
+    # whole equation loses a wave
+    one = [Term("x″", f"cos({k} x)", 1.0, None, "", None, "f1(x)") for k in range(1, 25)]
+    two = [Term("x″", f"cos({k} x + y)", 1.0, None, "", None, "f2(x, y)") for k in range(1, 26)]
+    equation = Equation((*one, *two), ("x″",), "x in m", None)
+    assert equation.text(24).splitlines()[-2] == "f2(x, y) = a sum of 25 waves (metrics.json)"
+    assert equation.text(24).count("cos(") == 24
+    assert str(equation).count("cos(") == 49
