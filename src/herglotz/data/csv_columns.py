@@ -183,36 +183,56 @@ def assign(
     columns group the rows.
     """
     names, units = _parse(cells, where, wanted)
-    place = {name: i for i, name in enumerate(names)}
     wanted = wanted.by_name(cells, names)
-    every = ", ".join(names)
-    refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
-    refuse({
-        f"{where}: {quote(x)} is named for both {' and '.join(fields)}; a column has one role": len(fields) > 1
-        for x in names if (fields := [f for f in ROLE_OF_FIELD if x in as_names(getattr(wanted, f) or ())])
-    })  # fmt: skip
+    _refuse_misnamed(where, names, wanted)
     guesses = _guesses(names, units, wanted)
     roles = {role: [i for i, x in enumerate(guesses) if x.role == role] for role in (*ROLES, "rate", "q", "dropped")}
-    clocks = roles["time"] or _other_clocks(names, units, roles)
-    if increases is not None and len(clocks) > 1:
-        clocks = [i for i in clocks if increases(i)] or clocks
-    clock = _clock(where, names, clocks)
+    clock = _clock(where, names, _clocks(names, units, roles, increases))
     units = (*units[:clock], units[clock] or unit_of_time(names[clock]), *units[clock + 1 :])
     u = wanted.in_order(roles["input"], names)
-    if wanted.coordinates is None:
-        q = wanted.in_order(roles["q"], names)
-    else:
-        q = tuple(place[x] for x in as_names(wanted.coordinates))
-    q = q or (() if wanted.motion else u[:1])
-    refuse({
-        f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
-        f"{where}: no coordinate column, only {every}; {_remedy(names, roles)}": not q,
-    })  # fmt: skip
+    q = _coordinates(where, names, roles, u, wanted)
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     groups, same = _varying(where, names, roles["trajectory"], is_constant)
     trajectory, action = (next(iter(own), None) for own in (groups, roles["action"]))
     found = Columns(names, units, clock, q, trajectory, action, p, u, wanted.hold)
     return replace(found, notes=(*_warnings(found, guesses, wanted), *same))
+
+
+def _refuse_misnamed(where: str, names: Sequence[str], wanted: Wanted) -> None:
+    """Raise InputError for a column that the user names and the table lacks, or that gets two roles."""
+    every = ", ".join(names)
+    refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in names for x in wanted.names})
+    refuse({
+        f"{where}: {quote(x)} is named for both {' and '.join(fields)}; a column has one role": len(fields) > 1
+        for x in names if (fields := [f for f in ROLE_OF_FIELD if x in as_names(getattr(wanted, f) or ())])
+    })  # fmt: skip
+
+
+def _clocks(
+    names: Sequence[str], units: Sequence[str], roles: dict[str, list[int]], increases: Callable[[int], bool] | None
+) -> list[int]:
+    """The columns that may be the time; of several those that increase."""
+    clocks = roles["time"] or _other_clocks(names, units, roles)
+    if increases is None or len(clocks) < 2:
+        return clocks
+    return [i for i in clocks if increases(i)] or clocks
+
+
+def _coordinates(
+    where: str, names: Sequence[str], roles: Mapping[str, list[int]], inputs: Sequence[int], wanted: Wanted
+) -> tuple[int, ...]:
+    """The columns of the coordinates; where inputs suffice, the first input stands for a missing one."""
+    if wanted.coordinates is None:
+        q = wanted.in_order(roles["q"], names)
+    else:
+        q = tuple(names.index(x) for x in as_names(wanted.coordinates))
+    q = q or (() if wanted.motion else tuple(inputs[:1]))
+    every, idle = ", ".join(names), not (inputs or wanted.motion)
+    refuse({
+        f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": idle,
+        f"{where}: no coordinate column, only {every}; {_remedy(names, roles)}": not q,
+    })  # fmt: skip
+    return q
 
 
 def _varying(

@@ -173,6 +173,14 @@ class SegmentStages:
         """The shortest segments, from states read off the samples."""
         return self.fit(self.lengths[0], sigma, FREEDOM if self.task.config.robust == "on" else None, None)
 
+    def from_least_squares(self, sigma: float, freedom: float | None) -> TrajectoryFit | None:
+        """The shortest segments by Student's t of this freedom (None: by least squares), from those by least squares.
+
+        A heavy-tailed loss finds no way from states that are off by many deviations, as those read off exact samples.
+        """
+        found = self.fit(self.lengths[0], sigma, None, None)
+        return found if found is None or freedom is None else self.fit(self.lengths[0], sigma, freedom, found)
+
     def robust_or_not(self, first: TrajectoryFit, *, known: bool = False) -> TrajectoryFit:
         """The shortest segments: `first`, or if the data have outliers, a fit without the outliers or by Student's t.
 

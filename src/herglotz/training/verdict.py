@@ -94,7 +94,7 @@ def with_own_starts(task: Task, fitted: Fitted, data: Trajectories, freedom: flo
     """The fit of the states of windows, with fixed parameters; None if a step fails."""
     config = replace(task.config, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(task, data=data, config=config, stages=Stages()), fitted.model, frozen=True)
-    return stages.fit(stages.lengths[0], fitted.sigma, freedom, None)
+    return stages.from_least_squares(fitted.sigma, freedom)
 
 
 def _shown_reason(task: Task, fitted: Fitted, seen: Look, missed: bool, longer: str = "") -> str:
