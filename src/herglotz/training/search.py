@@ -7,6 +7,7 @@ compared by the inequality of `score`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import with_input_terms
-from herglotz.data.noise import part_of
+from herglotz.data.noise import AT_THE_NOISE, part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
 from herglotz.models.drag import input_columns, input_forces, parse_drag
@@ -57,8 +58,6 @@ SAMPLES_OF_A_PART = 2000
 ITERATIONS_ON_ALL = 5
 # Changes of one kind that are fitted, the most promising first.
 FITS_OF_A_KIND = 3
-# Largest number of model steps in a recorded step, and in all trajectories.
-MAX_SUBSTEPS, MAX_STEPS = 16, 40_000
 
 # Zeros (B, n) of the sensors, with standard deviations.
 Zeros = tuple[Tensor, Tensor]
@@ -82,7 +81,6 @@ class Search:
         self.freedom = FREEDOM if outliers else None
         self.order = 4 if is_precise(data) and data.dof == 1 else 2
         self.fitters: dict[Variant, Fitter] = {}
-        self.max_substeps = max(1, min(MAX_SUBSTEPS, MAX_STEPS // data.samples))
         self.fits, self.iterations, self.part, self.step_ratio = FITS_OF_A_KIND, ITERATIONS, self, 1.0
         if (few := part_of(data, SAMPLES_OF_A_PART)) is not data:
             self.part, self.fits, self.iterations = self.of(few), 1, ITERATIONS_ON_ALL
@@ -389,12 +387,22 @@ class Search:
         return None
 
     def finer(self, trial: Trial) -> Trial:
-        """The model with model steps halved while that changes the motion by more than `FINER` of the misfit."""
-        while trial.fitter.variant.substeps < self.max_substeps:
-            fitter = trial.fitter
+        """The model with model steps halved while that changes the motion by more than `FINER` of the misfit.
+
+        A misfit that halved steps would take away, if there were any, tells of no force: it is the floor of misfits.
+        """
+        while True:
+            fitter, order = trial.fitter, trial.fitter.variant.order
             other = self.fitter(replace(fitter.variant, substeps=2 * fitter.variant.substeps))
             problem = other.problem(trial.length).of(other.numbers(trial.taken), trial.problem.sigma)
-            if moved(trial, problem, trial.theta) <= FINER * max(trial.rms, fitter.floor / ALIKE):
+            change = moved(trial, problem, trial.theta)
+            if change <= FINER * max(trial.rms, fitter.floor / ALIKE):
+                break
+            if fitter.variant.substeps >= fitter.finest:
+                of_steps = AT_THE_NOISE * change * 2**order / (2**order - 1)
+                least = math.hypot(of_steps, fitter.about_the_noise)
+                if fitter.about_the_noise < trial.rms <= least:
+                    fitter.floor = least
                 break
             fit = other.fit(trial.taken, trial.values, trial.length, trial)
             # Finer steps cannot miss what coarser ones meet: from these values the fit has not found its way.

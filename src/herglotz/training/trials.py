@@ -63,6 +63,8 @@ FINER = 0.3
 ALIKE = 10.0
 # Noise, as a share of the spread of the data, below which a rule of order 4 is worth its time.
 ORDER_4_NOISE = 1e-3
+# Largest number of model steps in a recorded step, and in all trajectories.
+MAX_SUBSTEPS, MAX_STEPS = 16, 40_000
 
 
 @dataclass(frozen=True)
@@ -302,9 +304,10 @@ class Trial:
 class Fitter:
     """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
 
-    `like` is another fitter of the same data, which shares its segments and noise levels. Numbers are scalar
-    parameters, by name; `keys` has the term of each number. Features in the settings take the place of `candidates`;
-    `ratios` are those of the candidates.
+    `like` is another fitter of the same data, which shares its segments and noise levels. Steps are not halved beyond
+    `finest` in a recorded one. Residuals below `floor` are rounding, or the error of the finest steps. Numbers are
+    scalar parameters, by name; `keys` has the term of each number. Features in the settings take the place of
+    `candidates`; `ratios` are those of the candidates.
     """
 
     def __init__(
@@ -312,6 +315,7 @@ class Fitter:
         like: Fitter | None = None, ratios: Mapping[tuple[int, int], str] | None = None,
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
+        self.finest = max(1, min(MAX_SUBSTEPS, MAX_STEPS // data.samples))
         bands = variant.functions
         terms = NamedTerms(config.features) if config.features else candidates(data, config.translations, ratios)
         terms = terms.joined(NamedTerms(tuple(windings(data.angles)))) if variant.windings else terms
