@@ -610,15 +610,32 @@ def test_finer_steps_replace_a_model_at_the_noise_at_the_noise(met, rms, at_the_
     fine: Any = SimpleNamespace(rms=rms, segments_at_the_noise=at_the_noise, fitter=None)
     other: Any = SimpleNamespace(
         variant=Variant(2, substeps=64), problem=lambda _: SimpleNamespace(of=lambda *_: None), numbers=lambda _: [],
-        spread=100.0, fit=lambda *_: fine, grow=lambda trial: trial,
+        spread=100.0, fit=lambda *_: fine, grow=lambda trial: trial, finest=16, floor=1e-9, about_the_noise=1e-9,
     )  # fmt: skip
-    fine.fitter = other
+    fine.fitter, fine.theta, fine.length, fine.taken = other, None, 9, frozenset()
+    fine.problem = SimpleNamespace(sigma=1.0)
     monkeypatch.setattr(search, "fitter", lambda _: other)
     trial: Any = SimpleNamespace(
-        fitter=SimpleNamespace(variant=Variant(2), floor=1e-9), length=9, taken=frozenset(), theta=None, rms=0.01,
-        problem=SimpleNamespace(sigma=1.0), values={}, segments_at_the_noise=met, replaces=lambda _: False,
+        fitter=SimpleNamespace(variant=Variant(2), floor=1e-9, finest=16), length=9, taken=frozenset(), theta=None,
+        rms=0.01, problem=SimpleNamespace(sigma=1.0), values={}, segments_at_the_noise=met, replaces=lambda _: False,
     )  # fmt: skip
     assert search.finer(trial) is (fine if replaced else trial)
+
+
+@pytest.mark.parametrize(("change", "rms", "floor"), [(3.0, 5.0, 6.02), (3.0, 7.0, 0.5), (0.3, 5.0, 0.5)])
+def test_the_error_of_the_finest_steps_is_the_floor_of_misfits(change, rms, floor, monkeypatch):
+    # fails if terms make up for the error of the steps (a double pendulum without noise got four masses of 2e-8), or if
+    # a force that is missing is taken for that error
+    monkeypatch.setattr(search_module, "moved", lambda *_: change)
+    search = searched(Trajectories.of(torch.arange(9.0), torch.arange(9.0) ** 2))
+    other = SimpleNamespace(problem=lambda _: SimpleNamespace(of=lambda *_: None), numbers=lambda _: [])
+    monkeypatch.setattr(search, "fitter", lambda _: other)
+    own = SimpleNamespace(variant=Variant(2, substeps=16), floor=0.5, about_the_noise=0.5, finest=16)
+    trial: Any = SimpleNamespace(
+        fitter=own, length=9, taken=frozenset(), theta=None, rms=rms, problem=SimpleNamespace(sigma=1.0)
+    )  # fmt: skip
+    assert search.finer(trial) is trial
+    assert own.floor == pytest.approx(floor, rel=1e-3)
 
 
 @pytest.mark.parametrize(("rms", "joins"), [(0.2, True), (0.3, False)])
