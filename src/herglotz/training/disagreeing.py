@@ -53,7 +53,8 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         rest = [b for b in range(len(data)) if b not in out]
         far = {b: reach(own) for b, own in enumerate(missed)}
         worst = max(rest, key=lambda b: far[b])
-        outlier = far[worst] > TAIL * scale_of_all([missed[b] for b in rest if b != worst], _least(seen))
+        most = TAIL * scale_of_all([missed[b] for b in rest if b != worst], _least(seen))
+        outlier = far[worst] > most and far[worst] > _of_steps(seen, data, worst)
         if not outlier and not out:
             bad = next((b for b in dict.fromkeys((worst, _least_alike(seen))) if _bends(seen, b)), None)
             worst, outlier = (worst, False) if bad is None else (bad, True)
@@ -185,6 +186,26 @@ def _followed(data: Trajectories, settings: FitConfig) -> Trajectories:
     cuts = cuts_of(data.lengths, settings.train_fraction)
     kept = [length if whole else cut for length, cut, whole in zip(data.lengths, cuts, held, strict=True)]
     return data.keep(leading(data.lengths, kept).to(data.q.device))
+
+
+def _of_steps(seen: Look, data: Trajectories, recording: int) -> float:
+    """The largest misfit (`reach`) of a recording that the error of the model's steps explains; 0 where a step fails.
+
+    Steps miss fast motion by more than slow motion. The error is the change of the misfit by steps of half the size,
+    with states of their own: what steps do not explain, as readings of nothing, such steps miss as well.
+    """
+    assert seen.found is not None
+    assert seen.found.sigma is not None
+    read = _followed(read_like(data, seen), seen.settings).select([recording])
+    finer = replace(seen, base=replace(seen.base, model_step=seen.base.model_step / 2))
+    long, short = (
+        _misfit(one, one.task(Stages()).build("none"), seen.found.sigma, read, True) for one in (seen, finer)
+    )
+    if long is None or short is None:
+        return 0.0
+    order = seen.settings.order
+    change = ((short - long) / read.balance)[read.complete]
+    return AT_THE_NOISE * reach(change) * 2**order / (2**order - 1)
 
 
 def _misfit(seen: Look, model: ContactLagrangian, sigma: float, data: Trajectories, whole: bool) -> Tensor | None:

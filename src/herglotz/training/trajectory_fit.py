@@ -22,6 +22,8 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import Task
 
+# Lengths of the first segments, in recorded steps: over so few the motion is almost linear in states and forces.
+SHORT_SEGMENTS = (5, 10)
 # Segments stop growing if their error exceeds this multiple of the error of shorter segments.
 LOST = 2.0
 # Segments of a sticking model grow further as long as their error is below this share of the spread of q: without a
@@ -177,8 +179,11 @@ class SegmentStages:
         """The shortest segments by Student's t of this freedom (None: by least squares), from those by least squares.
 
         A heavy-tailed loss finds no way from states that are off by many deviations, as those read off exact samples.
+        Least squares find none where motion over a segment is far from linear in its start; they begin with short ones.
         """
-        found = self.fit(self.lengths[0], sigma, None, None)
+        found = None
+        for length in (*(x for x in SHORT_SEGMENTS if x < self.lengths[0]), self.lengths[0]):
+            found = self.fit(length, sigma, None, found)
         return found if found is None or freedom is None else self.fit(self.lengths[0], sigma, freedom, found)
 
     def robust_or_not(self, first: TrajectoryFit, *, known: bool = False) -> TrajectoryFit:

@@ -47,14 +47,12 @@ from herglotz.training.score import Score, are_white, fitted_score, free_run_sco
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import EXACT, build_model, with_sticking
-from herglotz.training.trajectory_fit import FAR_OFF, FOLLOWED, LOST, NEAR
+from herglotz.training.trajectory_fit import FAR_OFF, FOLLOWED, LOST, NEAR, SHORT_SEGMENTS
 
 # Iterations of a fit; a trial that needs more starts too far from its optimum.
 ITERATIONS = 15
 # Share of every trajectory to which finalists are fitted; they run free over the rest.
 FITTED_SHARE = 0.75
-# Lengths of the first segments, in recorded steps: over so few the motion is almost linear in the forces.
-SHORT_SEGMENTS = (5, 10)
 # Largest misfit, as a share of the spread of the data, with which a model follows segments.
 MAX_MISFIT = 0.25
 # Halved model steps are tried if they change the motion by more than this share of the misfit.
