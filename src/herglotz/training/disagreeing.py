@@ -3,11 +3,11 @@
 Of every recording the part that a fit uses is followed from a start of its own, with the numbers of the model fixed:
 as a whole by a model that a search has found, else over short segments. Twenty steps hide a damping that is a fifth
 larger, or a scale that is wrong by 3 %. A recording disagrees if more than a tenth of its readings (`reach`) are
-outliers (`TAIL`) of the misfit of the others: fewer are single ones. A bad recording may have bent the model so far
-that none stands out. Where the model is not at the noise, the recording that it misses most, or else the one whose
-accelerations are least like the others', is left out if the whole dictionary would follow the others to their noise.
-The model is then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is
-an outlier of that model. Most recordings have to agree.
+outliers (`TAIL`) of the misfit of the others: fewer are single ones, and what the error of the model's steps explains
+is no outlier. A bad recording may have bent the model so far that none stands out. Where the model is not at the noise,
+the recording that it misses most, or else the one whose accelerations are least like the others', is left out if the
+whole dictionary would follow the others to their noise. The model is then found anew. What is left out stays so if the
+others agree, whose model is at their noise, and if it is an outlier of that model. Most recordings have to agree.
 
 Where nothing is left out, as where no terms are searched (more than three coordinates, a given plan, own terms), an
 outlier of the finished model is named (`outlying`).

@@ -35,7 +35,7 @@ from herglotz.data.sensors import measured
 from herglotz.data.splits import enough, leading
 from herglotz.data.units import common_unit
 from herglotz.stepping import Stepper, state_of
-from herglotz.training.errors_of_runs import EXACT_ENOUGH, Errors
+from herglotz.training.errors_of_runs import APART, EXACT_ENOUGH, Errors
 from herglotz.training.feedback import (
     caveat_of_inputs,
     held_by_inputs,
@@ -61,6 +61,10 @@ FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does no
 # Standard deviations of a free run, by what the fit leaves open, within which a loss of the motion is no error.
 CHANCE = 3.0
 OF_WHAT_IS_OPEN = "What the fit leaves open of its start and of its numbers explains the error of the one run"
+NO_NOISE = (
+    "Noise is the same in both parts, and what the model misses is not: samples are too far apart for the motion, or a "
+    "force is missing. Try a recording with more samples in the same time, or a --feature for that force"
+)
 # Standard errors by which a free run has to be better than the mean of the data.
 CLEARLY = 2.0
 # Most recordings of the same kind, as the root of their number: nobody records 900 times as much.
@@ -312,8 +316,11 @@ def in_words(
     if not follows or not (math.isfinite(free) or unstable):
         return f"{FAILS}: {errors}. {_remedy(errors, metrics, shown, beyond)}"
     # Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
-    if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
-        return f"{FAILS}: {_unseen_motion(errors)}"
+    if errors.windows > HALF * errors.spread:
+        if errors.unseen is not None and APART * errors.unseen < errors.windows:
+            return f"{FAILS}: {errors}. {NO_NOISE}"
+        if not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
+            return f"{FAILS}: {_unseen_motion(errors)}"
     if unstable:
         return ". ".join(filter(None, (f"{_fits(replace(errors, free=None))}: {errors}", unstable, caveat)))
     # The errors of what is left open and those of a model know nothing of each other.

@@ -98,6 +98,15 @@ def test_a_free_run_that_is_lost_alone_is_no_other_part(unseen, told, said, unsa
     assert unsaid not in text
 
 
+@pytest.mark.parametrize(("unseen", "fails"), [(0.3, False), (0.01, True)])
+def test_what_the_unseen_part_does_not_show_is_no_noise(unseen, fails):
+    # fails if two samples a period of an exact pendulum are noise of 0.6 of the spread, which the model "fits", where
+    # the decayed motion of the unseen part is met to 2e-4
+    text = in_words(Errors(0.55, unseen, unseen, noise=0.5, spread=1.0), KNOWN, GOOD | {"gain_over_mean": 9.0})
+    assert text.startswith("does not fit" if fails else "fits to the noise")
+    assert ("too far apart" in text) == fails
+
+
 def test_what_a_start_and_a_model_do_to_a_free_run_adds_up():
     # fails if a chaotic motion whose start explains nearly all of an error is refused: 3 × 0.03 of the start and 0.1
     # that a model may have
