@@ -118,6 +118,13 @@ def test_what_a_start_and_a_model_do_to_a_free_run_adds_up():
     )
 
 
+def test_a_motion_that_wanders_may_be_lost_by_more():
+    # fails if a pendulum that turns over is held to the √2 of a motion about a place
+    told = [replace(KNOWN, unseen=9.0, followed=3.0, apart=apart) for apart in (2**0.5, 1.6)]
+    text = [in_words(Errors(0.011, 0.011, 1.5, noise=0.01, spread=1.0), ahead, GOOD) for ahead in told]
+    assert [x.startswith("does not fit") for x in text] == [True, False]
+
+
 def test_angles_that_may_be_positions_on_a_line():
     # fails if a spring is offered for an angle that turns over
     t, angle = 0.1 * torch.arange(40, dtype=torch.float64), torch.linspace(-2.4, 2.4, 40, dtype=torch.float64)[:, None]
