@@ -222,8 +222,11 @@ def _gathered(terms: list[str]) -> list[str]:
     keys = [x and (", ".join(sorted(set(re.findall(r"[a-z]\d+", x["form"])))), x["factors"]) for x in of]
     found, counts = {}, Counter(keys)
     for term, key in zip(terms, keys, strict=True):
-        many = key is not None and counts[key] > MAX_WAVES
-        found[f"{counts[key]} waves of {key[0]}{' by' if key[1] else ''}{key[1]}" if many else term] = None
+        if key is None or counts[key] <= MAX_WAVES:
+            found[term] = None
+        else:
+            coordinates, factors = key
+            found[f"{counts[key]} waves of {coordinates}{' by' if factors else ''}{factors}"] = None
     return list(found)
 
 
