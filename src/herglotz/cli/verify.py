@@ -10,7 +10,7 @@ from typing import Any
 
 from herglotz.cli.common import check_output_folder, count, flag, import_torch, positive, print_json, seed
 from herglotz.cli.flags import TRUST
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.formats import FORMATS, of_ending
 
 DESCRIPTION = """\
@@ -48,9 +48,10 @@ FLAGS = (
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify and report; 1 when a check fails."""
-    if arguments.samples == 0 or arguments.steps < 2:
-        samples = "" if arguments.samples is None else f"{arguments.samples} and "
-        raise InputError(f"--samples must be >= 1 and --steps >= 2, got {samples}{arguments.steps}")
+    refuse({
+        "--samples must be >= 1, got 0": arguments.samples == 0,
+        f"--steps must be >= 2, got {arguments.steps}": arguments.steps < 2,
+    })  # fmt: skip
     import_torch()
     target = arguments.target
     if Path(target).is_file():

@@ -72,16 +72,13 @@ class Graph(nn.Module):
         return self.call(*inputs, *self.constants)
 
 
-def example_batch(sizes: set[int]) -> int:
-    """A prime that divides none of the sizes in the graph: a shape that has this prime as a factor has the batch."""
-    return next(prime for prime in PRIMES if all(size % prime for size in sizes if size))
-
-
 def traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph:
     """The function as a graph without classes, repetitions and constant parts, for any batch size.
 
     The function takes and returns tensors whose batch is axis 0, and may differentiate by `torch.func`; `arguments` are
-    examples, with a batch from `example_batch`. Of examples with a batch of 1 the graph holds for one sample alone.
+    examples, with a batch of `PRIMES[0]`. Of examples with a batch of 1 the graph holds for one sample alone.
+
+    Raise InputError if the graph gives other numbers for another batch size.
     """
     while True:
         recorder = Recorder(arguments)
@@ -90,24 +87,40 @@ def traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph
                 outputs = function(*arguments)
             outputs = outputs if isinstance(outputs, tuple) else (outputs,)
             graph = recorder.graph_of(outputs)
-            larger = [] if graph.batch == 1 else [prime for prime in PRIMES if prime > graph.batch]
-            if not larger or _holds_for_any_batch(graph, arguments, outputs):
+            if graph.batch == 1 or _holds_for_any_batch(graph, arguments, outputs):
                 _Examples(graph, graph=graph.code).run(*arguments, *graph.constants)
                 return graph
-        arguments = _of_batch(arguments, graph.batch, larger[0])
+        larger = next((prime for prime in PRIMES if prime > graph.batch), None)
+        if larger is None:
+            raise InputError(
+                "what is computed for a sample depends on how many samples are computed with it, or on random numbers: "
+                "a file would hold for one number of samples alone"
+            )
+        arguments = _of_batch(arguments, graph.batch, larger)
 
 
 def _holds_for_any_batch(graph: Graph, arguments: tuple[Tensor, ...], outputs: tuple[Tensor, ...]) -> bool:
-    """Whether the graph gives the same numbers with fewer samples, so that no size was taken for the batch."""
+    """Whether the graph gives the same numbers with fewer samples, so that no size was taken for the batch.
+
+    Of an output without a batch, as derivatives by numbers that all samples share, the size alone is compared.
+    """
     try:
         found = graph(*_of_batch(arguments, graph.batch, OTHER))
     except (RuntimeError, IndexError):
         return False
     expected = _of_batch(outputs, graph.batch, OTHER)
+    batched = (y.ndim > 0 and len(y) == graph.batch for y in outputs)
     return all(
-        x.shape == y.shape and torch.allclose(x, y, rtol=1e-3, atol=1e-6, equal_nan=True)
-        for x, y in zip(found, expected, strict=True)
+        _alike(x, y) if each else x.shape == y.shape for x, y, each in zip(found, expected, batched, strict=True)
     )
+
+
+def _alike(x: Tensor, y: Tensor) -> bool:
+    """Whether two tensors are equal but for rounding; a size that was taken for the batch changes the numbers."""
+    if x.shape != y.shape or not y.numel():
+        return x.shape == y.shape
+    size = float(y.double().nan_to_num(posinf=0.0, neginf=0.0).abs().amax())
+    return torch.allclose(x.double(), y.double(), rtol=0.0, atol=1e-3 * size, equal_nan=True)
 
 
 def _of_batch(arguments: tuple[Tensor, ...], batch: int, size: int) -> tuple[Tensor, ...]:

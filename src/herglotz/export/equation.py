@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.codegen.trace import Graph, example_batch, traced
+from herglotz.codegen.trace import PRIMES, Graph, traced
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.numbers import WithNumbers
@@ -202,10 +202,9 @@ def dense(x: Tensor) -> Tensor:
 def example(model: ContactLagrangian, h: float) -> tuple[Tensor, ...]:
     """q, p (B, n), s, h (B,) and, where the model takes inputs, u (B, m) to trace with; no two share memory."""
     parameter = next(model.parameters())
-    batch = example_batch({size for x in model.parameters() for size in x.shape})
     make = torch.Generator().manual_seed(0)
     options: dict[str, Any] = {"dtype": parameter.dtype, "device": parameter.device}
-    q, p = (0.1 * torch.randn(batch, model.config.dof, generator=make).to(**options) for _ in range(2))
-    s, steps = torch.zeros(batch, **options), torch.full((batch,), float(h), **options)
+    q, p = (0.1 * torch.randn(PRIMES[0], model.config.dof, generator=make).to(**options) for _ in range(2))
+    s, steps = torch.zeros(PRIMES[0], **options), torch.full((PRIMES[0],), float(h), **options)
     m = model.inputs
-    return q, p, s, steps, *((torch.zeros(batch, m, **options),) if m else ())
+    return q, p, s, steps, *((torch.zeros(PRIMES[0], m, **options),) if m else ())

@@ -37,6 +37,7 @@ from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.structure import MOST, search_between_coupled
 from herglotz.training.trajectory_fit import SegmentStages
+from herglotz.training.trials import explained_by_steps
 from herglotz.training.verdict import STATE_ITERATIONS
 
 
@@ -203,9 +204,8 @@ def _of_steps(seen: Look, data: Trajectories, recording: int) -> float:
     )
     if long is None or short is None:
         return 0.0
-    order = seen.settings.order
     change = ((short - long) / read.balance)[read.complete]
-    return AT_THE_NOISE * reach(change) * 2**order / (2**order - 1)
+    return explained_by_steps(reach(change), seen.settings.order)
 
 
 def _misfit(seen: Look, model: ContactLagrangian, sigma: float, data: Trajectories, whole: bool) -> Tensor | None:

@@ -32,14 +32,13 @@ from herglotz.training.equation_words import BESIDE, UNKNOWN, Joint, Numbers, nu
 from herglotz.training.feedback import acting_inputs
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import run_on
+from herglotz.training.plan import MAX_WAVES
 from herglotz.training.sensor_zeros import CENTRE
 
 # Columns of a line; the screen has two blanks before each line.
 WIDTH = 78
 BRACKETS = "in brackets: standard deviation, of the last digits or as ±, by noise alone"
 WAVE = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<speeds>(?: [^ ()]+′²?)*)")
-# More waves of one form with the same speeds are printed as a function, below the lines.
-MAX_WAVES = 6
 # Most waves of a function that are printed on the screen: five lines.
 ON_SCREEN = 24
 # Lines break between terms, not inside a term.

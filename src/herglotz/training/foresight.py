@@ -165,7 +165,7 @@ class _Ahead:
         ):
             lost = (there & out).nonzero()[:, 0]
             first.append(float(t[lost[0]] - t[there][0]) if len(lost) else math.inf)
-        return torch.tensor(first)
+        return torch.tensor(first, dtype=torch.float64)
 
     def within(self, times: Tensor) -> Tensor:
         """Samples beyond the training part, up to these times (runs,) from its end on, (N,) bool."""

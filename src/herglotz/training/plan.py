@@ -17,7 +17,8 @@ from herglotz.training.trades import listed
 
 # Columns of a printed table.
 COLUMNS = 80
-# A term that is a wave of a linear form of the coordinates, and most such terms that are listed one by one.
+# A term that is a wave of a linear form of the coordinates. More waves of one form with the same factors are a
+# function, in the plan and in the printed equation.
 WAVE, MAX_WAVES = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<factors>(?: [^ ()]+)*)"), 6
 # Starting values of the baseline; all other names in `Plan.start` are parameters of the model.
 STARTS = ("stiffness", "tilt", "rate")

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.input_terms import with_input_terms
-from herglotz.data.noise import AT_THE_NOISE, part_of
+from herglotz.data.noise import part_of
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials
 from herglotz.models.drag import input_columns, input_forces, parse_drag
@@ -47,6 +47,7 @@ from herglotz.training.trials import (
     Fitter,
     Trial,
     Variant,
+    explained_by_steps,
     is_precise,
     likeliest,
     moved,
@@ -392,15 +393,14 @@ class Search:
         A misfit that halved steps would take away, if there were any, tells of no force: it is the floor of misfits.
         """
         while True:
-            fitter, order = trial.fitter, trial.fitter.variant.order
+            fitter = trial.fitter
             other = self.fitter(replace(fitter.variant, substeps=2 * fitter.variant.substeps))
             problem = other.problem(trial.length).of(other.numbers(trial.taken), trial.problem.sigma)
             change = moved(trial, problem, trial.theta)
             if change <= FINER * max(trial.rms, fitter.floor / ALIKE):
                 break
             if fitter.variant.substeps >= fitter.finest:
-                of_steps = AT_THE_NOISE * change * 2**order / (2**order - 1)
-                least = math.hypot(of_steps, fitter.about_the_noise)
+                least = math.hypot(explained_by_steps(change, fitter.variant.order), fitter.about_the_noise)
                 if fitter.about_the_noise < trial.rms <= least:
                     fitter.floor = least
                 break

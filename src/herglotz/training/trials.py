@@ -517,6 +517,11 @@ def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
     return float((problem.misfit(path) - trial.problem.misfit(trial.path)).square().mean().sqrt())
 
 
+def explained_by_steps(change: float, order: int) -> float:
+    """Largest misfit that the error of steps explains, from the change of the motion by halved ones (Richardson)."""
+    return AT_THE_NOISE * change * 2**order / (2**order - 1)
+
+
 def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:
     """Two models over segments of one length; None if their segments differ, and longer ones say more.
 

@@ -315,12 +315,8 @@ def in_words(
     unstable = held() if met and not free <= errors.lost else ""
     if not follows or not (math.isfinite(free) or unstable):
         return f"{FAILS}: {errors}. {_remedy(errors, metrics, shown, beyond)}"
-    # Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
-    if errors.windows > HALF * errors.spread:
-        if errors.unseen is not None and APART * errors.unseen < errors.windows:
-            return f"{FAILS}: {errors}. {NO_NOISE}"
-        if not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
-            return f"{FAILS}: {_unseen_motion(errors)}"
+    if errors.windows > HALF * errors.spread and (words := _half_missed(errors, metrics)):
+        return f"{FAILS}: {words}"
     if unstable:
         return ". ".join(filter(None, (f"{_fits(replace(errors, free=None))}: {errors}", unstable, caveat)))
     # The errors of what is left open and those of a model know nothing of each other.
@@ -350,6 +346,16 @@ def _fits(errors: Errors) -> str:
         return f"{FITS}, or to {EXACT_ENOUGH:g} of the spread" if beyond else FITS
     stands = "" if known else ", for which its misfit of the training data stands,"
     return f"{WORSE}{stands} by a factor of {errors.worst / errors.limit:.2g}"
+
+
+def _half_missed(errors: Errors, metrics: dict[str, Any]) -> str:
+    """The verdict on windows that miss more than half of the spread; "" if they may be right, in much noise.
+
+    Windows of pure noise, whose starts are fitted, have an error of 0.9 to 0.95 of the spread.
+    """
+    if errors.unseen is not None and APART * errors.unseen < errors.windows:
+        return f"{errors}. {NO_NOISE}"
+    return "" if (metrics.get("gain_over_mean") or 0.0) > CLEARLY else _unseen_motion(errors)
 
 
 def _unseen_motion(errors: Errors) -> str:

@@ -30,7 +30,7 @@ from torch import Tensor
 from herglotz.codegen.c_compiler import build
 from herglotz.codegen.interpret import interpret
 from herglotz.codegen.program import Program, as_scalars, whole
-from herglotz.codegen.trace import example_batch, traced
+from herglotz.codegen.trace import PRIMES, traced
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 from herglotz.export.c_header import number, written
@@ -226,7 +226,7 @@ def kicks_c(stepper: KickStepper, dtype: str = "float64") -> str:
     """The header for numbers of a dtype; raise InputError if the dtype has no C form."""
     if dtype not in TYPES:
         raise InputError(f"dtype must be float64 or float32, got {dtype}")
-    q, p, s = torch.linspace(-1, 1, 3 * example_batch(set(stepper.cosines.shape)), dtype=torch.float64).chunk(3)
+    q, p, s = torch.linspace(-1, 1, 3 * PRIMES[0], dtype=torch.float64).chunk(3)
     program, places = Program(), ("x->q", "x->p", "x->s")
     given = [program.given(place, 0) for place in places]
     found = interpret(program, traced(stepper.map, (q, p, s)), given)

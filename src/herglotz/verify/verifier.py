@@ -227,7 +227,7 @@ def symmetries(
     target: Any,
     *,
     h: float | None = None,
-    samples: int = 64,
+    samples: int | None = None,
     steps: int | None = None,
     seed: int = 0,
     precision: float | None = None,

@@ -114,7 +114,7 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
         (["simulate", "parachute", "--out", "OUT.csv", "--trajectories", "0"], "trajectories"),
         (["verify", "triple_pendulum"], "triple_pendulum"),
         (["verify", "missing.pt2"], "no such file"),
-        (["verify", "damped_oscillator", "--samples", "0"], "--samples must be >= 1 and --steps >= 2"),
+        (["verify", "damped_oscillator", "--samples", "0"], "--samples must be >= 1, got 0"),
         (["fit", "missing.csv"], "no such file"),
         (["select", "missing.csv"], "no such file"),
         (["plot", "missing.csv", "--out", "OUT"], "no such file"),

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.codegen.interpret import MATHEMATICS
-from herglotz.codegen.trace import PRIMES, example_batch, traced
+from herglotz.codegen.trace import PRIMES, traced
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export import export_run
@@ -45,7 +45,7 @@ def test_steps_at_the_ends_of_the_range_are_taken(dtype):
 def test_what_a_trace_leaves_out_changes_nothing(kept):
     # fails if another sum or product than x + 0 and 1 x is taken for x; or if these are written down
     a, b = (2.0, -1.0) if kept else (1.0, 0.0)
-    x = torch.rand(example_batch(set()), dtype=torch.float64)
+    x = torch.rand(PRIMES[0], dtype=torch.float64)
 
     def function(x):
         scale, more = (torch.full((1,), number, dtype=torch.float64) for number in (a, b))
@@ -68,9 +68,16 @@ def test_what_a_trace_leaves_out_changes_nothing(kept):
 def test_a_graph_holds_for_any_batch(function):
     # fails if a size that the example's batch divides is taken for the batch, or a large multiple of the batch for a
     # fixed size (derivatives of 32 coordinates: files of them stepped one batch size alone)
-    graph = traced(function, (torch.rand(example_batch(set()), 1, dtype=torch.float64),))
+    graph = traced(function, (torch.rand(PRIMES[0], 1, dtype=torch.float64),))
     x = torch.rand(5, 1, dtype=torch.float64)
     torch.testing.assert_close(graph(x)[0], function(x))
+
+
+@pytest.mark.parametrize("function", [lambda x: x - x.mean(0), torch.rand_like])
+def test_samples_that_depend_on_one_another_are_refused(function):
+    # fails if a file is written that holds for one number of samples alone
+    with pytest.raises(InputError, match="how many samples are computed with it, or on random numbers"):
+        traced(function, (torch.rand(PRIMES[0], 1, dtype=torch.float64),))
 
 
 @pytest.mark.parametrize(
@@ -86,7 +93,7 @@ def test_a_graph_holds_for_any_batch(function):
 )
 def test_what_repeats_is_computed_once(function, calls):
     # fails if the same operation is written down twice, or another one is taken for it
-    x = torch.rand(example_batch(set()), 1, dtype=torch.float64)
+    x = torch.rand(1, 1, dtype=torch.float64)
     graph = traced(function, (x,))
     assert sum(node.op == "call_function" for node in graph.code.nodes) == calls
     torch.manual_seed(0)
