@@ -52,18 +52,10 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         if (missed := _missed(seen, data, out)) is None:
             break
         rest = [b for b in range(len(data)) if b not in out]
-        far = {b: reach(own) for b, own in enumerate(missed)}
-        worst = max(rest, key=lambda b: far[b])
-        most = TAIL * scale_of_all([missed[b] for b in rest if b != worst], _least(seen))
-        outlier = far[worst] > most and far[worst] > _of_steps(seen, data, worst)
-        if not outlier and not out:
-            bad = next((b for b in dict.fromkeys((worst, _least_alike(seen))) if _bends(seen, b)), None)
-            worst, outlier = (worst, False) if bad is None else (bad, True)
-        # The law may depend on what this recording alone has.
-        outlier = outlier and not own_properties(data, worst)
-        if outlier:
-            now = sorted([*out, worst])
+        if (bad := _disagreeing(seen, data, rest, missed)) is not None:
+            now = sorted([*out, bad])
         else:
+            far = [reach(own) for own in missed]
             least = scale_of_all([missed[b] for b in rest], _least(seen))
             now = [b for b in out if far[b] > TAIL * least]
             if not _agree(seen, precision(seen.data)):
@@ -77,6 +69,23 @@ def look_at_agreeing(data: Trajectories, settings: FitConfig, stages: Stages) ->
         others = data.select([b for b in range(len(data)) if b not in out])
         seen = look(others, settings, stages.labelled(f"{stages.label}, without {out}"))
     return whole, ()
+
+
+def _disagreeing(seen: Look, data: Trajectories, rest: Sequence[int], missed: Sequence[Tensor]) -> int | None:
+    """The recording among `rest` that is an outlier of the misfits of the others, or that bends the model, or None.
+
+    None, too, if the recording has a property of its own: the law may depend on that property.
+    """
+    worst = max(rest, key=lambda b: reach(missed[b]))
+    most = TAIL * scale_of_all([missed[b] for b in rest if b != worst], _least(seen))
+    far = reach(missed[worst])
+    if far > most and far > _of_steps(seen, data, worst):
+        bad = worst
+    else:
+        # Once a recording is left out, the model is no longer bent.
+        asked = dict.fromkeys((worst, _least_alike(seen))) if len(rest) == len(data) else ()
+        bad = next((b for b in asked if _bends(seen, b)), None)
+    return None if bad is None or own_properties(data, bad) else bad
 
 
 def outlying(seen: Look, model: ContactLagrangian, sigma: float) -> tuple[LeftOut, ...]:

@@ -30,7 +30,7 @@ class Errors:
     held out; `free` is inf if the free run fails or diverges. `noise` is the precision of the data, inf if unknown.
     With `unit` None all numbers are over the spread; with `degrees` numbers in rad are printed in deg. `out` training
     samples with gross errors are left out of the errors. The precision of the coordinates `rough`, not of all, exceeds
-    half their spread.
+    half their spread. `bound`: the precision is an upper bound, because samples are far apart (`noise.coarse`).
     """
 
     windows: float
@@ -42,6 +42,7 @@ class Errors:
     degrees: bool = False
     out: int = 0
     rough: tuple[str, ...] = ()
+    bound: bool = False
 
     @property
     def limit(self) -> float:
@@ -101,7 +102,8 @@ class Errors:
         if not math.isfinite(self.noise):
             return f"the data's precision is unknown, for no training part has {SAMPLES} samples"
         least = f" (errors below {self._size(self.limit)} count as none)" if self.limit > self.noise else ""
-        return f"the data's precision is {self._size(self.noise)}{least}"
+        told = " or better, for samples are too far apart to tell" if self.bound and not least else ""
+        return f"the data's precision is {self._size(self.noise)}{least}{told}"
 
     def _size(self, x: float) -> str:
         unit, factor = ("deg", math.degrees(1)) if self.degrees else (self.unit or "", 1.0)

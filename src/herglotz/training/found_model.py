@@ -64,7 +64,7 @@ def _start_of_order_4(trial: Trial, fourth: FitConfig, base: Baseline, values: d
     grid = segment_grid(data, trial.length, base.model_step)
     problem = ShootingProblem(model, data, grid, sigma=trial.problem.sigma)
     change = moved(trial, problem, problem.parameters.get())
-    return base if change <= FINER * max(trial.rms, trial.fitter.floor / ALIKE) else None
+    return base if change <= FINER * max(trial.rms, trial.fitter.rounding / ALIKE) else None
 
 
 def _spreads(trial: Trial) -> dict[str, float]:

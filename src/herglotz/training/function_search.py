@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from herglotz.progress import MORE_TERMS, inside, part
 from herglotz.training.search import Search
-from herglotz.training.trials import ITERATIONS, Trial, Variant, likeliest
+from herglotz.training.trials import ITERATIONS, Trial, Variant, likeliest, scores_of
 
 
 @inside()
@@ -45,7 +45,10 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     # A pendulum whose length turns with it needs mass, potential and damping together.
     every = fitter.fit({*taken, *fitter.functions}, fitter.values_of(best), best.length, best, 2 * ITERATIONS)
     every = every and likeliest(every, 2 * ITERATIONS)
-    if every is None or not float((best.score.losses - every.score.losses).sum()) > 0:
+    if every is None:
+        return found
+    few, all_of_them = scores_of(best, every)
+    if not float((few.losses - all_of_them.losses).sum()) > 0:
         return found
     return search.better(found, search.settled(every))
 

@@ -397,12 +397,10 @@ class Search:
             other = self.fitter(replace(fitter.variant, substeps=2 * fitter.variant.substeps))
             problem = other.problem(trial.length).of(other.numbers(trial.taken), trial.problem.sigma)
             change = moved(trial, problem, trial.theta)
-            if change <= FINER * max(trial.rms, fitter.floor / ALIKE):
+            if change <= FINER * max(trial.rms, fitter.rounding / ALIKE):
                 break
             if fitter.variant.substeps >= fitter.finest:
-                least = math.hypot(explained_by_steps(change, fitter.variant.order), fitter.about_the_noise)
-                if fitter.about_the_noise < trial.rms <= least:
-                    fitter.floor = least
+                fitter.explain(trial, explained_by_steps(change, fitter.variant.order))
                 break
             fit = other.fit(trial.taken, trial.values, trial.length, trial)
             # Finer steps cannot miss what coarser ones meet: from these values the fit has not found its way.

@@ -62,7 +62,7 @@ ALIKE = 10.0
 # Noise, as a share of the spread of the data, below which a rule of order 4 is worth its time.
 ORDER_4_NOISE = 1e-3
 # Largest number of model steps in a recorded step, and in all trajectories.
-MAX_SUBSTEPS, MAX_STEPS = 16, 40_000
+MAX_SUBSTEPS, MAX_STEPS = 64, 15_000
 
 
 @dataclass(frozen=True)
@@ -221,12 +221,22 @@ class Trial:
         return HeldOut(self.problem, self.path, self.theta, waves=waves)
 
     @cached_property
+    def _scores(self) -> dict[float, Score]:
+        return {}
+
+    @property
     def score(self) -> Score:
         """Score over held-out blocks; computing the score records the model in `Fitter.compared`."""
-        count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
-        (found,) = scores(self._held_out, [range(self.problem.P)], choices, count, self.fitter.floor)
-        self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
-        return found
+        return self.score_above(self.fitter.floor)
+
+    def score_above(self, floor: float) -> Score:
+        """The score with residuals below this floor taken for rounding."""
+        if floor not in self._scores:
+            count, choices = int((self.problem.weight > 0).sum()), [len(self.taken)]
+            (found,) = scores(self._held_out, [range(self.problem.P)], choices, count, floor)
+            self.fitter.compared.append(Compared(self.length, self.problem.P, found.rms, self.taken))
+            self._scores[floor] = found
+        return self._scores[floor]
 
     @cached_property
     def _shorter(self) -> dict[int, Trial | None]:
@@ -249,9 +259,8 @@ class Trial:
         """
         if (pair := of_one_length(self, simple)) is None:
             return math.inf if self.length > simple.length else -math.inf
-        rich, other = pair
-        offered = max(self.fitter.offered, simple.fitter.offered)
-        return replace(rich.score, zeros=more).gain(other.score, offered)
+        rich, other = scores_of(*pair)
+        return replace(rich, zeros=more).gain(other, max(self.fitter.offered, simple.fitter.offered))
 
     def foretells(self, other: Trial) -> bool:
         """True if this model misses held-out blocks clearly less than another, whatever the numbers of both cost.
@@ -260,7 +269,8 @@ class Trial:
         """
         if (pair := of_one_length(self, other)) is None:
             return self.length > other.length
-        return pair[0].score.clearly_better(pair[1].score)
+        own, theirs = scores_of(*pair)
+        return own.clearly_better(theirs)
 
     def fits_better(self, simple: Trial, zeros: int = 0) -> bool:
         """True if this model, with `zeros` of sensors as further numbers, replaces a model with the same offers.
@@ -270,9 +280,9 @@ class Trial:
         """
         if (pair := of_one_length(self, simple)) is None:
             return self.length > simple.length
-        rich, other = pair
-        theirs = fitted_score(other.problem, other.path, self.fitter.floor)
-        own = fitted_score(rich.problem, rich.path, self.fitter.floor, zeros)
+        (rich, other), floor = pair, max(self.fitter.floor, simple.fitter.floor)
+        theirs = fitted_score(other.problem, other.path, floor)
+        own = fitted_score(rich.problem, rich.path, floor, zeros)
         return own.replaces(theirs, self.fitter.offered)
 
     @property
@@ -303,9 +313,8 @@ class Fitter:
     """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
 
     `like` is another fitter of the same data, which shares its segments and noise levels. Steps are not halved beyond
-    `finest` in a recorded one. Residuals below `floor` are rounding, or the error of the finest steps. Numbers are
-    scalar parameters, by name; `keys` has the term of each number. Features in the settings take the place of
-    `candidates`; `ratios` are those of the candidates.
+    `finest` in a recorded one. Numbers are scalar parameters, by name; `keys` has the term of each number. Features in
+    the settings take the place of `candidates`; `ratios` are those of the candidates.
     """
 
     def __init__(
@@ -351,7 +360,9 @@ class Fitter:
         self.lengths = [*(length for length in SHORT_SEGMENTS if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
         self.grids = Grids(data) if like is None else like.grids
-        self.floor = ALIKE * EXACT["float64"] * max(base.scale)
+        self.rounding = ALIKE * EXACT["float64"] * max(base.scale)
+        # Misfit that the error of the finest steps explains, by the order of the rule.
+        self.of_steps: dict[int, float] = {} if like is None else like.of_steps
         self.offered = len(every_offer)
         self.compared: list[Compared] = []
 
@@ -362,9 +373,24 @@ class Fitter:
         return own.union(key for number, key in self.keys.items() if number.startswith(TILT))
 
     @property
+    def floor(self) -> float:
+        """Residuals below it are rounding, or the error of the finest steps, in units of q over the balance."""
+        return max(self.rounding, self.of_steps.get(self.variant.order, 0.0))
+
+    @property
     def about_the_noise(self) -> float:
         """Largest misfit that counts as noise, in units of q over the balance."""
-        return max(AT_THE_NOISE * self.precision, self.floor)
+        return math.hypot(AT_THE_NOISE * self.precision, self.floor)
+
+    def explain(self, trial: Trial, by_steps: float) -> None:
+        """Take the error of the finest steps for the floor of misfits, if it explains what the model of a trial misses.
+
+        The floor stays below the errors that count as none: steps of a wrong model may be as far off as the model.
+        """
+        floor = min(by_steps, EXACT_ENOUGH * self.spread)
+        if trial.rms <= math.hypot(floor, self.about_the_noise):
+            order = self.variant.order
+            self.of_steps[order] = max(floor, self.of_steps.get(order, 0.0))
 
     @property
     def exact(self) -> bool:
@@ -520,6 +546,12 @@ def moved(trial: Trial, problem: ShootingProblem, theta: Tensor) -> float:
 def explained_by_steps(change: float, order: int) -> float:
     """Largest misfit that the error of steps explains, from the change of the motion by halved ones (Richardson)."""
     return AT_THE_NOISE * change * 2**order / (2**order - 1)
+
+
+def scores_of(own: Trial, other: Trial) -> tuple[Score, Score]:
+    """The scores of two models with one floor, because losses of different floors cannot be compared."""
+    floor = max(own.fitter.floor, other.fitter.floor)
+    return own.score_above(floor), other.score_above(floor)
 
 
 def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:

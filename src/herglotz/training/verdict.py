@@ -206,7 +206,7 @@ def _errors(kept: Trajectories, unit: Tensor, missed: tuple[Tensor, Tensor | Non
     names = () if all(rough) else tuple(name for name, own in zip(kept.names, rough, strict=True) if own)
     assert windows is not None
     spread = _rms(scaled.q - scaled.q.mean(0))
-    return Errors(windows, unseen, free, precision(scaled), spread, named, in_degrees, out, names)
+    return Errors(windows, unseen, free, precision(scaled), spread, named, in_degrees, out, names, coarse(scaled))
 
 
 def unseen_outlier(seen: Look, everywhere: Tensor) -> str:

@@ -27,7 +27,7 @@ from herglotz.training.score import Score, correlation_time, fitted_score
 from herglotz.training.search import Search
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
-from herglotz.training.trials import Variant, masses
+from herglotz.training.trials import Variant, masses, scores_of
 from tests import runge_kutta
 
 NOISE = 0.003
@@ -610,19 +610,20 @@ def test_finer_steps_replace_a_model_at_the_noise_at_the_noise(met, rms, at_the_
     fine: Any = SimpleNamespace(rms=rms, segments_at_the_noise=at_the_noise, fitter=None)
     other: Any = SimpleNamespace(
         variant=Variant(2, substeps=64), problem=lambda _: SimpleNamespace(of=lambda *_: None), numbers=lambda _: [],
-        spread=100.0, fit=lambda *_: fine, grow=lambda trial: trial, finest=16, floor=1e-9, about_the_noise=1e-9,
+        spread=100.0, fit=lambda *_: fine, grow=lambda trial: trial, finest=16, rounding=1e-9, about_the_noise=1e-9,
+        of_steps={},
     )  # fmt: skip
     fine.fitter, fine.theta, fine.length, fine.taken = other, None, 9, frozenset()
     fine.problem = SimpleNamespace(sigma=1.0)
     monkeypatch.setattr(search, "fitter", lambda _: other)
     trial: Any = SimpleNamespace(
-        fitter=SimpleNamespace(variant=Variant(2), floor=1e-9, finest=16), length=9, taken=frozenset(), theta=None,
+        fitter=SimpleNamespace(variant=Variant(2), rounding=1e-9, finest=16), length=9, taken=frozenset(), theta=None,
         rms=0.01, problem=SimpleNamespace(sigma=1.0), values={}, segments_at_the_noise=met, replaces=lambda _: False,
     )  # fmt: skip
     assert search.finer(trial) is (fine if replaced else trial)
 
 
-@pytest.mark.parametrize(("change", "rms", "floor"), [(3.0, 5.0, 6.02), (3.0, 7.0, 0.5), (0.3, 5.0, 0.5)])
+@pytest.mark.parametrize(("change", "rms", "floor"), [(3.0, 5.0, {2: 6.02}), (3.0, 7.0, {}), (0.3, 5.0, {})])
 def test_the_error_of_the_finest_steps_is_the_floor_of_misfits(change, rms, floor, monkeypatch):
     # fails if terms make up for the error of the steps (a double pendulum without noise got four masses of 2e-8), or if
     # a force that is missing is taken for that error
@@ -630,12 +631,35 @@ def test_the_error_of_the_finest_steps_is_the_floor_of_misfits(change, rms, floo
     search = searched(Trajectories.of(torch.arange(9.0), torch.arange(9.0) ** 2))
     other = SimpleNamespace(problem=lambda _: SimpleNamespace(of=lambda *_: None), numbers=lambda _: [])
     monkeypatch.setattr(search, "fitter", lambda _: other)
-    own = SimpleNamespace(variant=Variant(2, substeps=16), floor=0.5, about_the_noise=0.5, finest=16)
+    own = SimpleNamespace(variant=Variant(2, substeps=16), rounding=0.5, about_the_noise=0.5, finest=16, of_steps={})
     trial: Any = SimpleNamespace(
         fitter=own, length=9, taken=frozenset(), theta=None, rms=rms, problem=SimpleNamespace(sigma=1.0)
     )  # fmt: skip
     assert search.finer(trial) is trial
-    assert own.floor == pytest.approx(floor, rel=1e-3)
+    assert own.of_steps == pytest.approx(floor, rel=1e-3)
+
+
+def test_the_floor_of_misfits_is_one_for_all_fits_of_an_order(duffing):
+    # fails if what the finest steps miss asks for terms in a fit of coarser ones, or fits of order 4 miss as much
+    found = duffing[1]
+    search = Search(found.fitter.data, found.fitter.base, found.fitter.config)
+    coarse, fine, fourth = (search.fitter(Variant(*own)) for own in ((2, 1), (2, 64), (4, 1)))
+    fine.of_steps[2] = 3.0
+    assert (coarse.floor, fine.about_the_noise, fourth.floor) == (3.0, 3.0, fourth.rounding)
+
+
+def test_two_models_are_compared_above_one_floor(duffing):
+    # fails if a loss known from a lower floor stands against a loss above a higher one: the richer of two exact models
+    # stayed, by 770
+    found = duffing[1]
+    search = Search(found.fitter.data, found.fitter.base, found.fitter.config)
+    fitter = search.fitter(found.fitter.variant)
+    own, other = replace(found, fitter=fitter), replace(found, fitter=search.fitter(Variant(4)))
+    before = own.score.losses
+    fitter.of_steps[2] = 10.0
+    few, many = scores_of(own, other)
+    assert few.losses.tolist() == many.losses.tolist() == own.score.losses.tolist() != before.tolist()
+    assert own.gain(other) < 0
 
 
 @pytest.mark.parametrize(("rms", "joins"), [(0.2, True), (0.3, False)])

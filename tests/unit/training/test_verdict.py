@@ -179,6 +179,10 @@ def test_a_precision_that_is_not_known_is_said_to_be_unknown():
     exact = str(replace(unknown, noise=2e-9))
     assert "the data's precision is 2e-09 m (errors below 0.0001 m count as none)" in exact
     assert "count as none" not in str(replace(unknown, noise=0.01))
+    # fails if an upper bound is told as the precision of exact data with 3.5 samples a period, or noise as a bound
+    rough = replace(unknown, noise=0.01, bound=True)
+    assert "precision is 0.01 m or better, for samples are too far apart to tell, their spread is" in str(rough)
+    assert "or better" not in str(replace(rough, bound=False)) + str(replace(rough, noise=2e-9))
 
 
 @pytest.mark.parametrize(
