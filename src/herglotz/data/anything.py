@@ -182,6 +182,8 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     refuse({
         "positions without times: give h, the time between two samples, or time, an array of times":
             (h is None) == (time is None),
+        "h is the time between two samples, one number; where steps differ, give time":
+            h is not None and np.size(h) != 1,
         f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, give a list "
         "of recordings, or name every coordinate with coordinates=":
             q.ndim == 2 and MAX_COORDINATES_PER_SAMPLE * len(q) < q.shape[1] != len(as_names(called or ())),

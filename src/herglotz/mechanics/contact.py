@@ -27,6 +27,14 @@ def split(x: Tensor) -> Triple:
     return x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
 
 
+def normal(x: Tensor) -> Tensor:
+    """x, or a copy of an x of inference mode, by which autograd cannot differentiate."""
+    if not x.is_inference():
+        return x
+    with torch.inference_mode(False):
+        return x.clone()
+
+
 def contact_form(p: Tensor) -> Tensor:
     """Components (−p, 0, 1) of η = ds − p·dq at a point with momentum p (..., n); (..., 2n+1)."""
     return torch.cat([-p, torch.zeros_like(p), torch.ones_like(p[..., :1])], -1)
@@ -45,8 +53,8 @@ def flow_derivatives(
 ) -> list[tuple[Triple, Tensor]]:
     """Value and derivative of Φ_1, Φ_2∘Φ_1, … as `flow_derivative` returns them; every map is evaluated once."""
     found = []
-    with torch.enable_grad():
-        x = join(q, p, s).detach().requires_grad_()
+    with torch.inference_mode(False), torch.enable_grad():
+        x = join(normal(q), normal(p), normal(s)).detach().requires_grad_()
         q, p, s = split(x)
         for flow in flows:
             q, p, s = flow(q, p, s)
@@ -63,8 +71,8 @@ def jacobian(
     One x may serve all samples of f.
     """
     keep_graph = torch.is_grad_enabled() and (x.requires_grad or f(x).requires_grad)
-    with torch.enable_grad():
-        x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
+    with torch.inference_mode(False), torch.enable_grad():
+        x = x * 1 if keep_graph and x.requires_grad else normal(x).detach().requires_grad_()
         y = f(x)
         batch = torch.broadcast_shapes(y.shape[:-1], x.shape[:-1])
         if batch != x.shape[:-1]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.func import vjp
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import rows_of, split
+from herglotz.mechanics.contact import normal, rows_of, split
 
 
 class DiscreteLagrangian(Protocol):
@@ -169,11 +169,18 @@ def partials(
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     if isinstance(L_d, ClosedForm):
         return L_d.partials(q0, q1, s0, h, order)
+    check_function(L_d)
+    return autograd_partials(L_d, q0, q1, s0, h, order)
+
+
+def check_function(L_d: Any) -> None:
+    """Raise InputError if L_d is no function of tensors: an object, or a class in place of a module of that class."""
+    if isinstance(L_d, type):
+        raise InputError(f"L_d must be a module or function, got the class {L_d.__name__}; make one: {L_d.__name__}()")
     if not callable(L_d):
         raise InputError(
             f"L_d must be a function L_d(q0, q1, s0, h), got a {type(L_d).__name__}; of a Stepper, give its L_d"
         )
-    return autograd_partials(L_d, q0, q1, s0, h, order)
 
 
 def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
@@ -187,11 +194,24 @@ def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor
     return L
 
 
-def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] = ("q0", "q1", "s0")) -> None:
-    """Raise InputError for an argument that is no tensor, or positions without a last axis for the coordinates."""
-    for name, x in zip(names, (q0, q1, s0), strict=True):
+def in_vmap(x: Tensor) -> bool:
+    """Whether a tensor is one sample of many inside `torch.func.vmap`, where its numbers cannot be asked for."""
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(x) and not functorch.is_batchedtensor(x):
+        x = functorch.get_unwrapped(x)
+    return functorch.is_batchedtensor(x)
+
+
+def check_tensors(**arguments: Any) -> None:
+    """Raise InputError for the first argument that is no tensor."""
+    for name, x in arguments.items():
         if not isinstance(x, Tensor):
             raise InputError(f"{name} must be a tensor, got a {type(x).__name__}; {REMEDY}")
+
+
+def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] = ("q0", "q1", "s0")) -> None:
+    """Raise InputError for an argument that is no tensor, or positions without a last axis for the coordinates."""
+    check_tensors(**dict(zip(names, (q0, q1, s0), strict=True)))
     if q0.ndim == 0 or q1.ndim == 0:
         raise InputError(f"{names[0]} and {names[1]} need shape (..., n), got (); {REMEDY}")
 
@@ -201,10 +221,23 @@ REMEDY = (
 )
 
 
+# What torch says of tensors that do not fit together.
+OF_SHAPES = ("have the same dtype", "expected scalar type", "size of tensor", "shapes cannot be multiplied")
+
+
 def called(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-    """L_d(q0, q1, s0, h); raise InputError if L_d takes another number of arguments."""
+    """L_d(q0, q1, s0, h); raise InputError if L_d takes another number of arguments, or other shapes or dtypes."""
     try:
         return L_d(q0, q1, s0, h)
+    except RuntimeError as error:
+        if not any(words in str(error) for words in OF_SHAPES):
+            raise
+        own = next(iter(L_d.parameters()), None) if isinstance(L_d, torch.nn.Module) else None
+        holds = "" if own is None else f", and its parameters are {own.dtype}"
+        raise InputError(
+            f"{_name(L_d)} does not take positions of shape {tuple(q0.shape)} and {q0.dtype}, with s0 and h of shape "
+            f"{tuple(s0.shape)} and {tuple(h.shape)}{holds}: {str(error).splitlines()[0]}"
+        ) from None
     except TypeError as error:
         if "positional argument" not in str(error) or _takes_four(L_d):
             raise
@@ -242,7 +275,7 @@ def checked(L_d: Any, L: Any, like: Tensor) -> Tensor:
 
 def _check_alone(L_d: Any, L: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> None:
     """Raise InputError if the first sample depends on the h of other samples, as with (q1 − q0) / h."""
-    if L.numel() < 2:
+    if L.numel() < 2 or in_vmap(L):
         return
     first = (0,) * L.ndim
     steps = 2 * h.detach().expand(L.shape).clone()
@@ -266,13 +299,18 @@ def autograd_partials(
 ) -> Partials:
     """Return the result of `partials`, always by autograd: the slow twin that closed forms are tested against.
 
-    Samples do not interact, so the gradient of the sum over samples is the batch of gradients.
+    Samples do not interact, so the gradient of the sum over samples is the batch of gradients. Within `torch.func`,
+    which autograd does not nest in, the result is that of `functional_partials`.
     """
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
+    if torch._C._are_functorch_transforms_active():
+        return functional_partials(L_d, q0, q1, s0, h, order)
+    q0, q1, s0, h = map(normal, (q0, q1, s0, h))
     q0, q1, s0, _ = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
     s0 = s0[..., 0]
     keep_graph = torch.is_grad_enabled() and _differentiable(L_d, q0, q1, s0, h)
-    with torch.enable_grad():
+    # Autograd records nothing in inference mode.
+    with torch.inference_mode(False), torch.enable_grad():
         q0, q1, s0 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q1, s0))
         # `* 1` gives each argument a graph node of its own, so that views of one tensor differentiate separately.
         a, b, s = q0 * 1, q1 * 1, s0 * 1

@@ -12,23 +12,23 @@ operation, so autograd and vmap apply.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 from torch.nn.functional import linear, logsigmoid
 
+from herglotz.cached import cached
+
 Constant = Tensor | float
 
 
-@lru_cache(maxsize=64)
+@cached
 def pairs(d: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Indices (i, j) with i ≤ j of the Hessian rows, in their order."""
     i, j = torch.triu_indices(d, d, device=device)
     return i, j
 
 
-@lru_cache(maxsize=64)
+@cached
 def _unpack_index(d: int, device: torch.device) -> Tensor:
     """(d, d) the row number of ∂_i ∂_j f among the Hessian rows."""
     i, j = pairs(d, device)
@@ -37,14 +37,14 @@ def _unpack_index(d: int, device: torch.device) -> Tensor:
     return index
 
 
-@lru_cache(maxsize=64)
+@cached
 def _upper_index(d: int, device: torch.device) -> Tensor:
     """Indices of ∂_i ∂_j f, i ≤ j, in the flattened (d, d) matrix: ONNX takes entries along one axis."""
     i, j = pairs(d, device)
     return d * i + j
 
 
-@lru_cache(maxsize=64)
+@cached
 def _embed_index(d: int, size: int, offset: int, order: int, device: torch.device) -> Tensor:
     """Row numbers that place a jet over d tangents in a jet over `size`; the last row (zeros) fills the rest."""
     slot = {offset + k: k for k in range(d)}

@@ -168,6 +168,11 @@ def check_own(L_d: Any, inputs: int) -> None:
         )
 
 
+def own_name(model: Any) -> str | None:
+    """The name of a user's L_d; None for a model of the package."""
+    return model.config.name if isinstance(model, OwnLagrangian) else None
+
+
 def refuse_own(model: Any, what: str, instead: str) -> None:
     """Raise InputError for a function that reads the terms of a model, if the model is a user's L_d without terms."""
     if isinstance(model, OwnLagrangian):

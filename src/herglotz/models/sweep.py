@@ -7,13 +7,13 @@ derivative: 1 + n rows in place of the 1 + 2n + n(2n + 1) rows of a jet over (q0
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import linear, logsigmoid
 
+from herglotz.cached import cached
 from herglotz.models.network import Network
 
 
@@ -26,7 +26,7 @@ class Trigonometry(NamedTuple):
     minus_sin: Tensor  # (..., n) ∂c/∂q
 
 
-@lru_cache(maxsize=64)
+@cached
 def _angle_mask(angles: tuple[bool, ...], device: torch.device) -> Tensor | None:
     """(n,) whether each coordinate is an angle; None if all are."""
     return None if all(angles) else torch.tensor(angles, device=device)
@@ -90,7 +90,7 @@ class Sweep:
         return value, g, dg
 
 
-@lru_cache(maxsize=64)
+@cached
 def _columns(
     angles: tuple[bool, ...],
     scale: tuple[float, ...],
@@ -117,11 +117,10 @@ def _columns(
     return None if plain else torch.tensor(index, device=device), torch.tensor(fold, dtype=dtype, device=device)
 
 
-@lru_cache(maxsize=16)
+@cached
 def numbers(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """The tensors 0 and 1."""
-    with torch.inference_mode(False):
-        return torch.zeros((), dtype=dtype, device=device), torch.ones((), dtype=dtype, device=device)
+    return torch.zeros((), dtype=dtype, device=device), torch.ones((), dtype=dtype, device=device)
 
 
 def activation(name: str, z: Tensor, *, second: bool = False) -> tuple[Tensor, Tensor, Tensor]:

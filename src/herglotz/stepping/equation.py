@@ -11,12 +11,12 @@ so V is evaluated once a step (V at q0 is known from the step before) and an ite
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from herglotz.cached import cached
 from herglotz.mechanics import (
     DiscreteLagrangian,
     Partials,
@@ -111,7 +111,7 @@ class _Frame(NamedTuple):
     eye: Tensor  # (n, n)
 
 
-@lru_cache(maxsize=64)
+@cached
 def _frame(angles: tuple[bool, ...], dtype: torch.dtype, device: torch.device) -> _Frame:
     n = len(angles)
     eye = torch.eye(n, dtype=dtype, device=device)

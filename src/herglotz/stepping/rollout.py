@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint as save_start_only
 
 from herglotz.errors import InputError
+from herglotz.mechanics.partials import check_tensors
 from herglotz.progress import ProgressBar
 from herglotz.stepping.events import Event, Watch
 from herglotz.stepping.state import (
@@ -30,6 +31,7 @@ from herglotz.stepping.state import (
     Step,
     StepError,
     check_h,
+    check_spreads,
     check_state,
     step_sizes,
     throw_failure,
@@ -325,6 +327,7 @@ class OneStepMethod(ABC):
         InputError
             If h is not positive, lengths disagree, the L_d takes no inputs, or options do not fit together.
         """
+        check_tensors(q=q, p=p)
         start = self._checked(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
         if inputs is not None:
             inputs = self._checked_inputs(torch.as_tensor(inputs), q)
@@ -347,6 +350,7 @@ class OneStepMethod(ABC):
     ) -> Track:
         """The rollout of a named tuple of tensors, the last of shape (...); exported files replace this loop."""
         h_all = step_sizes(check_h(h, start[-1]), steps)
+        check_spreads(h_all[..., 0], start[-1])
         if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
             raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
         cut = Plan(h_all.shape[-1], **plan)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import join, split
+from herglotz.mechanics.contact import join, normal, split
 from herglotz.mechanics.newton import Root
-from herglotz.mechanics.partials import check_arguments
+from herglotz.mechanics.partials import check_arguments, in_vmap
 
 
 class Status(IntEnum):
@@ -158,11 +158,17 @@ def check_state(
 ) -> State:
     """Return the state.
 
+    A tensor of inference mode is copied, because autograd, by which an L_d without closed forms is stepped, refuses it.
     Raise InputError if shapes or dtypes do not fit one another and the parameters of L_d (of an exported file: `dof`
     and `dtype`); with `finite`, also if a number is not finite.
     """
     q, p, s = state
     check_arguments(q, p, s, names)
+    if in_vmap(q) or in_vmap(p) or in_vmap(s):
+        raise InputError(
+            "torch.func.vmap does not go through steps, which iterate until they converge; leave it out: q, p, s and h "
+            "take any leading dimensions"
+        )
     # Linear solves of torch have no other dtypes.
     if q.dtype not in (torch.float32, torch.float64):
         raise InputError(
@@ -182,7 +188,7 @@ def check_state(
     for name, x in zip(names, state, strict=True):
         if finite and not bool(torch.isfinite(x).all()):
             raise InputError(f"{name} must be finite, got {int((~torch.isfinite(x)).sum())} values that are not")
-    return State(q, p, s)
+    return State(*map(normal, state))
 
 
 def check_started(state: State) -> State:
@@ -208,15 +214,29 @@ def check_moving(v: Tensor, status: Tensor) -> Tensor:
 def check_h(h: Tensor | float, like: Tensor) -> Tensor:
     """The time step as a tensor of the dtype and device of `like`.
 
-    Raise InputError if h is not positive and finite.
+    Raise InputError if h is no number or tensor, or is not positive and finite.
     """
-    h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
+    try:
+        h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError):
+        raise InputError(f"h must be a number or a tensor, in the unit of time, got {h!r}") from None
     if not h.numel():
         raise InputError("h holds no step; give at least one")
     if not bool(((h > 0) & (h < torch.inf)).all()):
         wrong = float(h[~((h > 0) & (h < torch.inf))].flatten()[0])
         raise InputError(f"h must be {'finite' if wrong > 0 else '> 0'}, got {wrong:g}")
     return h
+
+
+def check_spreads(h: Tensor, s: Tensor) -> None:
+    """Raise InputError if steps h (...) do not spread over the batch of a state with the action s (...)."""
+    try:
+        torch.broadcast_shapes(h.shape, s.shape)
+    except RuntimeError:
+        raise InputError(
+            f"h of shape {tuple(h.shape)} does not spread over states of shape {tuple(s.shape)}; give one step for all "
+            "or one for each"
+        ) from None
 
 
 def check_rows(inputs: Tensor) -> None:
@@ -230,6 +250,8 @@ def step_sizes(h: Tensor, steps: int | None) -> Tensor:
 
     Raise InputError if a scalar comes without a count, or a list has another length than the count.
     """
+    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool)):
+        raise InputError(f"steps must be a whole number, got {steps!r}")
     if h.ndim == 0:
         if steps is None or steps < 1:
             raise InputError(f"a scalar h needs steps >= 1, got steps={steps}")

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian, legendre_plus
+from herglotz.mechanics.partials import check_function
 from herglotz.models import capabilities
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.linearise import Linearised, linearise
@@ -21,6 +22,7 @@ from herglotz.stepping.state import (
     check_h,
     check_moving,
     check_rows,
+    check_spreads,
     check_started,
     check_state,
     throw_failure,
@@ -54,6 +56,7 @@ class Stepper(OneStepMethod):
         throw: bool = False,
         explicit: bool = True,
     ):
+        check_function(L_d)
         self.L_d = L_d
         self.tol = tol
         self.max_iterations = max_iterations
@@ -191,6 +194,7 @@ class Stepper(OneStepMethod):
         """
         state = check_state(state, self.L_d)
         h = check_h(h, state.q)
+        check_spreads(h, state.s)
         step, _ = self._single_step()(state, h, guess, u)
         self._check_step(step, state, h, u)
         return step

@@ -231,6 +231,8 @@ class FitConfig:
             raise InputError(f"unknown device '{self.device}'; use cpu or cuda") from None
         if device.type == "cuda" and not torch.cuda.is_available():
             raise InputError("device cuda was asked for but PyTorch finds no GPU; use cpu")
+        if device.type not in ("cpu", "cuda"):
+            raise InputError(f"device {self.device} has no float64, in which fits are made; use cpu or cuda")
 
     def resolved(self, data: Trajectories) -> FitConfig:
         """The settings of a fit to these data, with the level chosen.

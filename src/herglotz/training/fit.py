@@ -12,6 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
@@ -48,6 +50,7 @@ ROUNDING = 3.0
 
 
 @one_thread()
+@torch.inference_mode(mode=False)
 def fit(
     data: Any,
     config: FitConfig | None = None,
@@ -74,8 +77,8 @@ def fit(
         Settings; default `FitConfig()`.
     model
         Your own L_d to train in place of the package's model: a `torch.nn.Module` L_d(q0, q1, s0, h), with `at(u)` for
-        inputs, and derivatives by `partials` or by autograd. Its parameters are trained in place. Only settings of the
-        fit apply (`herglotz.training.own_fit.TAKEN`).
+        inputs, and derivatives by `partials` or by autograd. Its parameters are made float64 (or `dtype`) and trained,
+        both in place. Only settings of the fit apply (`herglotz.training.own_fit.TAKEN`).
     plan
         A plan to follow instead of choosing one, or a run with a plan: the same terms, from the same starting values.
         This is how two loads of one machine are fitted (`herglotz.export.between`). To change a plan, start from

@@ -97,7 +97,8 @@ def near_data(
 ) -> Tensor | None:
     """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1), all steps solved at once.
 
-    Newton's method starts from the recorded positions; None if it does not converge, when the runs are not near them.
+    Newton's method starts from the recorded positions; None if it does not converge, when the runs are not near them,
+    and if the stepper goes elsewhere.
     """
     found = motion(model, start, grid.h, u)
     if found is not None:
@@ -109,7 +110,19 @@ def near_data(
         tol = 64 * torch.finfo(start.dtype).eps
         L_d = problem.parameters.at(problem.parameters.get(), u)
         path = solve_path(L_d, start, grid.h, problem.path.x, tol)
-    return None if path is None or not bool(torch.isfinite(path.x).all()) else path.x
+    return path.x if path is not None and _are_steps(model, path.x, grid, u) else None
+
+
+def _are_steps(model: ContactLagrangian, nodes: Tensor, grid: SegmentGrid, u: Tensor | None) -> bool:
+    """Whether the stepper takes every step of these runs (S, K+1, 2n+1) from where it begins.
+
+    A step may have several solutions, of which the one near the data need not be that of the stepper.
+    """
+    there = torch.arange(grid.h.shape[1], device=nodes.device) < grid.end[:, None]
+    start, q = state_of(nodes[:, :-1][there]), nodes[:, 1:, : model.dof][there]
+    with torch.no_grad():
+        taken = Stepper(model).step(start, grid.h[there], u=None if u is None else u[there]).state.q
+    return bool((taken - q).abs().amax() <= torch.finfo(q.dtype).eps ** 0.5 * q.abs().amax())
 
 
 def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor:

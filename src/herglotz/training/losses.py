@@ -20,7 +20,7 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
-from herglotz.mechanics.partials import value
+from herglotz.mechanics.partials import in_vmap, value
 from herglotz.stepping import Stepper, solve, state_of
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import check_h
@@ -79,7 +79,7 @@ def herglotz_residual(
     after = P.map(lambda x: x.narrow(axis, 1, h.shape[-1] - 1))
     R = momentum_residual(after, p)
     r = solve(momentum_jacobian(after, p), R) if preconditioned else R
-    if len(bad := (~torch.isfinite(r)).nonzero()):
+    if not in_vmap(r) and len(bad := (~torch.isfinite(r)).nonzero()):
         *sample, k, _ = bad[0].tolist()
         raise InputError(
             f"J = ∂R/∂q1 is singular, or L_d not finite, at step {k + 1} of window {tuple(sample)}: a discrete "
@@ -96,7 +96,9 @@ def _action(L_d: DiscreteLagrangian, q: Tensor, h: Tensor, s0: Tensor, u: Tensor
         P = partials(L, q0, q1, first, h)
         near = first + torch.nn.functional.pad(P.L.cumsum(-1)[..., :-1], (1, 0))
         other = partials(L, q0, q1, near, h)
-        same = all(torch.equal(getattr(P, name), getattr(other, name)) for name in ("D1", "D2", "D3"))
+        same = not in_vmap(P.L) and all(
+            torch.equal(getattr(P, name), getattr(other, name)) for name in ("D1", "D2", "D3")
+        )
     if same and not s0.requires_grad:
         return first
     found = [s0]
@@ -159,7 +161,7 @@ def starts(
         If q has fewer than three samples, or length is not positive.
     """
     _checked(q, 1.0, None, None)
-    refuse({f"length must be a whole number >= 1, got {length}": length < 1})
+    refuse({f"length must be a whole number >= 1, got {length}": not isinstance(length, int) or length < 1})
     at = torch.arange(max((q.shape[-2] - 2) // length, 1), device=q.device) * length
     found = Starts(q[..., at, :], q[..., at + 1, :], q.new_zeros((*q.shape[:-2], len(at))))
     return Starts(*(x.detach().clone().requires_grad_() for x in found))
@@ -211,6 +213,8 @@ def shooting(
     Source: multiple shooting (Bock 1984) on Φ̃ of section 1 of `docs/mathematics.md`.
     """
     h, _, u = _checked(q, h, None, u)
+    refuse({f"starts must be those of herglotz.losses.starts(q, length), got a {type(starts).__name__}":
+            not isinstance(starts, Starts)})  # fmt: skip
     K, (*batch, S, n) = h.shape[-1], starts.q0.shape
     length = min(K - 1 if length is None else length, K - 1)
     fitting = max((K - 1) // length, 1) == S and tuple(batch) == tuple(q.shape[:-2]) and n == q.shape[-1]
@@ -252,9 +256,9 @@ def _joints(x: Tensor, starts: Starts) -> Tensor:
     q, s = x[..., : starts.q0.shape[-1]], x[..., -1]
     ends = q[..., :-1, :, :]
     positions = [ends[..., -2, :] - starts.q0[..., 1:, :], ends[..., -1, :] - starts.q1[..., 1:, :]]
-    with torch.no_grad():
-        spread, change = (x.square().mean().sqrt() for x in (q - q.mean(-2, True), s - s[..., :1]))
-        by = torch.where(change > 0, spread / change, 0.0)
+    spread, change = (x.square().mean() for x in (q - q.mean(-2, True), s - s[..., :1]))
+    # A root has no derivative at 0, where no segment changes s.
+    by = (spread / torch.where(change > 0, change, 1.0)).sqrt()
     return torch.cat([*positions, ((s[..., :-1, -2] - starts.s[..., 1:]) * by)[..., None]], -1)
 
 
@@ -271,6 +275,7 @@ def _checked(q: Tensor, h: Tensor | float, s0: Tensor | None, u: Tensor | None) 
         raise InputError(f"q is not finite at {tuple(bad[0].tolist())}; leave that window out")
     batch, K = q.shape[:-2], q.shape[-2] - 1
     h = check_h(h, q)
+    refuse({f"s0 must be a tensor, got a {type(s0).__name__}": s0 is not None and not isinstance(s0, Tensor)})
     for name, x, shape in (("h", h, (*batch, K)), ("s0", s0, batch)):
         if x is not None and not _fits(x.shape, shape):
             raise InputError(f"{name} needs shape {shape} or one that spreads to it, got {tuple(x.shape)}")

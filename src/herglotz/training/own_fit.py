@@ -101,7 +101,7 @@ def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagra
     model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device="cpu")
     with _differentiable(model.config.name):
         model.s_enters_motion = s_enters_motion(model, kept)
-    _refuse_mixed_samples(model, kept)
+    _check_samples(model, kept)
     seen = Look(
         data, train, unseen, kept, dropped, False, data.arrival, {}, (), (),
         noise=roughness(kept), settings=config, base=base,
@@ -119,28 +119,60 @@ def own_model(L_d: DiscreteLagrangian, data: Trajectories, base: Baseline) -> Ow
         f"{name} has no parameters to train; make it a torch.nn.Module with some, or step it as it is: hz.Stepper(L_d)":
             not sum(x.numel() for x in model.parameters()),
         f"{name}: {', '.join(frozen)} do not require gradients; make them buffers (register_buffer)": frozen,
+        f"{name} was made in inference mode, where nothing can be trained; make it outside":
+            any(x.is_inference() for x in model.parameters()),
     })  # fmt: skip
     return model
 
 
-def _refuse_mixed_samples(model: Any, data: Trajectories) -> None:
-    """Raise InputError if L_d of a batch is not that of each sample, as where h, (...), stands beside q, (..., n)."""
+def _check_samples(model: Any, data: Trajectories) -> None:
+    """Raise InputError if L_d is not finite or random, or if L_d of a batch is not that of each sample.
+
+    Samples are mixed where h, (...), stands beside q, (..., n).
+    """
     steps, u = data.steps(), step_inputs(model, data)
     i = steps.index[torch.linspace(0, len(steps.index) - 1, 6).long()]
     h = steps.h[:1] * torch.arange(1, 7).to(data.q)
     samples = (data.q[i], data.q[i + 1], data.t[i] - data.t[0], h) + (() if u is None else (u[i],))
-    call = lambda q0, q1, s0, h, u=None: model(q0, q1, s0, h, 0, u)  # noqa: E731
-    with torch.no_grad():
-        each = torch.cat([call(*(x[k : k + 1] for x in samples)) for k in range(6)])
+    name = model.config.name
+
+    def same(*x: Tensor) -> bool:
+        """Whether L_d of these samples at once, in any shape, is that of each."""
         try:
-            L = call(*(x.unflatten(0, (3, 2)) for x in samples)).flatten()
-        except RuntimeError:
-            L = torch.full_like(each, torch.nan)
-    refuse({
-        f"{model.config.name}: L_d of several samples is not that of each: q is (..., n), s0 and h are (...), with any "
-        "leading dimensions; write h[..., None] beside q, and .sum(-1) over coordinates":
-            L.shape != each.shape or not torch.allclose(L, each, 1e-3, 1e-3 * each.abs().max().item()),
-    })  # fmt: skip
+            L = model(*x[:4], 0, *x[4:]).flatten()
+        except (RuntimeError, ValueError, InputError):
+            return False
+        return L.shape == each.shape and torch.allclose(L, each, 1e-3, 1e-3 * each.abs().max().item())
+
+    def of_each() -> Tensor:
+        """L_d of these samples, one at a time."""
+        rows = [[x[k : k + 1] for x in samples] for k in range(len(i))]
+        return torch.cat([model(*row[:4], 0, *row[4:]) for row in rows])
+
+    with torch.no_grad():
+        each = of_each()
+        q0, q1 = data.q[steps.index], data.q[steps.index + 1]
+        every = model(q0, q1, torch.zeros_like(q0[:, 0]), steps.h, 0, None if u is None else u[steps.index]).flatten()
+        if len(bad := (~torch.isfinite(every)).nonzero()):
+            k = int(bad[0])
+            raise InputError(
+                f"{name} is {float(every[k])} from q = {q0[k].tolist()} to {q1[k].tolist()}; "
+                "an L_d has to be finite for the recorded positions"
+            )
+        refuse({
+            f"{name} is random: two calls with the same arguments differ, as with dropout; switch that off by .eval()":
+                not torch.equal(each, of_each()),
+        })  # fmt: skip
+        refuse({
+            f"{name}: L_d of several samples is not that of each: q is (..., n), s0 and h are (...); "
+            "write h[..., None] beside q, and .sum(-1) over coordinates; norms of a batch mix samples":
+                not same(*samples),
+        })  # fmt: skip
+        refuse({
+            f"{name} takes one leading dimension alone, and q is (..., n), s0 and h are (...), with any: layers that "
+            "have a place for channels, as batch and group norms, need q.flatten(0, -2) before, and .unflatten after":
+                not same(*(x.unflatten(0, (3, 2)) for x in samples)),
+        })  # fmt: skip
 
 
 def s_enters_motion(model: Any, data: Trajectories) -> bool:

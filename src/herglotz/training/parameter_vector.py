@@ -124,5 +124,5 @@ class FixedModel:
 
     def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
         """See `ContactLagrangian.partials_increment`."""
-        function, args = ContactLagrangian.partials_increment, (q0, delta, s0, h, order, self.u)
+        function, args = type(self.parameters.model).partials_increment, (q0, delta, s0, h, order, self.u)
         return self.parameters.evaluated(self.theta, function, *args, buffers=self.buffers)

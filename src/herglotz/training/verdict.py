@@ -34,6 +34,7 @@ from herglotz.data.polar import Circle, circles, remedy
 from herglotz.data.sensors import measured
 from herglotz.data.splits import enough, leading
 from herglotz.data.units import common_unit
+from herglotz.models import own_name
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.errors_of_runs import APART, EXACT_ENOUGH, Errors
 from herglotz.training.feedback import (
@@ -121,7 +122,7 @@ def _reason_of_residuals(task: Task, fitted: Fitted, seen: Look) -> str:
         miss = data.q if found is None else found.problem.misfit(found.path) * data.balance
         grid = found and found.problem.grid
         owner = data.trajectory if grid is None else grid.node // (grid.longest + 1)
-        reason = reason_of(data, miss, owner, task.config.level)
+        reason = reason_of(data, miss, owner, "full" if own_name(fitted.model) else task.config.level)
         if min(train.lengths) < 2 * FIRST_SEGMENT or coarse(half := train.thinned(2)):
             break
         train, steps = half, 2 * steps
@@ -185,7 +186,7 @@ def judged(
     beyond = partial(unseen_outlier, seen, everywhere)
     told = metrics | {
         "driven": train.u is not None, "level": task.config.level, "angles": _never_turned(train),
-        "columns": ways_of_columns(train),
+        "columns": ways_of_columns(train), "own": own_name(model),
     }  # fmt: skip
     held = partial(held_by_inputs, model, train, states, task.base.model_step)
     return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond, held)} | kept_numbers
@@ -395,11 +396,13 @@ def _remedy(errors: Errors, metrics: dict[str, Any], shown: Callable[..., str], 
         return reason
     if not errors.missed:
         return beyond() or _unlike(errors, metrics)
-    columns = metrics.get("columns", ())
+    columns, own = metrics.get("columns", ()), metrics.get("own")
     if metrics["objective"] in ("residual", "raw"):
         ways = ", or ".join(["Try --objective trajectory", *columns])
         asked = "" if columns else "; inputs that are not recorded?"
         return f"{ways}; or --substeps where a period has few samples{asked}"
+    if own:
+        return f"A force is missing, or the fit has not found it. Try other first values of {own}, or more terms in it"
     ways = [*columns, *([] if metrics["objective"] == "smoothing" else ["--objective smoothing"])]
     # Inputs leave one level.
     ways += [] if metrics.get("driven") else ["another --level (herglotz select)"]
@@ -413,18 +416,20 @@ def _remedy(errors: Errors, metrics: dict[str, Any], shown: Callable[..., str], 
 
 def _unlike(errors: Errors, metrics: dict[str, Any]) -> str:
     """Why a model that meets the training data misses the unseen part, or one run over that part, with a remedy."""
-    driven = metrics.get("driven")
+    driven, own = metrics.get("driven"), metrics.get("own")
     if (errors.unseen or 0.0) > AT_THE_NOISE * errors.limit:
         # Inputs leave one level.
-        simpler = "" if driven or metrics.get("level") in ("conservative", "linear") else "--level linear, or "
+        simple = driven or own or metrics.get("level") in ("conservative", "linear")
+        simpler = "" if simple else "--level linear, or "
         return f"Try {simpler}a larger train fraction: the unseen part differs from the training part"
     met = "the data" if errors.unseen is None else "the unseen part, too"
     noisy = "from noise of the inputs, " if driven else ""
-    line = "--angles none, where a spring and not gravity holds the angle, or " if metrics.get("angles") else ""
+    ways = ["--angles none, where a spring and not gravity holds the angle"] if metrics.get("angles") else []
+    ways = [f"more terms in {own}"] if own else [*ways, "a --feature for that force"]
     return (
         f"Runs over {FIRST_SEGMENT} steps meet {met}: errors of a longer run come from a force too small to be seen in "
-        f"these, {noisy}or from chaos, which no run follows for long. Try {line}a --feature for that force, or a "
-        "longer recording; herglotz predict with --windows and --horizon scores shorter runs"
+        f"these, {noisy}or from chaos, which no run follows for long. Try {', or '.join(ways)}, or a longer "
+        "recording; herglotz predict with --windows and --horizon scores shorter runs"
     )
 
 

@@ -1,15 +1,17 @@
 """Free runs solved block by block, and paths that start from the last one's derivatives."""
 
+from typing import Any, cast
+
 import pytest
 import torch
 
-from herglotz.data import simulate
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.data import Trajectories, simulate
+from herglotz.models import ContactLagrangian, ModelConfig, OwnLagrangian
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import free_run
 from herglotz.training.cross_validation import _left_out
-from herglotz.training.free_run import continued
+from herglotz.training.free_run import continued, free_runs, near_data
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers import lifted_newton
@@ -36,6 +38,22 @@ def test_runs_continued_in_blocks_are_those_of_single_steps(name):
     assert bool(still) == held  # friction holds for a while
     torch.testing.assert_close(x[..., :1], out.q, rtol=0, atol=1e-11)
     torch.testing.assert_close(x[..., 1:2], out.p, rtol=0, atol=1e-11)
+
+
+def test_a_run_near_the_data_is_that_of_the_stepper():
+    # fails if a step that has two solutions is taken to the one near the data: the printed error of a free run was that
+    # of a motion that no stepper makes
+    bent = lambda q0, q1, s0, h: ((q1 - q0) ** 2 / 2 - (q1 - q0) ** 3 / 3).sum(-1) / h + 0 * s0  # noqa: E731
+    model, h, t = cast(Any, OwnLagrangian(bent, 1)), 0.1, 0.1 * torch.arange(9, dtype=torch.float64)
+    start = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64)
+    for sign in (-1, 1):
+        # Both solutions Δ of Δ − Δ² = h p, with p = 1 throughout.
+        data = Trajectories.of(t, torch.arange(9.0).double() * (1 + sign * (1 - 4 * h) ** 0.5) / 2)
+        grid = segment_grid(data, 8, h)
+        run = free_runs(Stepper(model), data, grid, start, None)
+        rolled = Stepper(model).rollout(start[:, :1], start[:, 1:2], start[:, 2], h=grid.h)
+        torch.testing.assert_close(run[..., :1], rolled.q, rtol=0, atol=1e-9)
+        assert (near_data(model, data, grid, start, None) is None) is (sign == 1)
 
 
 def test_a_run_that_fails_leaves_the_others_alone():

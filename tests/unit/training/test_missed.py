@@ -133,6 +133,9 @@ def test_columns_left_aside_are_named_where_something_is_missing():
     assert text.endswith(f"A force is missing. Try {takes} a --feature for it")
     text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, metrics | {"objective": "residual"})
     assert f"Try --objective trajectory, or {takes.removesuffix(', or')}; or --substeps" in text
+    # fails if settings that a fit of one's own L_d refuses are the remedies of that fit
+    text = in_words(Errors(0.5, 0.5, 0.5, noise=0.01, spread=1.0), None, {**metrics, "columns": (), "own": "Net"})
+    assert text.endswith("Try other first values of Net, or more terms in it")
     grows = reason_of(data, left(0.01 * (T - T.mean()) * Q), OWNER) or ""
     assert grows.endswith(f"each with a fit of its own, or {takes.removesuffix(', or')}")
 

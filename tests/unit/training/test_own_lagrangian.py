@@ -1,7 +1,7 @@
 """An L_d of one's own: its losses, its fit, and the files that it is written to."""
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -36,6 +36,28 @@ class Pushed(Spring):
 
     def at(self, u):
         return lambda q0, q1, s0, h: self(q0, q1, s0, h) + h * (u * q0).sum(-1)
+
+
+class Linear(Spring):
+    """The same with a layer, which has a dtype and a number of coordinates."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(1, 1).double()
+
+    def forward(self, q0, q1, s0, h):
+        return super().forward(q0, q1, s0, h) + 0 * self.layer(q0)[..., 0]
+
+
+class Residual(nn.Module):
+    """The residual of a recording by an L_d, for `functional_call`."""
+
+    def __init__(self, L_d):
+        super().__init__()
+        self.L_d = L_d
+
+    def forward(self, q):
+        return hz.losses.herglotz_residual(self.L_d, q, H)
 
 
 def motion(L_d, steps=40, n=1, inputs=None):
@@ -102,9 +124,12 @@ def test_gradients_of_the_losses_are_those_of_differences(bend):  # fails if J, 
     losses = [
         (lambda: hz.losses.herglotz_residual(L_d, noisy, H).square().mean(), ()),
         (lambda: hz.losses.shooting(L_d, noisy, H, starts, length=11).misfit.square().sum(), starts),
+        # fails if a line search cannot trust the gradient, because the scale of the gaps in s is held constant
+        (lambda: hz.losses.shooting(L_d, noisy, H, starts, length=11).loss, starts),
     ]
     for loss, further in losses:
-        L_d.zero_grad()
+        for x in (*L_d.parameters(), *further):
+            x.grad = None
         loss().backward()
         for x in (*L_d.parameters(), *further):
             assert x.grad is not None
@@ -159,18 +184,56 @@ def test_inputs_and_single_precision_and_unequal_steps():  # fails if u or h of 
         ({"h": torch.ones(7).double()}, r"h needs shape \(3, 40\)"),
         ({"u": torch.ones(3, 7, 1).double()}, "u needs shape"),
         ({"u": torch.ones(40, 1).double()}, "takes no inputs"),
+        ({"s0": 0.0}, "s0 must be a tensor"),
+        ({"q": motion(Spring()).q.float(), "L_d": Linear()}, r"Linear does not take .*float32, .*float64: "),
+        ({"q": motion(Spring()).q[..., 0], "L_d": Linear()}, r"Linear does not take positions of shape \(2, 41\)"),
     ],
 )
 def test_wrong_arguments_are_named(change, words):  # fails if a wrong shape spreads in silence
-    given = {"q": motion(Spring()).q, "h": H, "u": None} | change
+    given: dict[str, Any] = {"L_d": Spring(), "q": motion(Spring()).q, "h": H} | change
     with pytest.raises(hz.InputError, match=words):
-        hz.losses.herglotz_residual(Spring(), given["q"], given["h"], u=given["u"])
+        hz.losses.herglotz_residual(**given)
 
 
 def test_starts_of_another_length_are_refused():  # fails if segments are cut elsewhere than they start
     q = motion(Spring()).q
     with pytest.raises(hz.InputError, match="make them by starts"):
         hz.losses.shooting(Spring(), q, H, hz.losses.starts(q, 10), length=5)
+    with pytest.raises(hz.InputError, match="starts must be those of"):
+        hz.losses.shooting(Spring(), q, H, cast(Any, None), length=5)
+    with pytest.raises(hz.InputError, match=r"whole number >= 1, got 1\.5"):
+        hz.losses.starts(q, cast(Any, 1.5))
+
+
+def test_function_transforms_go_through_the_residual():  # fails if autograd is asked inside them, or vmap for a number
+    q = 1.1 * motion(Spring(bend=0.3)).q
+    nets = [Spring(k, bend=0.3) for k in (0.5, 1.5)]
+    loss = lambda theta: torch.func.functional_call(Residual(nets[0]), theta, (q,)).square().mean()  # noqa: E731
+    each = [{f"L_d.{name}": x.detach() for name, x in net.named_parameters()} for net in nets]
+    slopes = torch.func.vmap(torch.func.grad(loss))({name: torch.stack([x[name] for x in each]) for name in each[0]})
+    for row, net in enumerate(nets):
+        hz.losses.herglotz_residual(net, q, H).square().mean().backward()
+        for name, x in net.named_parameters():
+            torch.testing.assert_close(slopes[f"L_d.{name}"][row], x.grad, rtol=1e-10, atol=0)
+    with pytest.raises(hz.InputError, match="vmap does not go through steps"):
+        torch.func.vmap(lambda q: Stepper(nets[0]).rollout(q, q, h=H, steps=2).q)(q[:, 0])
+
+
+def test_an_l_d_is_stepped_and_trained_in_inference_mode():
+    # fails if derivatives are 0 there, in silence, or if tensors that are made there once stop a later training
+    L_d, q = Spring(bend=0.3), torch.ones(3, 1).double()
+    ways = [
+        lambda q: autograd_partials(L_d, 0.9 * q, q, q[..., 0], H, 2).D12,
+        lambda q: Stepper(L_d).init(0.9 * q, q, h=H).p,
+        lambda q: Stepper(L_d).rollout(q, q, h=H, steps=3).p,
+        lambda q: Stepper(L_d).velocity(Stepper(L_d).init_qv(q, q, h=H), H),
+    ]
+    with torch.inference_mode():
+        inside, inner = [way(q) for way in ways], q + 0
+        run = hz.fit(hz.simulate(hz.scene("damped_oscillator"), trajectories=1, steps=20, h=H, seed=0))
+    assert run.metrics["verdict"].startswith("fits to the noise")
+    for way, found in zip(ways, inside, strict=True):
+        assert found.tolist() == way(q).tolist() == way(inner).tolist()
 
 
 def test_functional_derivatives_are_those_of_autograd():  # fails if a block is transposed or takes another row
@@ -238,6 +301,22 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
         def forward(self, q0, q1, s0, h):
             return super().forward(q0 / h * h, q1, s0, h)  # h stands beside q without [..., None]
 
+    class Random(Spring):
+        def forward(self, q0, q1, s0, h):
+            return super().forward(q0, q1, s0, h) * (1 + torch.rand_like(s0))
+
+    class Infinite(Spring):
+        def forward(self, q0, q1, s0, h):
+            return super().forward(q0, q1, s0, h) + (q0[..., 0] - q0[..., 0].detach() - 1e-9).sqrt()
+
+    class Grouped(Spring):
+        def __init__(self):
+            super().__init__()
+            self.norm = nn.BatchNorm1d(1).double().eval()
+
+        def forward(self, q0, q1, s0, h):
+            return super().forward(q0, q1, s0, h) + 0 * self.norm(q0).sum(-1)
+
     frozen = Spring()
     frozen.k.requires_grad_(False)
     wrong: tuple[tuple[Any, dict[str, Any], str], ...] = (
@@ -246,6 +325,9 @@ def test_what_cannot_be_fitted_says_so():  # fails if the message names a settin
         (lambda *x: x[0].sum(-1), {}, "no parameters to train"),
         (frozen, {}, r"L_d.k do not require gradients"),
         (Branching(), {}, "cannot differentiate it sample by sample"),
+        (Random(), {}, r"Random is random: .* by \.eval\(\)"),
+        (Infinite(), {}, r"Infinite is nan from q = \[.*finite for the recorded positions"),
+        (Grouped(), {}, "Grouped takes one leading dimension alone"),
         (Normed(), {}, "Normed: torch.func cannot differentiate it .*batch norms"),
         (Mixing(), {}, r"Mixing: L_d of several samples is not that of each.*h\[..., None\] beside q"),
         (Copied(), {}, "Copied: torch.func cannot differentiate it .* numpy"),

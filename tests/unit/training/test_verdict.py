@@ -87,6 +87,8 @@ def test_words(windows, unseen, free, ahead, expected):
         (0.03, {"level": "forced"}, "Try --level linear, or a larger train fraction: the unseen part differs", "chaos"),
         (0.03, {"level": "linear"}, "Try a larger train fraction: the unseen part differs", "--level"),
         (0.03, {"level": "forced", "driven": True}, "Try a larger train fraction: the unseen part", "--level"),
+        (0.03, {"level": "forced", "own": "Net"}, "Try a larger train fraction: the unseen part", "--level"),
+        (0.011, {"angles": True, "own": "Net"}, "Try more terms in Net, or a longer", "--angles"),
     ],
 )
 def test_a_free_run_that_is_lost_alone_is_no_other_part(unseen, told, said, unsaid):
