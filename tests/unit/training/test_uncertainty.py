@@ -11,7 +11,7 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig, ensemble_bands, fit, laplace, uncertainty
 
 NOISE, INF = 0.01, float("inf")
-SETTINGS = FitConfig(departures=(6e-4, 2e-3), objective="trajectory")  # with networks, not with named terms
+SETTINGS = FitConfig(departures=(2e-3,), objective="trajectory")  # with networks, not with named terms
 
 
 @pytest.fixture(scope="module")
