@@ -107,7 +107,7 @@ def test_longer_steps_do_not_hide_in_the_parameters():
 def test_friction_that_holds_is_fitted_as_such():
     # fails if the variant with set-valued friction is the smooth model under another name: an axis without noise that
     # stands still at times is missed more than twice as far by smooth friction with the same offers
-    search = searched(simulate(scene("servo_axis"), trajectories=2, steps=60, h=0.05, seed=0))
+    search = searched(simulate(scene("servo_axis"), trajectories=1, steps=60, h=0.05, seed=0))
     found = there(search.run())
     assert found.fitter.model.capabilities.sticking
     assert "friction.log_smooth" not in found.values
@@ -154,7 +154,7 @@ def test_a_pendulum_on_a_spring_is_found_in_noise():
         return r * w**2 + 9.81 * a.cos() - 80.0 * (r - 0.4) - 0.1 * v, (-9.81 * a.sin() - 2 * v * w) / r
 
     starts = torch.tensor([[0.45, 0.9, 0.0, 0.0], [0.6, 0.5, 0.0, 0.0]], dtype=torch.float64)
-    found = there(searched(rolled(acceleration, starts, 200, 0.02, 5e-4)).run())
+    found = there(searched(rolled(acceleration, starts, 150, 0.02, 5e-4)).run())
     assert {"q1 cos(q2)", "q1^2 v2^2"} <= found.taken
     assert not any(" v" in name for name in found.taken - {"q1^2 v2^2"})
     assert found.at_the_noise
@@ -783,15 +783,15 @@ def test_a_search_of_many_samples_is_made_of_some(monkeypatch):
     # fails if every trial of a long recording is fitted to all of it, or the model to a part alone
     import herglotz.training.search as module
 
-    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
-    data, seen = simulate(scene("duffing"), trajectories=1, steps=600, h=0.05, noise=NOISE, seed=0), []
+    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 150)
+    data, seen = simulate(scene("duffing"), trajectories=1, steps=400, h=0.05, noise=NOISE, seed=0), []
     fit = module.Fitter.fit
     monkeypatch.setattr(
         module.Fitter, "fit", lambda self, *a, **k: seen.append(self.data.samples) or fit(self, *a, **k)
     )
     search = searched(data)
     found = there(search.of_part(search.part.run(), None)[1])
-    assert found.problem.data.samples == 601
+    assert found.problem.data.samples == 401
     assert found.taken == {"q1^2", "q1^4"}
     assert sum(count < 400 for count in seen) > sum(count > 400 for count in seen)
 
@@ -801,8 +801,8 @@ def test_zeros_of_a_part_are_where_those_of_all_data_begin(monkeypatch):
     # of some recordings stand for those of all; or if the zeros of the part are the last word
     import herglotz.training.search as module
 
-    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
-    data = simulate(scene("duffing"), trajectories=2, steps=300, h=0.05, noise=NOISE, seed=0)
+    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 150)
+    data = simulate(scene("duffing"), trajectories=2, steps=220, h=0.05, noise=NOISE, seed=0)
     shift = torch.tensor([0.0, 0.5], dtype=torch.float64)
     data = replace(data, q=data.q + shift[data.trajectory][:, None], p=None, s=None)
     search, firsts, again = searched(data), [], module.Search.again
@@ -896,12 +896,12 @@ def test_a_weight_on_a_torsion_spring_is_found():
     # θ″ = −7 θ − 12 sin θ − 0.15 θ′: fails if a weight is no offer on a line, or joins a model that powers complete
     # already: θ, θ³ and θ⁵ were found in its place
     rows, x = [], np.array([2.6, 0.0])
-    for _ in range(400):
+    for _ in range(300):
         rows.append(x[0])
         for _ in range(4):
             x = runge_kutta.step(lambda x: np.array([x[1], -7 * x[0] - 12 * np.sin(x[0]) - 0.15 * x[1]]), x, 0.025 / 4)
-    q = np.array(rows) + 0.004 * np.random.default_rng(0).standard_normal(400)
-    run = fit(Trajectories.of(0.025 * np.arange(400), q, names=("a",), units=("rad",), angles=(True,)), progress=False)
+    q = np.array(rows) + 0.004 * np.random.default_rng(0).standard_normal(300)
+    run = fit(Trajectories.of(0.025 * np.arange(300), q, names=("a",), units=("rad",), angles=(True,)), progress=False)
     terms = {term.what: (term.value, term.deviation) for term in run.equation().terms}
     assert set(terms) == {"a′", "a", "sin(a)"}
     for what, true in {"a′": -0.15, "a": -7.0, "sin(a)": -12.0}.items():
