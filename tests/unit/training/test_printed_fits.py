@@ -47,7 +47,7 @@ def drawn(kind, seed):
     """Two short recordings of a mechanism of the zoo."""
     rng = np.random.default_rng([7, seed])
     mechanism, _, driven = draw_mechanism(rng, kind)
-    t = PERIOD / log_uniform(rng, 8, 100) * np.arange(120.0)
+    t = PERIOD / log_uniform(rng, 8, 100) * np.arange(90.0)
     u = draw_inputs(rng, 2, t, 0.4) if driven else np.zeros((2, len(t)))
     q = exact_motion(mechanism, *_start(rng, mechanism, 2), t, u)[0]
     if rng.random() > 0.3:  # the others are exact
