@@ -146,7 +146,8 @@ def test_waves_of_a_part_are_those_of_all(in_the_well, monkeypatch):
     monkeypatch.setattr("herglotz.training.search.SAMPLES_OF_A_PART", 170)
     data = in_the_well
     search = search_of(data)
-    named = search.part.run()
+    plain = search.part.fitter(Variant(2))
+    named = plain.fit({"q1^2", "q1^4"}, {}, plain.lengths[0], None)
     assert named is not None
     monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
     # Functions are made, and none is better.

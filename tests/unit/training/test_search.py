@@ -66,7 +66,7 @@ def test_a_term_without_a_rule_of_order_4_keeps_order_2():
 def test_segments_of_exact_data_are_missed_by_the_rule_alone(noise):
     # fails if the search of exact data is given up over segments, where the rule of order 2 is all that is missed
     search = searched(simulate(scene("cart_pole"), trajectories=1, steps=100, h=0.02, noise=noise, seed=0))
-    missing = SimpleNamespace(fitter=there(search.begun).fitter, segments_at_the_noise=False)
+    missing = SimpleNamespace(fitter=search.fitter(Variant(search.order)), segments_at_the_noise=False)
     search.begun = cast(Any, missing)
     assert search.misses_segments == bool(noise)
 
@@ -664,6 +664,7 @@ def test_friction_that_pushes_does_not_join():
             v += 0.005 * (-4 * x + 0.3 * math.tanh(v / 0.05) - 0.2 * v)
             x += 0.005 * v
     search = searched(Trajectories.of(0.05 * torch.arange(300, dtype=torch.float64), torch.tensor(path).double()))
+    search.order = 2
     fitter = search.fitter(Variant(2))
     simple = there(fitter.fit(fitter.simple, {}, fitter.lengths[0], None))
     assert Moves(simple).joining(simple.taken)[0] - simple.taken == {"friction.coulomb"}
@@ -807,7 +808,8 @@ def test_zeros_of_a_part_are_where_those_of_all_data_begin(monkeypatch):
     data = replace(data, q=data.q + shift[data.trajectory][:, None], p=None, s=None)
     search, firsts, again = searched(data), [], module.Search.again
     differ = 0.8 * shift[:, None], torch.full((2, 1), 0.01, dtype=torch.float64)
-    found = there(search.part.of(module.measured(search.part.data, shift.tolist())).run())
+    fitter = search.part.of(module.measured(search.part.data, shift.tolist())).fitter(Variant(2))
+    found = fitter.grow(there(fitter.fit({"q1^2", "q1^4"}, {}, fitter.lengths[0], None)))
 
     def watched(self, trial):
         firsts.append(float(self.data.q.mean() - data.q.mean()))
