@@ -149,18 +149,15 @@ def test_inputs_and_single_precision_and_unequal_steps():  # fails if u or h of 
     assert single.abs().max() < 1e-5
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"q": torch.zeros(5).double()}, r"q needs shape"),
-        ({"q": torch.zeros(2, 1).double()}, r"at least 3 samples"),
-        ({"q": torch.tensor([[0.0], [math.nan], [1.0]])}, r"not finite at \(1, 0\)"),
-        ({"h": -0.1}, "h must be"),
-        ({"h": torch.ones(7).double()}, r"h needs shape \(3, 40\)"),
-        ({"u": torch.ones(3, 7, 1).double()}, "u needs shape"),
-        ({"u": torch.ones(40, 1).double()}, "takes no inputs"),
-    ],
-)
+@pytest.mark.parametrize(("change", "words"), [
+    ({"q": torch.zeros(5).double()}, r"q needs shape"),
+    ({"q": torch.zeros(2, 1).double()}, r"at least 3 samples"),
+    ({"q": torch.tensor([[0.0], [math.nan], [1.0]])}, r"not finite at \(1, 0\)"),
+    ({"h": -0.1}, "h must be"),
+    ({"h": torch.ones(7).double()}, r"h needs shape \(3, 40\)"),
+    ({"u": torch.ones(3, 7, 1).double()}, "u needs shape"),
+    ({"u": torch.ones(40, 1).double()}, "takes no inputs"),
+])  # fmt: skip
 def test_wrong_arguments_are_named(change, words):  # fails if a wrong shape spreads in silence
     given = {"q": motion(Spring()).q, "h": H, "u": None} | change
     with pytest.raises(hz.InputError, match=words):

@@ -269,17 +269,10 @@ def test_a_start_without_a_path_is_none():
     assert fitter.fit(fitter.simple, {"potential.features.sum.coefficient[0]": 1e300}, 5, None) is None
 
 
-@pytest.mark.parametrize(
-    ("gains", "more", "time", "replaces"),
-    [
-        ((20.0,) * 10, 1, 1.0, True),
-        ((20.0,) * 10, 60, 1.0, False),
-        ((20.0,) * 10, 1, 80.0, False),
-        ((200.0, *[0.0] * 9), 1, 1.0, False),
-        ((3.1, -1.1) * 5, 1, 1.0, False),
-        ((0.3,) * 10, 1, 1.0, False),
-    ],
-)
+@pytest.mark.parametrize(("gains", "more", "time", "replaces"), [
+    ((20.0,) * 10, 1, 1.0, True), ((20.0,) * 10, 60, 1.0, False), ((20.0,) * 10, 1, 80.0, False),
+    ((200.0, *[0.0] * 9), 1, 1.0, False), ((3.1, -1.1) * 5, 1, 1.0, False), ((0.3,) * 10, 1, 1.0, False),
+])  # fmt: skip
 def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, time, replaces):
     # fails if a price is left out, if one block alone decides, if samples that repeat one another count as so many, or
     # if what blocks differ by is not added to the price

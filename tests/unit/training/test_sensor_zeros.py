@@ -109,15 +109,12 @@ def test_zeros_of_angles_have_no_turns():
     assert fit(data).metrics["plan"]["zeros"] == pytest.approx(planted, abs=4 * NOISE)
 
 
-@pytest.mark.parametrize(
-    ("reference", "other", "words"),
-    [
-        ((0.1, 0.1), 3.0, "zeros: "),
-        ((0.1, 0.1), 1.2, CENTRE),
-        ((0.1, 0.0), 1.0, "zeros that differ, of some coordinates, from those of recording 0: "),
-        ((0.0, 0.0), 1.0, "zeros that differ from those of recording 0: "),
-    ],
-)
+@pytest.mark.parametrize(("reference", "other", "words"), [
+    ((0.1, 0.1), 3.0, "zeros: "),
+    ((0.1, 0.1), 1.2, CENTRE),
+    ((0.1, 0.0), 1.0, "zeros that differ, of some coordinates, from those of recording 0: "),
+    ((0.0, 0.0), 1.0, "zeros that differ from those of recording 0: "),
+])  # fmt: skip
 def test_the_note_says_what_zeros_are_beside(reference, other, words):
     # fails if zeros of one coordinate are said to be beside the reference, or not, as those of another are; or if what
     # all recordings have alike, where a bend of the law lies, is said to be the zero of a sensor

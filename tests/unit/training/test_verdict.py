@@ -78,17 +78,14 @@ def test_words(windows, unseen, free, ahead, expected):
     assert ("Try " in text) == (expected.startswith("does not fit"))
 
 
-@pytest.mark.parametrize(
-    ("unseen", "told", "said", "unsaid"),
-    [
-        (0.011, {}, "a force too small to be seen in these, or from chaos", "unseen part differs"),
-        (0.011, {"driven": True}, "in these, from noise of the inputs, or from chaos", "--level"),
-        (0.011, {"angles": True}, "Try --angles none, where a spring", "unseen part differs"),
-        (0.03, {"level": "forced"}, "Try --level linear, or a larger train fraction: the unseen part differs", "chaos"),
-        (0.03, {"level": "linear"}, "Try a larger train fraction: the unseen part differs", "--level"),
-        (0.03, {"level": "forced", "driven": True}, "Try a larger train fraction: the unseen part", "--level"),
-    ],
-)
+@pytest.mark.parametrize(("unseen", "told", "said", "unsaid"), [
+    (0.011, {}, "a force too small to be seen in these, or from chaos", "unseen part differs"),
+    (0.011, {"driven": True}, "in these, from noise of the inputs, or from chaos", "--level"),
+    (0.011, {"angles": True}, "Try --angles none, where a spring", "unseen part differs"),
+    (0.03, {"level": "forced"}, "Try --level linear, or a larger train fraction: the unseen part differs", "chaos"),
+    (0.03, {"level": "linear"}, "Try a larger train fraction: the unseen part differs", "--level"),
+    (0.03, {"level": "forced", "driven": True}, "Try a larger train fraction: the unseen part", "--level"),
+])  # fmt: skip
 def test_a_free_run_that_is_lost_alone_is_no_other_part(unseen, told, said, unsaid):
     # fails if the unseen part is said to differ where short runs meet it to the noise, or a level is offered that
     # refuses inputs or was taken
