@@ -4,6 +4,7 @@ import math
 import os
 import sys
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast
@@ -44,6 +45,23 @@ def there(found: T | None) -> T:
 def searched(data, **changes):
     config = FitConfig(**changes).resolved(data)
     return Search(data, estimate_baseline(data), config)
+
+
+@cache
+def oscillator(count=1):
+    return simulate(scene("damped_oscillator"), trajectories=count, steps=80, h=0.15, noise=0.01, seed=1)
+
+
+@cache
+def pendulum(count=1):
+    data = simulate(scene("damped_pendulum"), trajectories=count, steps=60, h=0.2, noise=0.01, seed=3)
+    return replace(data, p=None, s=None)
+
+
+def grown(search):
+    """The pendulum's law, fitted to whole trajectories."""
+    fitter = search.fitter(Variant(2))
+    return there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
 
 
 @pytest.fixture(scope="module")
@@ -344,7 +362,7 @@ def test_zeros_are_numbers_that_come_together():
 
 def test_held_out_residuals_are_those_of_fits_without_the_blocks():
     # fails if a step of parameters or starts has the wrong sign or size. A linear system: to first order is exact
-    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    data = oscillator(2)
     search = searched(data)
     fitter = search.fitter(Variant(2))
     whole = fitter.grow(there(fitter.fit({"q1^2"}, {}, 5, None, 60)))
@@ -367,7 +385,7 @@ def test_held_out_residuals_are_those_of_fits_without_the_blocks():
 
 def test_residuals_of_a_smaller_set_are_those_of_its_fit():
     # fails if numbers that leave do not go, or those that stay and the starts do not follow. To first order is exact
-    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    data = oscillator(2)
     data = replace(data, q=data.q + 0.01)
     fitter = searched(data).fitter(Variant(2))
     assert "q1" in {offer.name for offer in fitter.offers}
@@ -423,7 +441,7 @@ def test_fits_start_where_the_linear_motion_sees_their_numbers(duffing):
 def test_a_segment_that_is_left_out_whole_is_told_by_its_own_samples():
     # fails if its start stays where all samples put it, if it still has a say of the numbers, or if numbers of a fit
     # with joints stay where these hold them: against least squares in all starts and numbers at once
-    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    data = oscillator(2)
     fitter = searched(data).fitter(Variant(2))
     fit = there(fitter.fit({"q1^2"}, {}, 5, None, 60))
     problem, P, d = fit.problem, fit.problem.P, fit.problem.d
@@ -542,7 +560,7 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
     assert all(
         "dry" in own or "excess" not in own for own in moves(dry, excess, free).leaving(frozenset({"dry", "excess"}))
     )
-    fitter = searched(simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, seed=1)).fitter(Variant(2))
+    fitter = searched(oscillator()).fitter(Variant(2))
     assert {offer.on for offer in fitter.offers if offer.name == "friction.breakaway"} == {"friction.coulomb"}
 
 
@@ -550,8 +568,7 @@ def test_the_start_of_a_linear_problem_is_always_tried(monkeypatch):
     # fails if a climb that ends at the noise is believed: it may have taken other terms, and more, than the law has
     asked = []
     monkeypatch.setattr(Search, "linear_start", lambda _, fitter: asked.append(fitter))
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    assert there(searched(data).run()).at_the_noise
+    assert there(searched(oscillator()).run()).at_the_noise
     assert len(asked) == 1
 
 
@@ -567,8 +584,7 @@ def test_masses_start_from_velocities():
 
 def test_a_model_that_has_lost_its_friction_holds_no_joint():
     # fails if its settings ask for friction that holds without any, which no model can be made of
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    fitter = searched(data).fitter(Variant(2, sticking=True))
+    fitter = searched(oscillator()).fitter(Variant(2, sticking=True))
     of, base = settings(there(fitter.fit({"q1^2"}, {}, 5, None)), FitConfig())
     assert not of.sticking
     assert not build_model(base, of, "none").capabilities.sticking
@@ -676,8 +692,7 @@ def test_friction_that_pushes_does_not_join():
 
 def test_a_block_that_is_lost_weighs_no_more_than_it_may():
     # fails if a number that is none, or one far away, makes a whole score infinite
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    search = searched(data)
+    search = searched(oscillator())
     fitter = search.fitter(Variant(2))
     found = there(fitter.fit({"q1^2"}, {}, 5, None))
     found.path.x[-1, -1, 0] = 1e12
@@ -687,10 +702,8 @@ def test_a_block_that_is_lost_weighs_no_more_than_it_may():
 @pytest.mark.parametrize(("zero", "deviation", "better"), [(0.2, 1e-6, None), (0.001, 0.01, True)])
 def test_zeros_are_clearly_there_and_make_the_fit_better(zero, deviation, better, monkeypatch):
     # fails if zeros with which the fit misses more are taken, or those within their deviations
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
-    search = searched(replace(data, p=None, s=None), find_zeros=True)
-    fitter = search.fitter(Variant(2))
-    best = there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
+    search = searched(pendulum(2), find_zeros=True)
+    best = grown(search)
     found = torch.tensor([[0.0], [zero]], dtype=torch.float64), torch.tensor([[0.0], [deviation]], dtype=torch.float64)
     monkeypatch.setattr(search, "zeros", lambda *_: found)
     if better is not None:
@@ -700,13 +713,12 @@ def test_zeros_are_clearly_there_and_make_the_fit_better(zero, deviation, better
 
 def test_zeros_are_those_of_the_model_that_is_found():
     # fails if zeros stay what another model, which had terms that made up for them, asked for
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
+    data = pendulum(2)
     second = (data.trajectory == 1).double()[:, None]
-    search = searched(replace(data, q=data.q + 0.1 * second, p=None, s=None), find_zeros=True)
+    search = searched(replace(data, q=data.q + 0.1 * second), find_zeros=True)
     wrong = torch.tensor([[0.0], [0.07]], dtype=torch.float64)
     read = search.of(measured(search.data, wrong.flatten().tolist()))
-    fitter = read.fitter(Variant(2))
-    best = there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
+    best = grown(read)
     _, found, zeros = search.zeros_again(read, best, (wrong, torch.zeros_like(wrong)))
     assert there(found).rms < 0.9 * best.rms
     assert there(zeros)[0].flatten().tolist() == pytest.approx([0.0, 0.1], abs=0.01)
@@ -714,7 +726,7 @@ def test_zeros_are_those_of_the_model_that_is_found():
 
 def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
     # fails if blocks that are left out to first order decide of very many numbers, or residuals of a few
-    search = searched(simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3))
+    search = searched(pendulum())
     other = SimpleNamespace(fits_better=lambda _: True, replaces=lambda _: False)
     monkeypatch.setattr(search, "of", lambda _: SimpleNamespace(again=lambda _: other))
     trial = cast(Any, SimpleNamespace(lacks_nothing=False))
@@ -725,7 +737,7 @@ def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
 @pytest.mark.parametrize(("white", "hold"), [(False, "first"), (True, "")])
 def test_a_hold_is_asked_for_until_residuals_are_white(white, hold, monkeypatch):
     # fails if a model that terms brought to the noise, beside a wrong hold, is asked for no other hold
-    search = searched(simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3))
+    search = searched(pendulum())
     other = SimpleNamespace(replaces=lambda _: True)
     monkeypatch.setattr(search, "of", lambda _: SimpleNamespace(again=lambda _: other))
     trial = cast(Any, SimpleNamespace(at_the_noise=True, lacks_nothing=white))
@@ -735,7 +747,7 @@ def test_a_hold_is_asked_for_until_residuals_are_white(white, hold, monkeypatch)
 @pytest.mark.parametrize("lost", [True, False])
 def test_a_model_that_other_inputs_lose_is_grown_anew(lost, monkeypatch):
     # fails if a chaotic motion, which no fit of whole trajectories follows with another hold, speaks for the old hold
-    data = simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3)
+    data = pendulum()
     search, whole, short, grown = searched(data), SimpleNamespace(rms=3.0 if lost else 1.0), object(), object()
     found = cast(Any, SimpleNamespace(
         fitter=SimpleNamespace(data=replace(data), variant=Variant(2)), taken=(), values={}, length=60,
@@ -761,8 +773,7 @@ def test_a_child_has_threads_of_its_own():
 
 def test_a_missing_position_has_no_share_in_the_score_of_a_fit():
     # fails if what stands for a blank cell counts where zeros of sensors, or another hold, are asked for
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    found = there(searched(data).fitter(Variant(2)).fit({"q1^2"}, {}, 5, None))
+    found = there(searched(oscillator()).fitter(Variant(2)).fit({"q1^2"}, {}, 5, None))
     problem, path = found.problem, found.path
     q, observed = problem.data.q.clone(), torch.ones_like(problem.data.q)
     q[40], observed[40] = 1e3, 0.0
@@ -827,11 +838,8 @@ def test_a_search_gives_the_same_twice():
 
 def test_zeros_that_say_nothing_are_not_taken_off():
     # fails if zeros are taken off that the score does not ask for, unless a part of the recordings has them
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
-    search = searched(replace(data, p=None, s=None), find_zeros=True)
-    fitter = search.fitter(Variant(2))
-    best = there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))
-    best = there(fitter.grow(best))
+    search = searched(pendulum(2), find_zeros=True)
+    best = grown(search)
     assert search.with_zeros(best) == (search, best, None)
     read, other, zeros = search.with_zeros(best, accepted=True)
     assert there(zeros)[0].abs().max() > 0
