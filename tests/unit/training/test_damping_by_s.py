@@ -92,6 +92,7 @@ def test_it_is_found_where_no_model_without_s_follows_the_data():
     data = recorded(8, 0.0, 0, steps=27, s0=1.5)
     config = FitConfig().resolved(data)
     search = Search(data, estimate_baseline(data), config)
+    search.order = 2
     assert search.first is not None
     assert not search.first.whole
     found = search.run()

@@ -34,8 +34,8 @@ distributed.MIN_ROWS = 8  # there are few rows, and each process shall have some
 distillation.ITERATIONS = 3  # sums are shared from the first iteration on
 found = {}
 with process_group():
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
-    for objective, level, optimiser, iterations in (("residual", "affine", "lm", 3), ("raw", "linear", "adam", 2)):
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=16, h=0.2, seed=0)
+    for objective, level, optimiser, iterations in (("residual", "affine", "lm", 2), ("raw", "linear", "adam", 2)):
         settings = FitConfig(
             objective=objective, level=level, optimiser=optimiser, iterations=iterations, departures=(1e-3,),
             correction_width=5, damping_width=3, potential_width=4, train_fraction=1.0,
@@ -51,7 +51,7 @@ with process_group():
     start = shooting.pack(shooting.parameters.get(), first_states(shooting, shooting.parameters.get()))
     smoothing = SmoothingProblem(model, noisy, grid, process=0.1, **options)
     for name, problem, x in (("trajectory", shooting, start), ("smoothing", smoothing, smoothing.start())):
-        search = levenberg_marquardt(problem, x, max_iterations=4)
+        search = levenberg_marquardt(problem, x, max_iterations=3)
         found[name], found[name + " cost"] = search.x, torch.tensor(search.history, dtype=torch.float64)
     if is_first():
         torch.save(found, sys.argv[1])
@@ -71,8 +71,8 @@ def worked(monkeypatch, out):
     return torch.load(out, weights_only=True)
 
 
-def worked_by_two(monkeypatch, tmp_path):
-    """The same by this process and another one, which imports everything anew."""
+def by_one_and_by_two(monkeypatch, tmp_path):
+    """What this process finds alone while another one starts, which imports everything anew, and what both find."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
@@ -80,19 +80,20 @@ def worked_by_two(monkeypatch, tmp_path):
     command = [sys.executable, "-c", WORK, str(tmp_path / "none.pt")]
     second = {**os.environ, **shared, "RANK": "1", "LOCAL_RANK": "1"}
     with monkeypatch.context() as first, subprocess.Popen(command, cwd=ROOT, env=second) as other:
+        one = worked(monkeypatch, tmp_path / "1.pt")
         for name, value in {**shared, "RANK": "0", "LOCAL_RANK": "0"}.items():
             first.setenv(name, value)
-        found = worked(first, tmp_path / "2.pt")
+        two = worked(first, tmp_path / "2.pt")
         assert other.wait(timeout=300) == 0
     assert not (tmp_path / "none.pt").exists()
-    return found
+    return one, two
 
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this PyTorch has no torch.distributed")
 def test_two_processes_find_what_one_finds(tmp_path, monkeypatch):
     # fails if a process's share is left out or counted twice (prior included), or processes take different decisions;
     # or if a process ends while threads of gloo still run: once, on a loaded machine, one aborted
-    one, two = worked(monkeypatch, tmp_path / "1.pt"), worked_by_two(monkeypatch, tmp_path)
+    one, two = by_one_and_by_two(monkeypatch, tmp_path)
     assert one.keys() == two.keys()
     assert len(one) == 8
     for name, value in one.items():

@@ -182,15 +182,12 @@ def test_figures_of_a_driven_run(exact_run, tmp_path, capsys):
     assert drawn == {"trajectory.png", "phase_portrait.png", "learned.png", "training.png", "plan.png"}
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"level": "linear"}, "holds inputs u, which the level 'linear' cannot take; set level='forced'"),
-        ({"input_map": (1.0, 2.0)}, "input_map needs n · m = 1 · 1 numbers, row by row; got 2"),
-        ({"input_map": (1.0,), "use_inputs": False}, "leave one of them out"),
-        ({"input_map": (1.0,), "level": "affine"}, "are forces; set level='forced'"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"level": "linear"}, "holds inputs u, which the level 'linear' cannot take; set level='forced'"),
+    ({"input_map": (1.0, 2.0)}, "input_map needs n · m = 1 · 1 numbers, row by row; got 2"),
+    ({"input_map": (1.0,), "use_inputs": False}, "leave one of them out"),
+    ({"input_map": (1.0,), "level": "affine"}, "are forces; set level='forced'"),
+])  # fmt: skip
 def test_combinations_that_do_not_fit_are_named(settings, message):
     # fails if inputs are dropped without a word, or a wrong map is found only inside the fit
     with pytest.raises(InputError, match=message):

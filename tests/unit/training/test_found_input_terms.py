@@ -97,22 +97,39 @@ def searched(data):
     return search, first
 
 
-@pytest.mark.parametrize(
-    ("kind", "level", "force", "noise"),
-    [("sat", 0.6, lambda u: 3 * np.clip(u, -0.6, 0.6), 2e-4), ("tanh", 0.3, lambda u: 3 * np.tanh(u / 0.3), 1e-3)],
-)
-def test_the_level_at_which_an_input_saturates_is_found(kind, level, force, noise):
-    # fails if saturations are not offered, a level stays where accelerations put it, or one kind of saturation stands
-    # beside the input for the other kind
-    search, first = searched(driven(lambda u, _: force(u), sway, samples=150, noise=noise))
-    offered = {of[0]: of for term in offered_terms(search.data)[3:] if (of := saturation(term))}
-    assert set(offered) == {"sat", "tanh"}
-    assert offered[kind][1:] == (pytest.approx(level, rel=0.15), "u")
+SATURATES = lambda u: 3 * np.clip(u, -0.6, 0.6)  # noqa: E731
+LEVELS = 3 * np.random.default_rng(2).standard_normal(60)
+SATURATING = {
+    "sat": lambda: driven(lambda u, _: SATURATES(u), sway, samples=150),
+    "tanh": lambda: replace(
+        driven(lambda u, _: 300 * np.tanh(u / 2.5), lambda s: LEVELS[int(s / 0.4 + 1e-6)], samples=200, noise=0.05),
+        hold="zero",
+    ),
+}
+
+
+@pytest.mark.parametrize(("kind", "level", "off"), [("sat", 0.6, 0.01), ("tanh", 2.5, 2e-3)])
+def test_the_level_at_which_an_input_saturates_is_found(kind, level, off):
+    # fails if a level stays where accelerations put it, one kind of saturation stands for the other, or the input stays
+    # beside its saturation, where the input made up for a level that was wrong by 0.5 %
+    search, first = searched(SATURATING[kind]())
     (term,) = asked_terms(search, first)
-    assert saturation(term) == (kind, pytest.approx(level, rel=0.01), "u")
+    assert saturation(term) == (kind, pytest.approx(level, rel=off), "u")
     model = search.driven_by([term]).run()
     assert model is not None
     assert model.taken == {"q1^2", f"{INPUTS}[1]"}
+
+
+def test_levels_of_both_saturations_are_offered():
+    # fails if a saturation is no offer, or its level is not that of the accelerations
+    for kind, force, level, noise in (
+        ("sat", SATURATES, 0.6, 2e-4),
+        ("tanh", lambda u: 3 * np.tanh(u / 0.3), 0.3, 1e-3),
+    ):
+        data = driven(lambda u, _, of=force: of(u), sway, samples=150, noise=noise)
+        offered = {of[0]: of for term in offered_terms(data)[3:] if (of := saturation(term))}
+        assert set(offered) == {"sat", "tanh"}
+        assert offered[kind][1:] == (pytest.approx(level, rel=0.15), "u")
 
 
 def test_the_best_level_is_found_far_from_the_first_guess():
@@ -121,19 +138,6 @@ def test_the_best_level_is_found_far_from_the_first_guess():
     broken = lambda x: asked.append(x) or (1e3 if x > 3.2 else 1 + (x - 3) ** 2)  # noqa: E731
     assert _least(broken, 0.0, 0.4) == pytest.approx(3, abs=5e-3)
     assert len(asked) < 40
-
-
-def test_an_input_that_saturates_acts_by_nothing_else():
-    # fails if the input stays beside its saturation, where the input made up for a level that was wrong by 0.5 %
-    levels = 3 * np.random.default_rng(2).standard_normal(60)
-    u = lambda s: levels[int(s / 0.4 + 1e-6)]  # noqa: E731
-    data = driven(lambda u, _: 300 * np.tanh(u / 2.5), u, samples=200, noise=0.05)
-    search, first = searched(replace(data, hold="zero"))
-    (term,) = asked_terms(search, first)
-    assert saturation(term) == ("tanh", pytest.approx(2.5, rel=2e-3), "u")
-    model = search.driven_by([term]).run()
-    assert model is not None
-    assert model.taken == {"q1^2", f"{INPUTS}[1]"}
 
 
 def test_an_accelerated_pivot_is_found():

@@ -55,9 +55,16 @@ def ended(search):
     return with_functions(search, named)
 
 
+def search_of(data):
+    """A search by the rule of order 2, as of noisier data: kernels of order 4 take four times as long."""
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search.order = 2
+    return search
+
+
 def near(data):
     """A search whose named terms end near the data, and that model."""
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     named = search.run()
     assert named is not None
     assert named.near
@@ -78,7 +85,7 @@ def in_the_well():
 def searched():
     """A search over motion in the well, which is damped by position, and the model that it ends in."""
     data = recorded(lambda q, v: -well(q) - (0.05 + 0.3 * np.exp(-4 * q * q)) * v, STARTS, angle=False)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     return search, ended(search)
 
 
@@ -138,8 +145,9 @@ def test_waves_of_a_part_are_those_of_all(in_the_well, monkeypatch):
     monkeypatch.setattr("herglotz.training.search.bands", lambda data, base: asked.append(data) or bands(data, base))
     monkeypatch.setattr("herglotz.training.search.SAMPLES_OF_A_PART", 170)
     data = in_the_well
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    named = search.part.run()
+    search = search_of(data)
+    plain = search.part.fitter(Variant(2))
+    named = plain.fit({"q1^2", "q1^4"}, {}, plain.lengths[0], None)
     assert named is not None
     monkeypatch.setattr("herglotz.training.trials.Trial.at_the_noise", False)
     # Functions are made, and none is better.
@@ -207,7 +215,7 @@ def test_a_mass_that_turns_is_learned():
         return (0.2 * np.sin(q) * v * v - 1.2 * np.sin(q) - 0.1 * v) / (1 + 0.4 * np.cos(q))
 
     data = recorded(acceleration, [(2.5, 0.0), (-1.5, 1.0), (0.3, 2.2)], angle=True, steps=120)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     found = ended(search)
     assert found.at_the_noise
     assert "mass(q1) 1" in found.taken
@@ -224,7 +232,7 @@ def without_named_terms(search):
 def test_a_damper_that_no_dictionary_holds_is_learned_as_friction_by_speed():
     # fails if no function of the speed is offered, its waves are those of another speed, or its sign is wrong
     data = recorded(lambda q, v: -q - 0.5 * q**3 - 0.1 * v - 0.2 * np.sin(5 * v), STARTS, angle=False)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     found = without_named_terms(search)
     assert found.at_the_noise
     assert any(name.startswith("friction(v1)") for name in found.taken)
@@ -246,7 +254,7 @@ def plane(angles=(False, False), units=("m", "m")):
 def test_springs_and_tilts_stay_beside_functions():
     # fails if they may leave: nothing holds a motion beyond what was recorded then, where waves are 0
     data = plane()
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     fitter = search.fitter(Variant(2, functions=tuple(bands(data, search.base))))
     springs = {f"potential.{kind}[{i}]" for kind in ("stiffness", "tilt") for i in (0, 1)}
     assert springs <= set(fitter.always)
@@ -337,7 +345,7 @@ def test_a_potential_of_both_coordinates_is_learned(monkeypatch):
     q = torch.tensor(np.array(out)).permute(2, 0, 1).reshape(-1, 2)
     q = q + NOISE * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
     data = Trajectories.of(t.repeat(4), q, (161,) * 4)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     found = without_named_terms(search)
     assert "V(q1, q2) 1" in found.taken
     assert found.whole
@@ -357,7 +365,7 @@ def test_functions_join_a_model_that_is_near_the_data(monkeypatch):
     assert found.fitter.variant.kept == named.taken
     # of powers those stay that are kept
     data = recorded(lambda q, v: -q - 2 * q**3 - 0.1 * v, STARTS, angle=False)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     kept = search.fitter(Variant(2, functions=tuple(bands(data, search.base)), kept=frozenset({"q1^4"})))
     assert "q1^4" in {offer.name for offer in kept.offers}
     assert "q1^3" not in {offer.name for offer in kept.offers}
@@ -373,8 +381,7 @@ def test_functions_join_all_at_once_where_none_does_alone(monkeypatch):
         forces = -slope * v * v - length * np.sin(q) + slope * np.cos(q) - 0.063 * v  # ℓ + ℓ″ = 1
         return forces / (length**2 + slope**2)
 
-    data = recorded(acceleration, [(1.9, 0.3)], angle=True, parts=8, h=0.14, noise=0.0)
-    search, named = near(data)
+    search, named = near(recorded(acceleration, [(1.9, 0.3)], angle=True, parts=8, h=0.14, noise=0.0, steps=120))
     found = with_functions(search, named)
     assert found.at_the_noise
     assert "mass(q1) 1" in found.taken
@@ -386,7 +393,7 @@ def test_all_functions_compete_where_none_joins(in_the_well, monkeypatch):
     monkeypatch.setattr("herglotz.training.function_search._joined", lambda *_: None)
     monkeypatch.setattr("herglotz.training.function_search._anew", lambda _: None)
     data = in_the_well
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     found = ended(search)
     every = search.flexible
     assert every is not None
@@ -401,7 +408,7 @@ def test_all_functions_do_not_compete_where_they_are_no_better_over_the_shortest
     make = np.random.default_rng(0)
     kicked = lambda q, v: -q - 0.1 * v + make.standard_normal(q.shape)  # noqa: E731
     data = recorded(kicked, STARTS[:3], angle=False, parts=1, noise=0.0, steps=120)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     assert search.flexible is None
     of = next(variant for variant in search.fitters if variant.functions)
     assert list(search.fitters[of].problems) == [search.fitters[of].lengths[0]]
@@ -414,9 +421,8 @@ def test_masses_join_the_functions_that_are_fitted_all_at_once():
         slope, bend = np.sin(q) + 0.5 * np.sin(2 * q), np.cos(q) + np.cos(2 * q)
         return (-slope * bend * v * v - 0.6 * np.sin(q) - 0.05 * v) / (0.5 + slope**2)
 
-    data = recorded(acceleration, STARTS[:3], angle=True, parts=8, h=0.1, noise=0.0, steps=110)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
-    every = search.flexible
+    data = recorded(acceleration, STARTS[:3], angle=True, parts=8, h=0.1, noise=0.0, steps=60)
+    every = search_of(data).flexible
     assert every is not None
     assert every.at_the_noise
     assert {"mass(q1) 1", "mass(q1) 2"} <= every.taken
@@ -433,8 +439,8 @@ def test_functions_are_compared_at_their_likeliest_variances():
         return (-slope * bend * v * v - (1 + 0.4 * (0.5 * c + rod)) * slope - 0.1 * v) / (0.6 + slope**2)
 
     starts = [(2.6, 0.5), (-1.5, 1.0), (1.2, -1.2)]
-    data = recorded(acceleration, starts, angle=True, parts=8, steps=280, noise=2e-3)
-    found = ended(Search(data, estimate_baseline(data), FitConfig().resolved(data)))
+    data = recorded(acceleration, starts, angle=True, parts=8, steps=240)
+    found = ended(search_of(data))
     assert "mass(q1) 1" in found.taken
     assert found.lacks_nothing
 
@@ -444,7 +450,7 @@ def test_a_model_about_the_noise_lacks_something_while_its_errors_go_on():
     # potential is met to 1.2 times the noise by harmonics, and errors go on from sample to sample
     bump = lambda q: 0.12 * (q - 0.5) / 0.04 * np.exp(-(((q - 0.5) / 0.2) ** 2) / 2)  # noqa: E731
     data = recorded(lambda q, v: -np.sin(q) + bump(q) - 0.1 * v, STARTS, angle=True, parts=8, noise=2e-2)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     named = search.run()
     assert named is not None
     assert named.at_the_noise
@@ -471,8 +477,8 @@ def test_the_mass_of_a_length_bends_as_sharply_as_that_of_an_angle():
         slope, bend = x - x / 0.16 * bump, 1 + (x * x / 0.16**2 - 1 / 0.16) * bump
         return (-slope * bend * v * v - slope - 0.1 * v) / (1 + slope**2)
 
-    data = recorded(acceleration, STARTS[:3], angle=False, parts=8, noise=0.0, steps=120)
-    every = Search(data, estimate_baseline(data), FitConfig().resolved(data)).flexible
+    data = recorded(acceleration, STARTS[:3], angle=False, parts=8, noise=0.0, steps=100)
+    every = search_of(data).flexible
     assert every is not None
     assert every.whole
     assert every.rms < 1e-6
@@ -481,7 +487,7 @@ def test_the_mass_of_a_length_bends_as_sharply_as_that_of_an_angle():
 def test_no_functions_where_named_terms_are_at_the_noise(monkeypatch):
     # fails if functions are tried for every recording: they would take the place of the law
     data = recorded(lambda q, v: -np.sin(q) - 0.1 * v, [(2.0, 0.0), (0.5, 1.0)], angle=True)
-    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    search = search_of(data)
     found = search.run()
     assert found is not None
     assert found.taken == {"cos(q1)"}

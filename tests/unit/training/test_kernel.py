@@ -25,6 +25,7 @@ SPRING = replace(PENDULUM, angles=(False,), features=("q1^2", "q1^3", "|q1| q1")
 JOINTS = ModelConfig(angles=(True, True), level="forced", scale=(1.0, 1.0), speed=(1.0, 1.5), stiffness=(3.0, 2.0),
                      tilt=(0.1, 0.0), potential_width=0, damping_width=0, coupled=True, coulomb=True,
                      features=("cos(q1 - q2) v1 v2", "sin(q2) v1 v1"))  # fmt: skip
+LENGTHS = replace(JOINTS, angles=(False, False), coupled=False, diagonal=True)
 NETWORK = ModelConfig(angles=(True,), scale=(0.7,), speed=(1.7,), stiffness=(2.0,), tilt=(0.1,), potential_width=4)
 
 
@@ -47,21 +48,9 @@ MODELS = {
     "joints without a number": replace(JOINTS, absent=("friction.viscous[0]", "coupling.viscous")),
     "joints apart": replace(JOINTS, coupled=False, diagonal=True, features=("cos(q1 - q2) v1 v2",)),
     "a slide and a joint": replace(JOINTS, angles=(False, True), features=("cos(q2) v1 v2", "q1^3"), drag=("q1 v1",)),
-    "lengths": replace(
-        JOINTS,
-        angles=(False, False),
-        features=("(q1 - q2)^2", "r^-1"),
-        coupled=False,
-        diagonal=True,
-        drag=("(v1 - v2)", "|v| v"),
-    ),
+    "lengths": replace(LENGTHS, features=("(q1 - q2)^2", "r^-1"), drag=("(v1 - v2)", "|v| v")),
     "lengths in proportion": replace(
-        JOINTS,
-        angles=(False, False),
-        features=("(2.5 q1 - q2)^2", "(2.5 q1 + q2)^3", "q1^3"),
-        coupled=False,
-        diagonal=True,
-        drag=("(2.5 v1 - v2)", "|v1| v1"),
+        LENGTHS, features=("(2.5 q1 - q2)^2", "(2.5 q1 + q2)^3", "q1^3"), drag=("(2.5 v1 - v2)", "|v1| v1")
     ),
     "joints with a geared damper": replace(JOINTS, drag=("(2.5 v1 - v2)",)),
     "own structure": replace(PENDULUM, alike=False, stiffness=(1.0,)),

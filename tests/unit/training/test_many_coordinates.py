@@ -34,7 +34,7 @@ def test_stages_of_many_coordinates_end_early(monkeypatch, n, grown, compared):
     assert len(ends) > last + 1
 
 
-@pytest.mark.parametrize(("n", "samples", "told_apart"), [(4, 31, True), (5, 31, False), (5, 200, True)])
+@pytest.mark.parametrize(("n", "samples", "told_apart"), [(4, 31, True), (5, 31, False), (5, 120, True)])
 def test_strengths_that_held_out_blocks_cannot_tell_apart_are_not_fitted(n, samples, told_apart):
     # fails if every strength is fitted where blocks are missed by more than the motion's spread (twenty coordinates:
     # 80 s for 50), if the choice is left out where samples suffice, or for few coordinates

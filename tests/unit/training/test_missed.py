@@ -75,23 +75,16 @@ def test_what_a_residual_shows(what):
         assert ("Try " in (found or "")) is bool(said)
 
 
-@pytest.mark.parametrize(
-    ("driven", "level", "columns", "ways"),
-    [
-        (False, "forced", (), "--level full, whose action remembers, or a record of what else acts (--inputs)"),
-        (False, "full", (), "a record of what else acts (--inputs)"),
-        (True, "forced", (), "a record of what else acts (--inputs)"),
-        (True, "forced", (("wind", "left aside", "m/s"),), "--inputs volt,wind, which takes wind, left aside so far"),
-        (
-            False,
-            "forced",
-            (("wind", "left aside", "m/s"),),
-            "--inputs wind, which takes wind, left aside so far, or --level full, whose action remembers",
-        ),
-        (True, "forced", (("x_ref", "left aside", "mm"),), "a record of what else acts (--inputs)"),
-        (True, "forced", (("speed", "left aside", "m/s"), ("dx", "left aside", "m/s")), "a record of what else acts"),
-    ],
-)
+@pytest.mark.parametrize(("driven", "level", "columns", "ways"), [
+    (False, "forced", (), "--level full, whose action remembers, or a record of what else acts (--inputs)"),
+    (False, "full", (), "a record of what else acts (--inputs)"),
+    (True, "forced", (), "a record of what else acts (--inputs)"),
+    (True, "forced", (("wind", "left aside", "m/s"),), "--inputs volt,wind, which takes wind, left aside so far"),
+    (False, "forced", (("wind", "left aside", "m/s"),),
+     "--inputs wind, which takes wind, left aside so far, or --level full, whose action remembers"),
+    (True, "forced", (("x_ref", "left aside", "mm"),), "a record of what else acts (--inputs)"),
+    (True, "forced", (("speed", "left aside", "m/s"), ("dx", "left aside", "m/s")), "a record of what else acts"),
+])  # fmt: skip
 def test_a_remedy_would_run(driven, level, columns, ways):
     # fails if the level full is offered where it takes no inputs, or was tried; or if a column that its unit alone left
     # aside is not named, or one is that the user dropped or that is a rate of the motion
@@ -272,18 +265,10 @@ def test_neighbours_that_are_far_tell_nothing():
     assert reason_of(Trajectories.of(T, q), left(0.3 * Q).expand(N, 8), OWNER) == ""
 
 
-@pytest.mark.parametrize(
-    ("rows", "told"),
-    [
-        ([2, 3, 3], True),
-        ([1, 2], True),
-        ([3], False),
-        ([40, 55, 70], False),
-        ([40, 55], False),
-        ([1], False),
-        ([2] * 40 + [3], False),
-    ],
-)
+@pytest.mark.parametrize(("rows", "told"), [
+    ([2, 3, 3], True), ([1, 2], True), ([3], False), ([40, 55, 70], False), ([40, 55], False), ([1], False),
+    ([2] * 40 + [3], False),
+])  # fmt: skip
 def test_inputs_that_were_filled_in(rows, told):
     # fails if a controller that runs at a third of the rate is told of, set points that come at any time are, or a
     # clock of its own is not
@@ -349,15 +334,11 @@ def transients(force, starts=6, rows=200, h=0.15):
     return data, torch.cat(left_over)[:, None], torch.arange(rows * starts) // 20
 
 
-@pytest.mark.parametrize(
-    ("force", "said"),
-    [
-        (lambda _, v, w: -2.0 * v * w**2, "the force depends on the past"),
-        (lambda q, _, __: -0.3 * q**3, ""),
-        (lambda _, v, __: -0.3 * abs(v) * v, ""),
-    ],
-    ids=["damping by a hidden state", "a spring that hardens", "drag"],
-)
+@pytest.mark.parametrize(("force", "said"), [
+    (lambda _, v, w: -2.0 * v * w**2, "the force depends on the past"),
+    (lambda q, _, __: -0.3 * q**3, ""),
+    (lambda _, v, __: -0.3 * abs(v) * v, ""),
+], ids=["damping by a hidden state", "a spring that hardens", "drag"])  # fmt: skip
 def test_motions_that_decay_show_the_past(force, said):
     # fails if only neighbours of other times count, which motions that decay do not have; or if the largest
     # accelerations of such motions, all at their start, are kicks; or if the past stands for a force of the state

@@ -55,18 +55,11 @@ def test_the_drawing_in_the_docs_is_the_code():
     assert drawing() in DOCS.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("noise", "settings", "number", "objective"),
-    [
-        (0.0, {}, 3, "trajectory"),
-        (0.0, {"level": "linear"}, 6, "residual"),
-        (0.01, {}, 3, "trajectory"),
-        (0.0, {"sticking": True}, 2, "trajectory"),
-        (0.01, {"objective": "smoothing"}, 1, "smoothing"),
-        (0.0, {"mass_width": 3}, 8, "trajectory"),
-        (0.0, {"supervision": "qs"}, 0, "residual"),
-    ],
-)
+@pytest.mark.parametrize(("noise", "settings", "number", "objective"), [
+    (0.0, {}, 3, "trajectory"), (0.0, {"level": "linear"}, 6, "residual"), (0.01, {}, 3, "trajectory"),
+    (0.0, {"sticking": True}, 2, "trajectory"), (0.01, {"objective": "smoothing"}, 1, "smoothing"),
+    (0.0, {"mass_width": 3}, 8, "trajectory"), (0.0, {"supervision": "qs"}, 0, "residual"),
+])  # fmt: skip
 def test_the_first_rule_that_is_answered_decides(noise, settings, number, objective):
     # fails if a rule is skipped, asked in another order, or gives another objective
     found, config = seen(noise, **settings)

@@ -165,8 +165,8 @@ def text_of(run):
 @pytest.mark.parametrize("name", MODELS)
 def test_the_printed_equation_is_the_model(name):
     # fails if a number of the model is not in the text, or not with its sign, factor or width, or rounded too coarsely
-    sticks = "sticks" in name
-    run = run_of(*MODELS[name], h=0.004 if sticks else H, count=1 if sticks else 2, steps=120 if sticks else 60)
+    sticks, one = "sticks" in name, name in ("a joint that sticks", "order 4")
+    run = run_of(*MODELS[name], h=0.004 if sticks else H, count=1 if one else 2, steps=120 if sticks else 60)
     missed, moved = compared(run, parts=1 if sticks else 2)
     assert "step it as" not in text_of(run)
     assert moved < TWICE * missed
@@ -371,7 +371,7 @@ def test_a_motion_that_is_not_solved_at_once_has_no_departure(monkeypatch):
 def test_the_numbers_of_an_equation_are_those_of_short_steps():
     # fails if the own numbers of the model are printed, a rule of order 2 with steps of 0.1 s: its stiffness, say,
     # is 8 deviations of 1600 samples too small; or if the notes do not say so
-    run = fit(simulate(scene("damped_pendulum"), trajectories=4, steps=400, h=0.1, noise=0.003, seed=0), progress=False)
+    run = fit(simulate(scene("damped_pendulum"), trajectories=4, steps=300, h=0.1, noise=0.003, seed=0), progress=False)
     found = {term.what: term for term in run.equation().terms}
     own = {term.what: term.value for term in equation_of(run).terms}
     for what, true in {"sin(theta)": -1.0, "theta′": -0.2}.items():

@@ -470,24 +470,21 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
         Stages(False, checkpoint, "other", resume=True)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"level": "cubic"}, "unknown level 'cubic'; choose one of auto, conservative, linear, affine"),
-        ({"objective": "best"}, "unknown objective 'best'"),
-        ({"optimiser": "sgd", "objective": "raw"}, "unknown optimiser 'sgd'"),
-        ({"dtype": "float16"}, "unknown dtype 'float16'; choose one of float64, float32"),
-        ({"train_fraction": 0.0}, r"train fraction must be in \(0, 1\], got 0"),
-        ({"optimiser": "adam"}, "adam fits the objectives residual and raw, not 'auto'"),
-        ({"substeps": 2}, "substeps need trajectory fitting, not the objective 'auto'"),
-        ({"substeps": 0}, "substeps must be >= 1, got 0"),
-        ({"batch": 8}, "batch applies only to adam and adamw"),
-        ({"batch": 0, "optimiser": "adam", "objective": "residual"}, "batch must be >= 1, got 0"),
-        ({"batch": 8, "optimiser": "adam", "objective": "residual", "level": "full"}, "carries s along whole"),
-        ({"device": "abacus"}, "unknown device 'abacus'; use cpu or cuda"),
-        ({"departures": ()}, "departures must be one or more positive numbers"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"level": "cubic"}, "unknown level 'cubic'; choose one of auto, conservative, linear, affine"),
+    ({"objective": "best"}, "unknown objective 'best'"),
+    ({"optimiser": "sgd", "objective": "raw"}, "unknown optimiser 'sgd'"),
+    ({"dtype": "float16"}, "unknown dtype 'float16'; choose one of float64, float32"),
+    ({"train_fraction": 0.0}, r"train fraction must be in \(0, 1\], got 0"),
+    ({"optimiser": "adam"}, "adam fits the objectives residual and raw, not 'auto'"),
+    ({"substeps": 2}, "substeps need trajectory fitting, not the objective 'auto'"),
+    ({"substeps": 0}, "substeps must be >= 1, got 0"),
+    ({"batch": 8}, "batch applies only to adam and adamw"),
+    ({"batch": 0, "optimiser": "adam", "objective": "residual"}, "batch must be >= 1, got 0"),
+    ({"batch": 8, "optimiser": "adam", "objective": "residual", "level": "full"}, "carries s along whole"),
+    ({"device": "abacus"}, "unknown device 'abacus'; use cpu or cuda"),
+    ({"departures": ()}, "departures must be one or more positive numbers"),
+])  # fmt: skip
 def test_wrong_settings_are_named(settings, message):
     # fails if a wrong setting is found only after an hour of training
     with pytest.raises(InputError, match=message):

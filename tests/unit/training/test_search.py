@@ -4,6 +4,7 @@ import math
 import os
 import sys
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast
@@ -47,6 +48,23 @@ def searched(data, **changes):
     return Search(data, estimate_baseline(data), config)
 
 
+@cache
+def oscillator(count=1):
+    return simulate(scene("damped_oscillator"), trajectories=count, steps=80, h=0.15, noise=0.01, seed=1)
+
+
+@cache
+def pendulum(count=1):
+    data = simulate(scene("damped_pendulum"), trajectories=count, steps=60, h=0.2, noise=0.01, seed=3)
+    return replace(data, p=None, s=None)
+
+
+def grown(search):
+    """The pendulum's law, fitted to whole trajectories."""
+    fitter = search.fitter(Variant(2))
+    return there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
+
+
 @pytest.fixture(scope="module")
 def duffing():
     """A search over 201 samples with noise, and the model that it ends in."""
@@ -67,7 +85,7 @@ def test_a_term_without_a_rule_of_order_4_keeps_order_2():
 def test_segments_of_exact_data_are_missed_by_the_rule_alone(noise):
     # fails if the search of exact data is given up over segments, where the rule of order 2 is all that is missed
     search = searched(simulate(scene("cart_pole"), trajectories=1, steps=100, h=0.02, noise=noise, seed=0))
-    missing = SimpleNamespace(fitter=there(search.begun).fitter, segments_at_the_noise=False)
+    missing = SimpleNamespace(fitter=search.fitter(Variant(search.order)), segments_at_the_noise=False)
     search.begun = cast(Any, missing)
     assert search.misses_segments == bool(noise)
 
@@ -108,7 +126,7 @@ def test_longer_steps_do_not_hide_in_the_parameters():
 def test_friction_that_holds_is_fitted_as_such():
     # fails if the variant with set-valued friction is the smooth model under another name: an axis without noise that
     # stands still at times is missed more than twice as far by smooth friction with the same offers
-    search = searched(simulate(scene("servo_axis"), trajectories=2, steps=60, h=0.05, seed=0))
+    search = searched(simulate(scene("servo_axis"), trajectories=1, steps=60, h=0.05, seed=0))
     found = there(search.run())
     assert found.fitter.model.capabilities.sticking
     assert "friction.log_smooth" not in found.values
@@ -155,7 +173,7 @@ def test_a_pendulum_on_a_spring_is_found_in_noise():
         return r * w**2 + 9.81 * a.cos() - 80.0 * (r - 0.4) - 0.1 * v, (-9.81 * a.sin() - 2 * v * w) / r
 
     starts = torch.tensor([[0.45, 0.9, 0.0, 0.0], [0.6, 0.5, 0.0, 0.0]], dtype=torch.float64)
-    found = there(searched(rolled(acceleration, starts, 200, 0.02, 5e-4)).run())
+    found = there(searched(rolled(acceleration, starts, 150, 0.02, 5e-4)).run())
     assert {"q1 cos(q2)", "q1^2 v2^2"} <= found.taken
     assert not any(" v" in name for name in found.taken - {"q1^2 v2^2"})
     assert found.at_the_noise
@@ -270,17 +288,10 @@ def test_a_start_without_a_path_is_none():
     assert fitter.fit(fitter.simple, {"potential.features.sum.coefficient[0]": 1e300}, 5, None) is None
 
 
-@pytest.mark.parametrize(
-    ("gains", "more", "time", "replaces"),
-    [
-        ((20.0,) * 10, 1, 1.0, True),
-        ((20.0,) * 10, 60, 1.0, False),
-        ((20.0,) * 10, 1, 80.0, False),
-        ((200.0, *[0.0] * 9), 1, 1.0, False),
-        ((3.1, -1.1) * 5, 1, 1.0, False),
-        ((0.3,) * 10, 1, 1.0, False),
-    ],
-)
+@pytest.mark.parametrize(("gains", "more", "time", "replaces"), [
+    ((20.0,) * 10, 1, 1.0, True), ((20.0,) * 10, 60, 1.0, False), ((20.0,) * 10, 1, 80.0, False),
+    ((200.0, *[0.0] * 9), 1, 1.0, False), ((3.1, -1.1) * 5, 1, 1.0, False), ((0.3,) * 10, 1, 1.0, False),
+])  # fmt: skip
 def test_a_richer_model_pays_for_its_numbers_and_their_chance(gains, more, time, replaces):
     # fails if a price is left out, if one block alone decides, if samples that repeat one another count as so many, or
     # if what blocks differ by is not added to the price
@@ -352,7 +363,7 @@ def test_zeros_are_numbers_that_come_together():
 
 def test_held_out_residuals_are_those_of_fits_without_the_blocks():
     # fails if a step of parameters or starts has the wrong sign or size. A linear system: to first order is exact
-    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    data = oscillator(2)
     search = searched(data)
     fitter = search.fitter(Variant(2))
     whole = fitter.grow(there(fitter.fit({"q1^2"}, {}, 5, None, 60)))
@@ -375,7 +386,7 @@ def test_held_out_residuals_are_those_of_fits_without_the_blocks():
 
 def test_residuals_of_a_smaller_set_are_those_of_its_fit():
     # fails if numbers that leave do not go, or those that stay and the starts do not follow. To first order is exact
-    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    data = oscillator(2)
     data = replace(data, q=data.q + 0.01)
     fitter = searched(data).fitter(Variant(2))
     assert "q1" in {offer.name for offer in fitter.offers}
@@ -431,7 +442,7 @@ def test_fits_start_where_the_linear_motion_sees_their_numbers(duffing):
 def test_a_segment_that_is_left_out_whole_is_told_by_its_own_samples():
     # fails if its start stays where all samples put it, if it still has a say of the numbers, or if numbers of a fit
     # with joints stay where these hold them: against least squares in all starts and numbers at once
-    data = simulate(scene("damped_oscillator"), trajectories=2, steps=80, h=0.15, noise=0.01, seed=1)
+    data = oscillator(2)
     fitter = searched(data).fitter(Variant(2))
     fit = there(fitter.fit({"q1^2"}, {}, 5, None, 60))
     problem, P, d = fit.problem, fit.problem.P, fit.problem.d
@@ -550,7 +561,7 @@ def test_an_excess_comes_and_goes_with_what_it_is_of():
     assert all(
         "dry" in own or "excess" not in own for own in moves(dry, excess, free).leaving(frozenset({"dry", "excess"}))
     )
-    fitter = searched(simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, seed=1)).fitter(Variant(2))
+    fitter = searched(oscillator()).fitter(Variant(2))
     assert {offer.on for offer in fitter.offers if offer.name == "friction.breakaway"} == {"friction.coulomb"}
 
 
@@ -558,8 +569,7 @@ def test_the_start_of_a_linear_problem_is_always_tried(monkeypatch):
     # fails if a climb that ends at the noise is believed: it may have taken other terms, and more, than the law has
     asked = []
     monkeypatch.setattr(Search, "linear_start", lambda _, fitter: asked.append(fitter))
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    assert there(searched(data).run()).at_the_noise
+    assert there(searched(oscillator()).run()).at_the_noise
     assert len(asked) == 1
 
 
@@ -575,8 +585,7 @@ def test_masses_start_from_velocities():
 
 def test_a_model_that_has_lost_its_friction_holds_no_joint():
     # fails if its settings ask for friction that holds without any, which no model can be made of
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    fitter = searched(data).fitter(Variant(2, sticking=True))
+    fitter = searched(oscillator()).fitter(Variant(2, sticking=True))
     of, base = settings(there(fitter.fit({"q1^2"}, {}, 5, None)), FitConfig())
     assert not of.sticking
     assert not build_model(base, of, "none").capabilities.sticking
@@ -698,6 +707,7 @@ def test_friction_that_pushes_does_not_join():
             v += 0.005 * (-4 * x + 0.3 * math.tanh(v / 0.05) - 0.2 * v)
             x += 0.005 * v
     search = searched(Trajectories.of(0.05 * torch.arange(300, dtype=torch.float64), torch.tensor(path).double()))
+    search.order = 2
     fitter = search.fitter(Variant(2))
     simple = there(fitter.fit(fitter.simple, {}, fitter.lengths[0], None))
     assert Moves(simple).joining(simple.taken)[0] - simple.taken == {"friction.coulomb"}
@@ -716,8 +726,7 @@ def test_friction_that_pushes_does_not_join():
 
 def test_a_block_that_is_lost_weighs_no_more_than_it_may():
     # fails if a number that is none, or one far away, makes a whole score infinite
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    search = searched(data)
+    search = searched(oscillator())
     fitter = search.fitter(Variant(2))
     found = there(fitter.fit({"q1^2"}, {}, 5, None))
     found.path.x[-1, -1, 0] = 1e12
@@ -727,10 +736,8 @@ def test_a_block_that_is_lost_weighs_no_more_than_it_may():
 @pytest.mark.parametrize(("zero", "deviation", "better"), [(0.2, 1e-6, None), (0.001, 0.01, True)])
 def test_zeros_are_clearly_there_and_make_the_fit_better(zero, deviation, better, monkeypatch):
     # fails if zeros with which the fit misses more are taken, or those within their deviations
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
-    search = searched(replace(data, p=None, s=None), find_zeros=True)
-    fitter = search.fitter(Variant(2))
-    best = there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
+    search = searched(pendulum(2), find_zeros=True)
+    best = grown(search)
     found = torch.tensor([[0.0], [zero]], dtype=torch.float64), torch.tensor([[0.0], [deviation]], dtype=torch.float64)
     monkeypatch.setattr(search, "zeros", lambda *_: found)
     if better is not None:
@@ -740,13 +747,12 @@ def test_zeros_are_clearly_there_and_make_the_fit_better(zero, deviation, better
 
 def test_zeros_are_those_of_the_model_that_is_found():
     # fails if zeros stay what another model, which had terms that made up for them, asked for
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
+    data = pendulum(2)
     second = (data.trajectory == 1).double()[:, None]
-    search = searched(replace(data, q=data.q + 0.1 * second, p=None, s=None), find_zeros=True)
+    search = searched(replace(data, q=data.q + 0.1 * second), find_zeros=True)
     wrong = torch.tensor([[0.0], [0.07]], dtype=torch.float64)
     read = search.of(measured(search.data, wrong.flatten().tolist()))
-    fitter = read.fitter(Variant(2))
-    best = there(fitter.grow(there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))))
+    best = grown(read)
     _, found, zeros = search.zeros_again(read, best, (wrong, torch.zeros_like(wrong)))
     assert there(found).rms < 0.9 * best.rms
     assert there(zeros)[0].flatten().tolist() == pytest.approx([0.0, 0.1], abs=0.01)
@@ -754,7 +760,7 @@ def test_zeros_are_those_of_the_model_that_is_found():
 
 def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
     # fails if blocks that are left out to first order decide of very many numbers, or residuals of a few
-    search = searched(simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3))
+    search = searched(pendulum())
     other = SimpleNamespace(fits_better=lambda _: True, replaces=lambda _: False)
     monkeypatch.setattr(search, "of", lambda _: SimpleNamespace(again=lambda _: other))
     trial = cast(Any, SimpleNamespace(lacks_nothing=False))
@@ -765,7 +771,7 @@ def test_the_whole_dictionary_is_asked_for_a_hold_by_its_residuals(monkeypatch):
 @pytest.mark.parametrize(("white", "hold"), [(False, "first"), (True, "")])
 def test_a_hold_is_asked_for_until_residuals_are_white(white, hold, monkeypatch):
     # fails if a model that terms brought to the noise, beside a wrong hold, is asked for no other hold
-    search = searched(simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3))
+    search = searched(pendulum())
     other = SimpleNamespace(replaces=lambda _: True)
     monkeypatch.setattr(search, "of", lambda _: SimpleNamespace(again=lambda _: other))
     trial = cast(Any, SimpleNamespace(at_the_noise=True, lacks_nothing=white))
@@ -775,7 +781,7 @@ def test_a_hold_is_asked_for_until_residuals_are_white(white, hold, monkeypatch)
 @pytest.mark.parametrize("lost", [True, False])
 def test_a_model_that_other_inputs_lose_is_grown_anew(lost, monkeypatch):
     # fails if a chaotic motion, which no fit of whole trajectories follows with another hold, speaks for the old hold
-    data = simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, noise=0.01, seed=3)
+    data = pendulum()
     search, whole, short, grown = searched(data), SimpleNamespace(rms=3.0 if lost else 1.0), object(), object()
     found = cast(Any, SimpleNamespace(
         fitter=SimpleNamespace(data=replace(data), variant=Variant(2)), taken=(), values={}, length=60,
@@ -801,8 +807,7 @@ def test_a_child_has_threads_of_its_own():
 
 def test_a_missing_position_has_no_share_in_the_score_of_a_fit():
     # fails if what stands for a blank cell counts where zeros of sensors, or another hold, are asked for
-    data = simulate(scene("damped_oscillator"), trajectories=1, steps=80, h=0.15, noise=0.01, seed=1)
-    found = there(searched(data).fitter(Variant(2)).fit({"q1^2"}, {}, 5, None))
+    found = there(searched(oscillator()).fitter(Variant(2)).fit({"q1^2"}, {}, 5, None))
     problem, path = found.problem, found.path
     q, observed = problem.data.q.clone(), torch.ones_like(problem.data.q)
     q[40], observed[40] = 1e3, 0.0
@@ -817,15 +822,15 @@ def test_a_search_of_many_samples_is_made_of_some(monkeypatch):
     # fails if every trial of a long recording is fitted to all of it, or the model to a part alone
     import herglotz.training.search as module
 
-    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
-    data, seen = simulate(scene("duffing"), trajectories=1, steps=600, h=0.05, noise=NOISE, seed=0), []
+    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 150)
+    data, seen = simulate(scene("duffing"), trajectories=1, steps=400, h=0.05, noise=NOISE, seed=0), []
     fit = module.Fitter.fit
     monkeypatch.setattr(
         module.Fitter, "fit", lambda self, *a, **k: seen.append(self.data.samples) or fit(self, *a, **k)
     )
     search = searched(data)
     found = there(search.of_part(search.part.run(), None)[1])
-    assert found.problem.data.samples == 601
+    assert found.problem.data.samples == 401
     assert found.taken == {"q1^2", "q1^4"}
     assert sum(count < 400 for count in seen) > sum(count > 400 for count in seen)
 
@@ -835,13 +840,14 @@ def test_zeros_of_a_part_are_where_those_of_all_data_begin(monkeypatch):
     # of some recordings stand for those of all; or if the zeros of the part are the last word
     import herglotz.training.search as module
 
-    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 200)
-    data = simulate(scene("duffing"), trajectories=2, steps=300, h=0.05, noise=NOISE, seed=0)
+    monkeypatch.setattr(module, "SAMPLES_OF_A_PART", 150)
+    data = simulate(scene("duffing"), trajectories=2, steps=220, h=0.05, noise=NOISE, seed=0)
     shift = torch.tensor([0.0, 0.5], dtype=torch.float64)
     data = replace(data, q=data.q + shift[data.trajectory][:, None], p=None, s=None)
     search, firsts, again = searched(data), [], module.Search.again
     differ = 0.8 * shift[:, None], torch.full((2, 1), 0.01, dtype=torch.float64)
-    found = there(search.part.of(module.measured(search.part.data, shift.tolist())).run())
+    fitter = search.part.of(module.measured(search.part.data, shift.tolist())).fitter(Variant(2))
+    found = fitter.grow(there(fitter.fit({"q1^2", "q1^4"}, {}, fitter.lengths[0], None)))
 
     def watched(self, trial):
         firsts.append(float(self.data.q.mean() - data.q.mean()))
@@ -866,11 +872,8 @@ def test_a_search_gives_the_same_twice():
 
 def test_zeros_that_say_nothing_are_not_taken_off():
     # fails if zeros are taken off that the score does not ask for, unless a part of the recordings has them
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
-    search = searched(replace(data, p=None, s=None), find_zeros=True)
-    fitter = search.fitter(Variant(2))
-    best = there(fitter.fit({"cos(q1)"}, {}, 20, None, 60))
-    best = there(fitter.grow(best))
+    search = searched(pendulum(2), find_zeros=True)
+    best = grown(search)
     assert search.with_zeros(best) == (search, best, None)
     read, other, zeros = search.with_zeros(best, accepted=True)
     assert there(zeros)[0].abs().max() > 0
@@ -930,12 +933,12 @@ def test_a_weight_on_a_torsion_spring_is_found():
     # θ″ = −7 θ − 12 sin θ − 0.15 θ′: fails if a weight is no offer on a line, or joins a model that powers complete
     # already: θ, θ³ and θ⁵ were found in its place
     rows, x = [], np.array([2.6, 0.0])
-    for _ in range(400):
+    for _ in range(300):
         rows.append(x[0])
         for _ in range(4):
             x = runge_kutta.step(lambda x: np.array([x[1], -7 * x[0] - 12 * np.sin(x[0]) - 0.15 * x[1]]), x, 0.025 / 4)
-    q = np.array(rows) + 0.004 * np.random.default_rng(0).standard_normal(400)
-    run = fit(Trajectories.of(0.025 * np.arange(400), q, names=("a",), units=("rad",), angles=(True,)), progress=False)
+    q = np.array(rows) + 0.004 * np.random.default_rng(0).standard_normal(300)
+    run = fit(Trajectories.of(0.025 * np.arange(300), q, names=("a",), units=("rad",), angles=(True,)), progress=False)
     terms = {term.what: (term.value, term.deviation) for term in run.equation().terms}
     assert set(terms) == {"a′", "a", "sin(a)"}
     for what, true in {"a′": -0.15, "a": -7.0, "sin(a)": -12.0}.items():

@@ -105,14 +105,11 @@ def test_forces_that_are_told_or_recorded_leave_the_forced_level():
     assert "linear" in levels_for(driven, FitConfig(use_inputs=False))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"levels": ("linear", "cubic")}, "cubic"),
-        ({"seeds": 0}, "seeds must be >= 1"),
-        ({"config": FitConfig(train_fraction=1.0)}, "holds nothing out"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"levels": ("linear", "cubic")}, "cubic"),
+    ({"seeds": 0}, "seeds must be >= 1"),
+    ({"config": FitConfig(train_fraction=1.0)}, "holds nothing out"),
+])  # fmt: skip
 def test_settings_are_checked(change, message):
     # fails if a wrong setting is found only after hours of fitting
     data = simulate(scene("damped_pendulum"), trajectories=1, steps=30, h=0.2, seed=0)

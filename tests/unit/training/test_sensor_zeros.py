@@ -15,14 +15,13 @@ from herglotz.data import Trajectories
 from herglotz.data.sensors import measured, since_start
 from herglotz.training import FitConfig, Plan, fit
 from herglotz.training.arrowhead import Arrowhead
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.first_states import first_states, states_of_pairs
-from herglotz.training.look import look
 from herglotz.training.predict import predict
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
 from herglotz.training.sensor_zeros import CENTRE, drifts, in_words, means, zeros_of_one
-from herglotz.training.stages import Stages
 from herglotz.training.structure import kept_structure
 from herglotz.training.task import build_model
 
@@ -54,26 +53,18 @@ def pendulums(planted=PLANTED, seed=2, recordings=2):
     )
 
 
-def silent():
-    return Stages(False, None, "", resume=False)
-
-
 @cache
 def run():
     return fit(pendulums(), find_zeros=True)
 
 
-@cache
-def seen():
-    return look(pendulums(), FitConfig(find_zeros=False), silent())
-
-
 @pytest.mark.parametrize("drifting", [False, True])
 def test_the_normal_equations_of_zeros_are_the_derivatives_of_the_cost(drifting):
-    of = seen()
-    data = of.kept
-    model = build_model(of.base, of.settings, "none")
-    problem = ShootingProblem(model, data, segment_grid(data, 20, of.base.model_step), sigma=NOISE)
+    data = pendulums()
+    start = {"potential.features.sum.coefficient": (-8.9,)}
+    base = replace(estimate_baseline(data), stiffness=(0.0,), tilt=(0.0,), rate=0.17, start=start)
+    model = build_model(base, FitConfig(level="linear", features=("cos(q1)",), alike=True), "none")
+    problem = ShootingProblem(model, data, segment_grid(data, 20, base.model_step), sigma=NOISE)
     problem.guess_from_states(states_of_pairs(model, data))
     theta = problem.parameters.get()
     target = WithZeros(problem, shared=True, grow=since_start(data) / 3) if drifting else WithZeros(problem)
@@ -118,15 +109,12 @@ def test_zeros_of_angles_have_no_turns():
     assert fit(data).metrics["plan"]["zeros"] == pytest.approx(planted, abs=4 * NOISE)
 
 
-@pytest.mark.parametrize(
-    ("reference", "other", "words"),
-    [
-        ((0.1, 0.1), 3.0, "zeros: "),
-        ((0.1, 0.1), 1.2, CENTRE),
-        ((0.1, 0.0), 1.0, "zeros that differ, of some coordinates, from those of recording 0: "),
-        ((0.0, 0.0), 1.0, "zeros that differ from those of recording 0: "),
-    ],
-)
+@pytest.mark.parametrize(("reference", "other", "words"), [
+    ((0.1, 0.1), 3.0, "zeros: "),
+    ((0.1, 0.1), 1.2, CENTRE),
+    ((0.1, 0.0), 1.0, "zeros that differ, of some coordinates, from those of recording 0: "),
+    ((0.0, 0.0), 1.0, "zeros that differ from those of recording 0: "),
+])  # fmt: skip
 def test_the_note_says_what_zeros_are_beside(reference, other, words):
     # fails if zeros of one coordinate are said to be beside the reference, or not, as those of another are; or if what
     # all recordings have alike, where a bend of the law lies, is said to be the zero of a sensor

@@ -117,7 +117,7 @@ def test_left_out_errors_are_those_of_fits_without_the_fold(driven):
         torch.testing.assert_close(found[k], expected)
 
 
-def disturbed(kick, seed=0, count=8, steps=60):
+def disturbed(kick, seed=0, count=6, steps=60):
     """Noisy positions of the damped pendulum under random pushes."""
     make = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.randn(*shape, generator=make, dtype=torch.float64)  # noqa: E731
@@ -165,7 +165,7 @@ def test_undisturbed_motion_is_left_to_the_model():
 
 def test_pushes_of_some_steps_are_outweighed():
     # fails if the loss stays quadratic where a few steps leave the model by far
-    data = simulate(scene("damped_pendulum"), trajectories=3, steps=50, h=0.2, noise=NOISE, seed=1)
+    data = simulate(scene("damped_pendulum"), trajectories=3, steps=40, h=0.2, noise=NOISE, seed=1)
     jump = torch.zeros_like(data.q)
     for first in data.offsets:
         jump[first + 30] = 1.0

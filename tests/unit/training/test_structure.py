@@ -234,7 +234,7 @@ def test_a_dictionary_that_misses_is_not_taken_for_noise():
         return p, -pull.sum(-2) - 0.5 * q - 0.05 * p, torch.zeros_like(s)
 
     wells = replace(scene("kepler"), flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
-    data, told = simulate(wells, trajectories=6, steps=30, h=0.1, seed=0), FitConfig()
+    data, told = simulate(wells, trajectories=4, steps=30, h=0.1, seed=0), FitConfig()
     config, base, *_ = structured(data, estimate_baseline(data), told.resolved(data))
     assert not config.features
     assert not base.start

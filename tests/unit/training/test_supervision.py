@@ -62,7 +62,7 @@ def test_gradients_match_finite_differences(level, momenta, freedom):
 def test_the_unit_of_s_is_found(supervision):
     # fails if s and p are taken in the model's unit, in which the first mass is 1
     data = pendulum(2.5, trajectories=6, steps=30, h=0.2, seed=1)
-    run = fit(data, FitConfig(supervision=supervision, iterations=40, correction_width=6), progress=False)
+    run = fit(data, FitConfig(supervision=supervision, iterations=30, correction_width=6), progress=False)
     assert run.metrics["objective"] == "residual"
     assert run.metrics["unit_of_s"] == pytest.approx(2.5, rel=5e-3)
     assert run.metrics["rate"] == pytest.approx(0.2, abs=2e-3)

@@ -39,30 +39,18 @@ def test_units_of_parameters():  # fails if a power of time or length is another
     assert _unit("friction.input_zero", run, 0) == "N m"  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("value", "std", "shown"),
-    [
-        (0.30096, 0.4, "0.3"),
-        (1.00131, 0.0013, "1.0013"),
-        (-0.000289, 0.00022, "−0.00029"),
-        (5.0, float("nan"), "5"),
-        (float("nan"), 1.0, "nan"),
-    ],
-)
+@pytest.mark.parametrize(("value", "std", "shown"), [
+    (0.30096, 0.4, "0.3"), (1.00131, 0.0013, "1.0013"), (-0.000289, 0.00022, "−0.00029"), (5.0, float("nan"), "5"),
+    (float("nan"), 1.0, "nan"),
+])  # fmt: skip
 def test_no_digits_beyond_the_deviation(value, std, shown):  # fails if 0.30096 ± 0.4 claims five digits
     assert rounded(value, std) == shown
 
 
-@pytest.mark.parametrize(
-    ("settings", "starts"),
-    [
-        ({}, True),
-        ({"level": "linear"}, False),
-        ({"features": ("cos(q1)",)}, False),
-        ({"known": ("cos(q1)",)}, False),
-        ({"objective": "raw"}, False),
-    ],
-)
+@pytest.mark.parametrize(("settings", "starts"), [
+    ({}, True), ({"level": "linear"}, False), ({"features": ("cos(q1)",)}, False), ({"known": ("cos(q1)",)}, False),
+    ({"objective": "raw"}, False),
+])  # fmt: skip
 def test_drag_starts_the_fit_of_an_affine_model_alone(settings, starts):
     # fails if drag is added to what the user names, or to a level whose s has no d·q̇
     assert bool(drag_starts_the_fit(FitConfig(**{"level": "affine", **settings}))) is starts

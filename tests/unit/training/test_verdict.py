@@ -40,13 +40,8 @@ KNOWN = Foresight(
         (0.011, 0.012, 1.2, replace(KNOWN, unseen=0.5), "fits to the noise:"),  # chaos
         (0.03, 0.012, 1.2, replace(KNOWN, unseen=0.5), "fits, worse than the noise by a factor of 3:"),
         (0.011, 0.012, 0.09, replace(KNOWN, unseen=0.5), "fits, worse than the noise by a factor of 9:"),  # not lost
-        (
-            0.011,
-            0.012,
-            1.5,
-            replace(KNOWN, unseen=9.0),
-            "does not fit beyond the recording",
-        ),  # no chaos leaves the world
+        # no chaos leaves the world
+        (0.011, 0.012, 1.5, replace(KNOWN, unseen=9.0), "does not fit beyond the recording"),
         (0.011, 0.012, 1.2, KNOWN, "does not fit beyond the recording"),
         (0.011, 0.012, 1.2, None, "does not fit beyond the recording"),
         (0.011, 0.012, 0.013, replace(KNOWN, parameters=0.2), "does not fit: too little was recorded"),
@@ -54,13 +49,8 @@ KNOWN = Foresight(
         (0.011, 0.012, 0.013, replace(KNOWN, reached=False), "does not fit: the model's own motion breaks off"),
         (0.03, 0.03, 0.03, replace(KNOWN, parameters=0.2), "does not fit: a force is missing"),  # more of it tells none
         (0.011, 0.012, 0.013, replace(KNOWN, parameters=4.0), "does not fit: such motions do not tell"),
-        (
-            0.011,
-            0.012,
-            math.inf,
-            replace(KNOWN, unseen=math.inf),
-            "does not fit",
-        ),  # it left the world: no start explains
+        # it left the world: no start explains
+        (0.011, 0.012, math.inf, replace(KNOWN, unseen=math.inf), "does not fit"),
         (0.2, 0.012, 0.013, KNOWN, "does not fit"),
         (0.011, 0.2, 0.013, KNOWN, "does not fit"),
         (0.011, 0.012, math.inf, KNOWN, "does not fit"),

@@ -23,15 +23,10 @@ def test_the_base_of_a_band_of_short_waves_is_no_wave_of_the_band():
     assert values(*(f"sin({j * 0.5123456:.10g} v1)" for j in (4, 5, 6, 7))) == pytest.approx([0.5123456], rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "terms",
-    [
-        ("cos(0.5123456 q1)", "cos(0.8234567 q1)"),
-        ("cos(0.5123456 q1)", "cos(0.5123456 q2)"),
-        ("cos(0.5123456 q1)", "cos(0.5123456 q1) v1"),
-        ("cos(0.5123456 v1)", "cos(0.5123456 (v1 - v2))"),
-    ],
-)
+@pytest.mark.parametrize("terms", [
+    ("cos(0.5123456 q1)", "cos(0.8234567 q1)"), ("cos(0.5123456 q1)", "cos(0.5123456 q2)"),
+    ("cos(0.5123456 q1)", "cos(0.5123456 q1) v1"), ("cos(0.5123456 v1)", "cos(0.5123456 (v1 - v2))"),
+])  # fmt: skip
 def test_other_numbers_and_other_kinds_of_waves_have_other_bases(terms):
     # fails if two functions share a rate, which their intervals give each a value of its own
     assert len(rates_of(terms).values) == 2
