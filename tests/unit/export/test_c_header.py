@@ -15,7 +15,7 @@ from herglotz.export import ExportedStepper, compile_c, export_c, load_c, weight
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
 from tests.compared import relative
-from tests.compilers import CC, needs_compiler
+from tests.compilers import CC, compile_once, needs_compiler
 from tests.lagrangians import even_model, random_model, states as normal_states
 
 CXX = next((c for c in ("c++", "g++", "clang++") if shutil.which(c)), None)
@@ -86,7 +86,7 @@ def test_no_compiler_warnings(tmp_path, dtype):
     # What depends on the flow of values is the same in both languages, and takes the optimiser.
     tools = [[CC, "-std=c99", "-O1", "-c", "-o", "/dev/null"]]
     if CXX is not None:
-        tools.append([CXX, "-x", "c++", "-fsyntax-only"])
+        tools.append([CXX, "-x", "c++", "-fsyntax-only", "-o", "/dev/null"])
     source = tmp_path / "use.c"
     source.write_text('#include "stepper.h"\nint main(void) { return 0; }\n')
     models = {kind: damped(2, kind) for kind in (["both"] if dtype == "float64" else ["alone"])}
@@ -103,7 +103,7 @@ def test_no_compiler_warnings(tmp_path, dtype):
         export_c(model, tmp_path / "stepper.h", h=0.1, units=["real*/", '"m?"'], dtype=dtype)
         for tool in tools:
             command = [*tool, "-Wall", "-Wextra", "-Wpedantic", "-Werror", str(source)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            done = compile_once(command)
             assert done.returncode == 0, (kind, tool, done.stderr[:2000])
 
 
@@ -117,7 +117,7 @@ def test_the_example_in_the_comment_runs(tmp_path, start):
     code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
     (tmp_path / "example.c").write_text(code)
     command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    built = compile_once(command)
     assert built.returncode == 0, built.stderr
     assert not built.stderr
     done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
@@ -144,7 +144,7 @@ def test_the_example_gives_a_step_inputs_of_the_caller(tmp_path):
     )
     (tmp_path / "example.c").write_text(code)
     command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    built = compile_once(command)
     assert built.returncode == 0, built.stderr
     done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
     state = State(*(torch.zeros(1, *shape, dtype=torch.float64) for shape in ((1,), (1,), ())))
