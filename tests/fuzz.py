@@ -83,10 +83,7 @@ def watched(count: Count) -> Iterator[None]:
         count.executed += 1
         raise InputError("reached")
 
-    with (
-        mock.patch.object(loading, "build", reached),
-        mock.patch.object(_package, "_load_exported_programs", reached),
-    ):
+    with mock.patch.object(loading, "build", reached), mock.patch.object(_package, "_load_exported_programs", reached):
         yield
 
 

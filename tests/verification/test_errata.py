@@ -1,5 +1,6 @@
 """Each erratum: the printed formula's residual is clear, the corrected one's is rounding; the paper's figures."""
 
+import functools
 import sys
 from pathlib import Path
 
@@ -17,8 +18,10 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "train"))
 import errata  # noqa: E402
 
+MADE = {make.__name__: functools.cache(make) for make in errata.ERRATA}
 
-@pytest.mark.parametrize("make", errata.ERRATA, ids=lambda f: f.__name__)
+
+@pytest.mark.parametrize("make", MADE.values(), ids=MADE)
 def test_printed_formulas_are_wrong_and_corrected_ones_right(make):
     # fails if a corrected formula carries a wrong sign, index or factor, or a check would accept the printed one
     erratum = make()
@@ -31,7 +34,7 @@ def test_printed_formulas_are_wrong_and_corrected_ones_right(make):
 def test_the_page_is_the_scripts_output():
     # fails if docs/errata.md was edited by hand or is older than the script (numbers apart: they are rounding)
     page = (ROOT / "docs" / "errata.md").read_text(encoding="utf-8")
-    for make in errata.ERRATA:
+    for make in MADE.values():
         e = make()
         assert f"## {e.number}\n" in page
         assert e.printed in page

@@ -371,10 +371,7 @@ def test_a_column_of_text_that_changes_where_time_starts_anew_groups_the_rows(tm
 
 @pytest.mark.parametrize(
     ("header", "labels", "cell"),
-    [
-        ("swing,t,x", ["a"] * 5 + ["b"] * 7, "a"),
-        ("y[m],t,x", ["lost"] * 4 + ["none"] * 4 + ["found"] * 4, "lost"),
-    ],
+    [("swing,t,x", ["a"] * 5 + ["b"] * 7, "a"), ("y[m],t,x", ["lost"] * 4 + ["none"] * 4 + ["found"] * 4, "lost")],
     ids=["changes elsewhere", "a position"],
 )
 def test_other_text_is_refused_with_both_remedies(tmp_path, header, labels, cell):

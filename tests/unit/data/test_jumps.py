@@ -41,12 +41,7 @@ def test_levels_that_are_leapt_to_are_asked_for(tmp_path, capsys):
 
 def test_the_remedy_names_the_coordinates_too(tmp_path):
     # fails if the input that jumps is taken away, and what has neither a unit nor a usual name becomes a coordinate
-    columns = {
-        "delta[deg]": np.sin(T),
-        "Pm": held([0.3, 0.7, 0.4, 1.1], 20),
-        "Pe": np.cos(T),
-        "Vt": np.cos(2 * T),
-    }
+    columns = {"delta[deg]": np.sin(T), "Pm": held([0.3, 0.7, 0.4, 1.1], 20), "Pe": np.cos(T), "Vt": np.cos(2 * T)}
     some = ", with those of Pe, Vt that are positions"
     said = r"--inputs Pm \(inputs= in Python\) and --coordinates delta"
     same = f"{some}; a coordinate all the same: --coordinates delta,Pm{some}$"

@@ -293,8 +293,7 @@ def test_many_columns_without_a_usual_name_are_one_warning(tmp_path, capsys):  #
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["Zeit", "Zeit[s]", "temps", "tiempo", "elapsed_time", "simTime[s]", "seconds", "clock[s]", "Messzeit"],
+    "name", ["Zeit", "Zeit[s]", "temps", "tiempo", "elapsed_time", "simTime[s]", "seconds", "clock[s]", "Messzeit"]
 )
 def test_times_in_other_words(tmp_path, name):  # fails if a time is a coordinate, and the user is told there is none
     data = read(tmp_path, table(f"x[m],{name},u_t[N]"))

@@ -48,10 +48,7 @@ TERMS: dict[str, tuple[int, dict[str, Any]]] = {
     "m(q), coupled": (2, {"mass_width": 3, "level": "forced", "coupled": True}),
     "drag": (
         3,
-        {
-            "level": "forced",
-            "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "|v| v", "load 1", "cos(1.5 q1) v1"),
-        },
+        {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "|v| v", "load 1", "cos(1.5 q1) v1")},
     ),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
 }

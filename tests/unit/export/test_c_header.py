@@ -15,7 +15,7 @@ from herglotz.export import ExportedStepper, compile_c, export_c, load_c, weight
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
 from tests.compared import relative
-from tests.compilers import CC, needs_compiler
+from tests.compilers import CC, compile_once, needs_compiler
 from tests.lagrangians import even_model, random_model, states as normal_states
 
 CXX = next((c for c in ("c++", "g++", "clang++") if shutil.which(c)), None)
@@ -86,7 +86,7 @@ def test_no_compiler_warnings(tmp_path, dtype):
     # What depends on the flow of values is the same in both languages, and takes the optimiser.
     tools = [[CC, "-std=c99", "-O1", "-c", "-o", "/dev/null"]]
     if CXX is not None:
-        tools.append([CXX, "-x", "c++", "-fsyntax-only"])
+        tools.append([CXX, "-x", "c++", "-fsyntax-only", "-o", "/dev/null"])
     source = tmp_path / "use.c"
     source.write_text('#include "stepper.h"\nint main(void) { return 0; }\n')
     models = {kind: damped(2, kind) for kind in (["both"] if dtype == "float64" else ["alone"])}
@@ -103,8 +103,24 @@ def test_no_compiler_warnings(tmp_path, dtype):
         export_c(model, tmp_path / "stepper.h", h=0.1, units=["real*/", '"m?"'], dtype=dtype)
         for tool in tools:
             command = [*tool, "-Wall", "-Wextra", "-Wpedantic", "-Werror", str(source)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            done = compile_once(command)
             assert done.returncode == 0, (kind, tool, done.stderr[:2000])
+
+
+def example_of(path):
+    """The example in the comment at the top of a header."""
+    comment = path.read_text().split("*/")[0]
+    return comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
+
+
+def printed(folder, code):
+    """The positions that an example prints."""
+    (folder / "example.c").write_text(code)
+    command = [CC, "-std=c99", "-Wall", "-Wextra", str(folder / "example.c"), "-lm", "-o", str(folder / "example")]
+    built = compile_once(command)
+    assert (built.returncode, built.stderr) == (0, "")
+    done = subprocess.run([folder / "example"], capture_output=True, text=True, check=True)
+    return torch.tensor([float(line.split()[1]) for line in done.stdout.splitlines()], dtype=torch.float64)
 
 
 @needs_compiler
@@ -113,19 +129,11 @@ def test_the_example_in_the_comment_runs(tmp_path, start):
     # fails if the example at the top of the header does not compile, or does not start from the recording's state
     model = damped(1, "linear")
     path = export_c(model, tmp_path / "stepper.h", h=0.1, name="arm", metadata={"start": start, "time_unit": "*/ s"})
-    comment = path.read_text().split("*/")[0]
-    code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
-    (tmp_path / "example.c").write_text(code)
-    command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
-    assert not built.stderr
-    done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
+    found = printed(tmp_path, example_of(path))
     q, p, s = (start[key] for key in "qps") if start else ([0.0], [0.0], 0.0)
     state = State(*(torch.tensor([x], dtype=torch.float64) for x in (q, p, s)))
     expected = Stepper(model).rollout(*state, h=0.1, steps=100).q[0, 1:, 0]
-    printed = torch.tensor([float(line.split()[1]) for line in done.stdout.splitlines()], dtype=torch.float64)
-    assert torch.allclose(printed, expected, rtol=1e-5, atol=1e-9)  # %g prints six digits
+    assert torch.allclose(found, expected, rtol=1e-5, atol=1e-9)  # %g prints six digits
 
 
 @needs_compiler
@@ -137,21 +145,15 @@ def test_the_example_gives_a_step_inputs_of_the_caller(tmp_path):
     columns = [("motor */ x", "input", "N m"), ("hz_load'", "input", "A/s")]
     metadata = {"columns": columns, "input_low": [0.1, 0.0], "input_high": [0.3, 1.0]}
     path = export_c(model, tmp_path / "stepper.h", h=0.1, name="arm", metadata=metadata)
-    comment = path.read_text().split("*/")[0]
-    code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
+    code = example_of(path)
     assert (
         "arm_real u[arm_M] = {0.2, 0.5};  // your inputs, set for each step: motor _/ x [N m], hz_load' [A/s]" in code
     )
-    (tmp_path / "example.c").write_text(code)
-    command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
-    done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
+    found = printed(tmp_path, code)
     state = State(*(torch.zeros(1, *shape, dtype=torch.float64) for shape in ((1,), (1,), ())))
     u = torch.tensor([0.2, 0.5], dtype=torch.float64).expand(1, 100, 2)
     expected = Stepper(model).rollout(*state, h=0.1, steps=100, inputs=u).q[0, 1:, 0]
-    printed = torch.tensor([float(line.split()[1]) for line in done.stdout.splitlines()], dtype=torch.float64)
-    assert torch.allclose(printed, expected, rtol=1e-5, atol=1e-9)
+    assert torch.allclose(found, expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_start_of_another_size_is_refused(tmp_path):  # fails if the header holds a state of too few numbers

@@ -38,7 +38,7 @@ Setting = dict[str, Any]
 # others in another one: a sum of one product has shapes of its own.
 CASES: dict[str, tuple[str, Setting]] = {
     "order 4": ("al", {
-        "level": "forced", "order": 4, "features": ("cos(q1)", "sin(q1) v1^2", "cos(q1) v1 v2"), "drag": ("load 1",),
+        "level": "forced", "order": 4, "features": ("cos(q1)", "cos(q1) v1 v2"), "drag": ("load 1",),
     }),
     "powers and functions": ("l", {
         "level": "forced", "alike": True,
@@ -67,7 +67,7 @@ CASES: dict[str, tuple[str, Setting]] = {
     "one distance and one field": ("ll", {
         "level": "conservative", "alike": True, "features": ("r^-1", "q1 v2 - q2 v1"), "known": ("0.3 q1^2",),
     }),
-    "three joints": ("aaa", {"features": ("cos(q1 - q2) v1 v2", "sin(q1 + q2 + q3)", "cos(q3) v3^2")}),
+    "three joints": ("aaa", {"features": ("cos(q1 - q2) v1 v2", "sin(q1 + q2 + q3)", "sin(q3) v3^2")}),
     "sticking by position": ("al", {
         "level": "forced", "coulomb": True, "sticking": True, "coupled": True, "features": ("q2^4",),
         "drag": ("q2^2 sgn(v2)", "cos(q1) sgn(v1)", "v2^3"), "inputs": 1,

@@ -1,5 +1,6 @@
 """The figures of S^k for anything that has an L_d, and the paper's two figures from the package."""
 
+import functools
 import math
 from typing import Any
 
@@ -30,6 +31,12 @@ STATES = (
     torch.linspace(0.5, 1, 8).double()[:, None],
     torch.zeros(8).double(),
 )
+
+
+@functools.cache
+def residual_figure() -> Any:
+    """The residual of the pendulum, drawn once; read-only."""
+    return plot_hamilton_jacobi_residual(pendulum, h=0.1)
 
 
 def test_a_function_with_a_step_is_drawn(tmp_path):
@@ -113,8 +120,7 @@ def test_a_largest_difference_of_zero_is_drawn_at_the_floor():
 
 def test_the_residual_is_rounding_on_the_flow():
     # fails if a column stands at another momentum or a row at another k, or the colours saturate
-    figure: Any = plot_hamilton_jacobi_residual(pendulum, h=0.1)
-    table, _, bar = figure.axes
+    table, _, bar = residual_figure().axes
     image = table.images[0]
     momenta = point_fan(pendulum, 31, 0.1).states.p[:, 0]
     left, right, bottom, top = image.get_extent()
@@ -144,7 +150,7 @@ def orbit(q, p, s, steps: int, h: float):
 
 def test_off_the_flow_the_equation_is_between_two_solutions_of_the_fan():
     # fails if a term of the residual or of its size is another one, or the curve belongs to another k or distance
-    h, axes = 0.1, plot_hamilton_jacobi_residual(pendulum, h=0.1).axes
+    h, axes = 0.1, residual_figure().axes
     start = point_fan(pendulum, 31, h).states
     q, p, s = start.q[:, 0].numpy(), start.p[:, 0].numpy(), start.s.numpy()
     here = orbit(q, p, s, 9, h)
@@ -162,8 +168,7 @@ def test_off_the_flow_the_equation_is_between_two_solutions_of_the_fan():
 
 def test_off_the_flow_the_residual_grows_with_the_square():
     # fails if the null experiment is on the flow, or its lines are not its own
-    axes: Any = plot_hamilton_jacobi_residual(pendulum, h=0.1).axes
-    table, null = axes[:2]
+    table, null = residual_figure().axes[:2]
     *curves, on_flow, square = null.lines
     assert len(curves) == 3
     close(on_flow.get_ydata()[0], 10 ** np.asarray(table.images[0].get_array()).max())

@@ -80,12 +80,7 @@ def one(x):
 
 @pytest.mark.parametrize(
     ("model", "motion", "order"),
-    [
-        (rubbing(), with_drag, 2),
-        (sticking(), with_dry, 2),
-        (falling(), along_the_way, 2),
-        (pendulum(order=4), free, 4),
-    ],
+    [(rubbing(), with_drag, 2), (sticking(), with_dry, 2), (falling(), along_the_way, 2), (pendulum(order=4), free, 4)],
     ids=["drag", "sticking", "affine", "order 4"],
 )
 def test_a_velocity_has_the_order_of_the_integrator(model, motion, order):

@@ -48,13 +48,7 @@ def drift(stepper, state, steps, h=0.1):
     return float(((energy - expected) / energy[..., :1]).abs().max()), out
 
 
-@pytest.mark.parametrize(
-    ("H", "n", "steps"),
-    [
-        (PENDULUM, 1, 100),
-        (coupled, 2, 50),
-    ],
-)
+@pytest.mark.parametrize(("H", "n", "steps"), [(PENDULUM, 1, 100), (coupled, 2, 50)])
 def test_H_is_kept_to_round_off(H, n, steps):
     # fails if B is not antisymmetric, or the discrete gradient misses the secant condition, at rest included (t = 100)
     worst, out = drift(EvolutionStepper(H), start(n), steps)

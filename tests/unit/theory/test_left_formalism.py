@@ -76,17 +76,11 @@ def test_hamiltonian_derivatives(name, side):
     H, x = (RightHamiltonian(L_d, q1), (q0, p1, s0)) if side == "right" else (LeftHamiltonian(L_d, q0), (p0, q1, s1))
     P = partials(H, *x, h, order=2)
     n, eps = q0.shape[-1], 1e-5
-    flat = torch.cat([x[0], x[1], x[2][:, None]], -1)
-    rows = []
-    for i in range(2 * n + 1):
-        ends = []
-        for sign in (1, -1):
-            y = flat.clone()
-            y[:, i] += sign * eps
-            Q = partials(H, y[:, :n], y[:, n : 2 * n], y[:, -1], h)
-            ends.append(torch.cat([Q.L[:, None], Q.D1, Q.D2, Q.D3[:, None]], -1))
-        rows.append((ends[0] - ends[1]) / (2 * eps))
-    slope = torch.stack(rows, -1)  # [value and gradient, direction]
+    flat, moves = torch.cat([x[0], x[1], x[2][:, None]], -1), eps * torch.eye(2 * n + 1, dtype=torch.float64)
+    y = flat + torch.stack([moves, -moves])[:, :, None]  # (sign, direction, sample, 2n + 1)
+    Q = partials(H, y[..., :n], y[..., n : 2 * n], y[..., -1], h)
+    ends = torch.cat([Q.L[..., None], Q.D1, Q.D2, Q.D3[..., None]], -1)
+    slope = ((ends[0] - ends[1]) / (2 * eps)).permute(1, 2, 0)  # (sample, value and gradient, direction)
     first = torch.cat([P.D1, P.D2, P.D3[:, None]], -1)
     close(slope[:, 0], first, 1e-7)
     second = torch.cat(

@@ -95,7 +95,10 @@ def test_a_momentum_at_the_end_of_the_numbers_moves_a_file(tmp_path):
     # fails if a file calls a guess that it gave up CONVERGED: q stayed where it was for p > 1.63e308, where the size of
     # the equation and of its first move are numbers, and their sum is none
     pytest.importorskip("onnxruntime")
-    model = ContactLagrangian(ModelConfig(level="linear", angles=(False,), correction_width=2))  # it iterates
+    # It iterates.
+    model = ContactLagrangian(
+        ModelConfig(level="linear", angles=(False,), potential_width=0, correction_width=2, correction_depth=1)
+    )
     file = load_exported(export_onnx(model, tmp_path / "model.onnx", h=0.1))
     p = torch.linspace(1.5e308, 1.79e308, 30, dtype=torch.float64)[:, None]
     out = file.rollout(torch.zeros_like(p), p, h=0.1, steps=1)

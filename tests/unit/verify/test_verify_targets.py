@@ -36,7 +36,7 @@ def test_an_exact_scene_is_also_held_to_its_flow():
 
 def test_an_exported_file(tmp_path):
     # fails if a file, which has no L_d, cannot be judged by its map alone, or is not said to be
-    model = ContactLagrangian(ModelConfig())
+    model = ContactLagrangian(ModelConfig(potential_width=0))
     path = export_pt2(model, tmp_path / "model.pt2", h=0.2, box=BOX)
     report = verify(path, samples=8, steps=4)
     assert report.passed, report.table()
@@ -54,7 +54,8 @@ def test_an_exported_file(tmp_path):
 def test_a_forced_file(tmp_path):
     # fails if friction, which makes a step no contact map, fails the file, or an identity is dropped in silence
     one = (1.0,)
-    config = ModelConfig((True,), "forced", one, one, one, (0.0,), rate=0.3, inputs=1, input_zero=True)
+    config = ModelConfig((True,), "forced", one, one, one, (0.0,), rate=0.3, inputs=1, input_zero=True,
+                         potential_width=0)  # fmt: skip
     model = ContactLagrangian(config)
     with torch.no_grad():
         for parameter in model.parameters():
