@@ -10,7 +10,7 @@ from export_models import damped, model_of, with_terms
 
 from herglotz.errors import InputError
 from herglotz.export import export_acados, load_exported
-from tests.compilers import CC, compile_once
+from tests.compilers import CC, run_compiler
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "acados"
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
@@ -26,7 +26,7 @@ def test_the_example_compiles_and_its_jacobian_is_that_of_its_step(name, tmp_pat
     path = export_acados(model, tmp_path / "arm.c", h=0.1)
     words = [str(CC), "-std=c99", *WARNINGS, *SANITIZED, f"-I{EXAMPLE / 'stand_in'}", f'-DMODEL="{path}"', "-DNAME=arm"]
     words += [str(EXAMPLE / "check.c"), "-o", str(tmp_path / "check"), "-lm"]
-    built = compile_once(words)
+    built = run_compiler(words)
     assert built.returncode == 0, built.stderr[:2000]
     done = subprocess.run([str(tmp_path / "check")], capture_output=True, text=True)
     assert done.returncode == 0, done
@@ -43,7 +43,7 @@ def test_a_step_that_does_not_exist_is_nan(tmp_path):
     check = check.replace("if (evaluated(ux, x1, jac)) return 1;", failed)
     (tmp_path / "check.c").write_text(check)
     words = [str(CC), "-std=c99", f"-I{EXAMPLE / 'stand_in'}", f'-DMODEL="{tmp_path / "arm.c"}"', "-DNAME=arm"]
-    assert compile_once([*words, str(tmp_path / "check.c"), "-o", str(tmp_path / "check"), "-lm"]).returncode == 0
+    assert run_compiler([*words, str(tmp_path / "check.c"), "-o", str(tmp_path / "check"), "-lm"]).returncode == 0
     out = subprocess.run([str(tmp_path / "check")], capture_output=True, text=True, check=True).stdout
     assert out.replace("-", "") == "nan nan"
 

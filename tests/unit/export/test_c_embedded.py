@@ -12,7 +12,7 @@ from export_models import randomise
 
 from herglotz.export import export_c
 from herglotz.models import ContactLagrangian, ModelConfig
-from tests.compilers import compile_once
+from tests.compilers import run_compiler
 
 ROOT = Path(__file__).resolve().parents[3]
 needs_gcc = pytest.mark.skipif(not shutil.which("gcc"), reason="no gcc in the PATH")
@@ -133,7 +133,7 @@ def test_a_constant_of_the_header_bounds_the_iteration(headers, tmp_path, limit)
     assert calls == 3
     (tmp_path / "counted.h").write_text(text)
     (tmp_path / "use.c").write_text(BOUND)
-    assert compile_once(["gcc", "-std=c99", "-O1", "use.c", "-o", "use", "-lm"], tmp_path).returncode == 0
+    assert run_compiler(["gcc", "-std=c99", "-O1", "use.c", "-o", "use", "-lm"], tmp_path).returncode == 0
     printed = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout
     most, worst, said = map(int, printed.split())
     assert said == limit

@@ -12,7 +12,7 @@ from herglotz.errors import InputError
 from herglotz.export import export_c
 from herglotz.export.c_header import RUNTIME
 from herglotz.models import ContactLagrangian, ModelConfig
-from tests.compilers import CC, compile_once, needs_compiler
+from tests.compilers import CC, needs_compiler, run_compiler
 
 pytestmark = needs_compiler
 
@@ -48,7 +48,7 @@ def small(n=1, **options) -> ContactLagrangian:
 def built(tmp_path, code, *flags):
     (tmp_path / "use.c").write_text(code)
     command = [CC, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", *flags, "use.c"]
-    return compile_once([*command, "-o", "use", "-lm"], tmp_path)
+    return run_compiler([*command, "-o", "use", "-lm"], tmp_path)
 
 
 def test_another_process_of_the_same_user_knows_what_was_written(monkeypatch, tmp_path):

@@ -25,7 +25,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.numbers import values_of
 from herglotz.stepping import State, Stepper
 from herglotz.stepping.filter import KalmanFilter, Noise
-from tests.compilers import compile_once
+from tests.compilers import run_compiler
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="neither gcc nor clang in the PATH")
 H, NAMES = 0.05, ["friction.viscous[0]", "friction.viscous[1]"]
@@ -359,7 +359,7 @@ def test_what_is_no_number_changes_nothing(double_pendulum, tmp_path):
              extras=["filter"])  # fmt: skip
     (tmp_path / "use.c").write_text(PROGRAM)
     command = [str(COMPILER), "-std=c99", *WARNINGS, "-O0", "-fno-sanitize-recover=all", "-fsanitize=address,undefined"]
-    built = compile_once([*command, str(tmp_path / "use.c"), "-o", str(tmp_path / "use"), "-lm"])
+    built = run_compiler([*command, str(tmp_path / "use.c"), "-o", str(tmp_path / "use"), "-lm"])
     assert built.returncode == 0, built.stderr[:2000]
     words = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout.split()
     assert " ".join(words) == "0 0 5 5 5 5 1 5 0 0 1 1 0 5 5 5 0 1 0 0 1 1 5 5 5 5 1 1"
@@ -374,7 +374,7 @@ def test_what_is_no_number_changes_nothing(double_pendulum, tmp_path):
     )
     (tmp_path / "f.c").write_text(library)
     compile_ = [str(COMPILER), "-std=c99", "-O2", "-c", str(tmp_path / "f.c"), "-o", str(tmp_path / "f.o")]
-    assert compile_once(compile_).returncode == 0
+    assert run_compiler(compile_).returncode == 0
     names = subprocess.run(["nm", "-u", tmp_path / "f.o"], capture_output=True, text=True, check=True).stdout
     # memcpy and memset are what a compiler makes of assignments and loops.
     own = {"sin", "cos", "sincos", "exp", "expm1", "sqrt", "fabs", "floor", "memcpy", "memset", "memmove"}

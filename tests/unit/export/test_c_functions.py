@@ -8,7 +8,7 @@ import pytest
 
 from herglotz.export import export_c
 from herglotz.models import ContactLagrangian, ModelConfig
-from tests.compilers import compile_once
+from tests.compilers import run_compiler
 
 COMPILERS = [c for c in ("gcc", "clang") if shutil.which(c)]
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="neither gcc nor clang in the PATH")
@@ -39,7 +39,7 @@ def functions(request, tmp_path_factory):
     export_c(ContactLagrangian(config), folder / "model.h", h=0.1, dtype=dtype)
     (folder / "own.c").write_text(SOURCE + "\n".join(f"BOTH({name})" for name in FUNCTIONS))
     command = [compiler, "-O2", "-march=native", "-shared", "-fPIC", "-o", "own.so", "own.c", "-lm"]
-    assert compile_once(command, folder).returncode == 0
+    assert run_compiler(command, folder).returncode == 0
     library, kind = ctypes.CDLL(str(folder / "own.so")), TYPES[dtype]
 
     def function(name, x):

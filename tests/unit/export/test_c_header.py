@@ -15,7 +15,7 @@ from herglotz.export import ExportedStepper, compile_c, export_c, load_c, weight
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
 from tests.compared import relative
-from tests.compilers import CC, compile_once, needs_compiler
+from tests.compilers import CC, needs_compiler, run_compiler
 from tests.lagrangians import even_model, random_model, states as normal_states
 
 CXX = next((c for c in ("c++", "g++", "clang++") if shutil.which(c)), None)
@@ -103,7 +103,7 @@ def test_no_compiler_warnings(tmp_path, dtype):
         export_c(model, tmp_path / "stepper.h", h=0.1, units=["real*/", '"m?"'], dtype=dtype)
         for tool in tools:
             command = [*tool, "-Wall", "-Wextra", "-Wpedantic", "-Werror", str(source)]
-            done = compile_once(command)
+            done = run_compiler(command)
             assert done.returncode == 0, (kind, tool, done.stderr[:2000])
 
 
@@ -117,7 +117,7 @@ def printed(folder, code):
     """The positions that an example prints."""
     (folder / "example.c").write_text(code)
     command = [CC, "-std=c99", "-Wall", "-Wextra", str(folder / "example.c"), "-lm", "-o", str(folder / "example")]
-    built = compile_once(command)
+    built = run_compiler(command)
     assert (built.returncode, built.stderr) == (0, "")
     done = subprocess.run([folder / "example"], capture_output=True, text=True, check=True)
     return torch.tensor([float(line.split()[1]) for line in done.stdout.splitlines()], dtype=torch.float64)

@@ -18,7 +18,7 @@ from herglotz.export.parameters import described_parameters, parsed
 from herglotz.models import ContactLagrangian, ModelConfig, numbers_of
 from herglotz.models.numbers import WithNumbers, chosen, values_of, with_values
 from herglotz.stepping import State, Stepper
-from tests.compilers import compile_once
+from tests.compilers import run_compiler
 
 COMPILER = next((c for c in ("gcc", "clang") if shutil.which(c)), None)
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="neither gcc nor clang in the PATH")
@@ -175,7 +175,7 @@ def test_bounds_and_defaults_in_c(tmp_path):
     (tmp_path / "use.c").write_text(PROGRAM)
     safe = ("-O0", "-fno-sanitize-recover=all", "-fsanitize=address,undefined")
     command = [str(COMPILER), "-std=c99", *WARNINGS, *safe, str(tmp_path / "use.c"), "-o", str(tmp_path / "use"), "-lm"]
-    built = compile_once(command)
+    built = run_compiler(command)
     assert built.returncode == 0, built.stderr[:2000]
     words = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout.split()
     assert words[:-1] == ["0", "5", "5", "5", "5", "5", "1", "friction.input_map[1]", "5", "5", "5", "5", "1", "1", "1"]

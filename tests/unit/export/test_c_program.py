@@ -15,7 +15,7 @@ from herglotz.export.c_header import c_source, described
 from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.terms import PositionKinetic
-from tests.compilers import compile_once
+from tests.compilers import run_compiler
 from tests.lagrangians import random_model
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "c.md"
@@ -47,7 +47,7 @@ def run(tmp_path, code, compiler, *flags):
     """What a program prints, as words."""
     (tmp_path / "use.c").write_text(code)
     command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", *flags, str(tmp_path / "use.c")]
-    built = compile_once([*command, "-o", str(tmp_path / "use"), "-lm"])
+    built = run_compiler([*command, "-o", str(tmp_path / "use"), "-lm"])
     assert built.returncode == 0, built.stderr[:2000]
     return subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout.split()
 
@@ -265,7 +265,7 @@ def test_networks_vectorise(tmp_path):
     )
     for flags in (("-O3", "-mavx2", "-mfma"), ("-O3", "-mavx2", "-mfma", "-ffast-math")):
         command = [COMPILERS[0], "-std=c99", "-ffp-contract=fast", *flags, "-c", str(tmp_path / "use.c")]
-        assert compile_once([*command, "-o", str(tmp_path / "use.o")]).returncode == 0
+        assert run_compiler([*command, "-o", str(tmp_path / "use.o")]).returncode == 0
         code = subprocess.run(["objdump", "-d", tmp_path / "use.o"], capture_output=True, text=True, check=True).stdout
         assert len(re.findall(r"vfn?m(?:add|sub)\d+pd.*%ymm", code)) > 40
 

@@ -13,7 +13,7 @@ from export_models import randomise
 
 from herglotz.export import export_c
 from herglotz.models import ContactLagrangian, ModelConfig
-from tests.compilers import compile_once
+from tests.compilers import run_compiler
 
 pytestmark = pytest.mark.slow  # a compiler run of 3–30 s each
 PROGRAM = Path(__file__).with_name("fuzz.c")
@@ -80,7 +80,7 @@ def checked(folder, compiler, way, *language):
         pytest.skip(f"no {runner[0]} in the PATH")
     program = folder / "fuzz"
     words = [compiler, *language, *WARNINGS, *flags, f"-I{folder}", str(PROGRAM), "-o", str(program), "-lm", "-pthread"]
-    built = compile_once(words)
+    built = run_compiler(words)
     assert built.returncode == 0, built.stderr[:3000]
     done = subprocess.run([*runner, program, str(trials)], capture_output=True, text=True, check=False,
                           env={**os.environ, "TSAN_OPTIONS": "halt_on_error=1"})  # fmt: skip

@@ -13,7 +13,7 @@ from export_models import beside, damped, model_of, near, states_of, with_terms
 from herglotz.errors import InputError
 from herglotz.export import export_casadi, load_exported
 from herglotz.stepping import State
-from tests.compilers import CC, compile_once, needs_compiler
+from tests.compilers import CC, needs_compiler, run_compiler
 
 ca = pytest.importorskip("casadi", reason="casadi is not installed (extra: control)")
 pytestmark = needs_compiler
@@ -37,7 +37,7 @@ def function(model, folder, flags=(), **settings):
     path = export_casadi(model, folder / "arm.c", h=0.1, **settings)
     library = path.with_suffix(".so")
     flags = ["-std=c99", "-O0", "-fPIC", "-shared", *WARNINGS, *flags]
-    built = compile_once([str(CC), *flags, str(path), "-o", str(library), "-lm"])
+    built = run_compiler([str(CC), *flags, str(path), "-o", str(library), "-lm"])
     assert built.returncode == 0, built.stderr[:2000]
     return ca.external("arm_step", str(library)), path
 

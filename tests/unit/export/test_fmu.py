@@ -16,7 +16,7 @@ from export_models import damped, model_of, with_terms
 from herglotz.codegen import c_compiler
 from herglotz.errors import InputError
 from herglotz.export import export_fmu, load_exported
-from tests.compilers import CC, compile_once, needs_compiler
+from tests.compilers import CC, needs_compiler, run_compiler
 
 fmpy = pytest.importorskip("fmpy", reason="fmpy is not installed (extra: control)")
 pytestmark = needs_compiler
@@ -318,7 +318,7 @@ def test_sources_compile_without_a_warning_and_survive_the_sanitizers(version, f
     sanitized = ["-O0", "-g", "-fno-sanitize-recover=all", "-fsanitize=address,undefined"]
     words = [str(CC), "-std=c99", *WARNINGS, *sanitized, f'-DSOURCE="{source}"', f"-DFMI={version[0]}"]
     words += [str(Path(__file__).with_name("fmu_program.c")), "-o", str(program), "-lm"]
-    built = compile_once(words)
+    built = run_compiler(words)
     assert built.returncode == 0, built.stderr[:2000]
     done = subprocess.run([str(program)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr[:2000]

@@ -11,7 +11,7 @@ from export_models import damped
 
 from herglotz.export import export_casadi
 from herglotz.stepping import State, Stepper
-from tests.compilers import CC, compile_once, needs_compiler
+from tests.compilers import CC, needs_compiler, run_compiler
 
 pytestmark = needs_compiler
 RTI = Path(__file__).parents[3] / "examples" / "real_time_iteration" / "rti.c"
@@ -74,7 +74,7 @@ def own(model, tmp_path_factory):
     export_casadi(model, folder / "model.c", h=0.1, name="model")
     library = folder / "rti.so"
     command = [str(CC), *FLAGS, f"-DRTI_N={N}", f"-I{folder}", str(RTI), "-o", str(library), "-lm"]
-    built = compile_once(command)
+    built = run_compiler(command)
     assert built.returncode == 0, built.stderr[:2000]
     return ctypes.CDLL(str(library))
 
