@@ -196,7 +196,7 @@ def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor
 
 def in_vmap(x: Tensor) -> bool:
     """Whether a tensor is one sample of many inside `torch.func.vmap`, where its numbers cannot be asked for."""
-    functorch = torch._C._functorch
+    functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
     while functorch.is_functorch_wrapped_tensor(x) and not functorch.is_batchedtensor(x):
         x = functorch.get_unwrapped(x)
     return functorch.is_batchedtensor(x)
