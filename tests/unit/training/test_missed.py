@@ -192,7 +192,7 @@ def test_a_model_that_cannot_be_stepped_is_judged_by_the_motion(monkeypatch):
     monkeypatch.setattr(verdict, "with_own_starts", lambda *_: None)
     data = Trajectories.of(T, noisy()[:, None])
     task = Task(data, estimate_baseline(data), FitConfig(), Stages())
-    none: Any = None
+    none: Any = SimpleNamespace(model=None)
     seen: Any = SimpleNamespace(train=data, outlying=())
     assert "It misses differently" in verdict._reason_of_residuals(task, none, seen)
     seen.train = Trajectories.of(T, noisy(torch.sin(T))[:, None])
@@ -207,7 +207,7 @@ def test_residuals_are_in_units_of_q(monkeypatch):
     monkeypatch.setattr(verdict, "reason_of", lambda _, miss, *__: asked.append(miss) or "")
     data = Trajectories.of(T, torch.stack([Q, 100 * Q], -1), units=("rad", "mm"))
     seen: Any = SimpleNamespace(train=data, outlying=())
-    fitted: Any = None
+    fitted: Any = SimpleNamespace(model=None)
     verdict._reason_of_residuals(Task(data, estimate_baseline(data), FitConfig(), Stages()), fitted, seen)
     assert asked[0][0].tolist() == pytest.approx([0.01, 1.0])
 

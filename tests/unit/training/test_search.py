@@ -126,7 +126,7 @@ def test_longer_steps_do_not_hide_in_the_parameters():
 def test_friction_that_holds_is_fitted_as_such():
     # fails if the variant with set-valued friction is the smooth model under another name: an axis without noise that
     # stands still at times is missed more than twice as far by smooth friction with the same offers
-    search = searched(simulate(scene("servo_axis"), trajectories=1, steps=60, h=0.05, seed=0))
+    search = searched(simulate(scene("servo_axis"), trajectories=2, steps=60, h=0.05, seed=0))
     found = there(search.run())
     assert found.fitter.model.capabilities.sticking
     assert "friction.log_smooth" not in found.values
