@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
@@ -250,7 +251,7 @@ def step_sizes(h: Tensor, steps: int | None) -> Tensor:
 
     Raise InputError if a scalar comes without a count, or a list has another length than the count.
     """
-    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool)):
+    if steps is not None and not isinstance(steps, Integral):
         raise InputError(f"steps must be a whole number, got {steps!r}")
     if h.ndim == 0:
         if steps is None or steps < 1:

@@ -47,8 +47,8 @@ def _joined(search: Search, best: Trial) -> Trial | None:
     every = every and likeliest(every, 2 * ITERATIONS)
     if every is None:
         return found
-    few, all_of_them = scores_of(best, every)
-    if not float((few.losses - all_of_them.losses).sum()) > 0:
+    before, after = scores_of(best, every)
+    if not float((before.losses - after.losses).sum()) > 0:
         return found
     return search.better(found, search.settled(every))
 

@@ -7,6 +7,7 @@ residual.
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import NamedTuple
 
 import torch
@@ -161,7 +162,7 @@ def starts(
         If q has fewer than three samples, or length is not positive.
     """
     _checked(q, 1.0, None, None)
-    refuse({f"length must be a whole number >= 1, got {length}": not isinstance(length, int) or length < 1})
+    refuse({f"length must be a whole number >= 1, got {length}": not isinstance(length, Integral) or length < 1})
     at = torch.arange(max((q.shape[-2] - 2) // length, 1), device=q.device) * length
     found = Starts(q[..., at, :], q[..., at + 1, :], q.new_zeros((*q.shape[:-2], len(at))))
     return Starts(*(x.detach().clone().requires_grad_() for x in found))

@@ -92,6 +92,7 @@ def test_the_name_of_a_series_holds_its_unit():  # fails if x[m] is a name of fo
     ("data", "options", "message"),
     [
         (Q, {}, "positions without times: give h"),
+        (Q, {"h": [0.1, 0.2]}, "h is the time between two samples, one number; where steps differ, give time"),
         (Q, {"h": 0.1, "time": T}, "positions without times: give h, the time between two samples, or time"),
         ([[1, 2], [1, 2, "x"]], {"h": 0.1}, "not numbers|trajectory 0 has 2 samples"),
         ("nothing.csv", {}, "no such file"),

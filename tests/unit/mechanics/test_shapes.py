@@ -1,5 +1,6 @@
 """A function that returns no number a sample, and positions without an axis, are refused at every door."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -112,6 +113,33 @@ def test_scalars_have_a_remedy(state, message):
         match=message.replace("q and p", "q0 and q1").replace("q must", "q0 must").replace("p must", "q1 must"),
     ):
         partials(oscillator, *state, 0.1)  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("h", "steps", "message"),
+    [
+        (None, 2, "h must be a number or a tensor, in the unit of time, got None"),
+        ("0.1", 2, "h must be a number or a tensor, in the unit of time, got '0.1'"),
+        (0.1, 2.5, r"steps must be a whole number, got 2\.5"),
+        (f64(0.1, 0.2, 0.3)[:, None], 1, r"h of shape \(3,\) does not spread over states of shape \(2,\)"),
+    ],
+)
+def test_steps_of_another_kind_have_a_remedy(h, steps, message):
+    # fails if a wrong step ends in an error of torch that names no argument
+    stepper, q = Stepper(lambda q0, q1, s0, h: ((q1 - q0) ** 2).sum(-1) / (2 * h) - 0.02 * s0), f64(0.1, 0.2)[:, None]
+    with pytest.raises(InputError, match=message):
+        stepper.rollout(q, q, h=h, steps=steps)
+    if steps == 1:
+        with pytest.raises(InputError, match=message):
+            stepper.step(State(q, q, q[:, 0]), h[:, 0])
+    assert stepper.rollout(q, q, h=0.1, steps=np.int64(2)).ok.all()
+
+
+@pytest.mark.parametrize(("L_d", "message"), [(object, "got the class object; make one"), ("run", "got a str")])
+def test_a_stepper_is_of_a_function(L_d, message):
+    # fails if a class or a name is taken for an L_d, and the first step ends in an error of Python
+    with pytest.raises(InputError, match=message):
+        Stepper(L_d)
 
 
 def test_a_step_a_sample_with_one_position_for_all():

@@ -483,6 +483,7 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
     ({"batch": 0, "optimiser": "adam", "objective": "residual"}, "batch must be >= 1, got 0"),
     ({"batch": 8, "optimiser": "adam", "objective": "residual", "level": "full"}, "carries s along whole"),
     ({"device": "abacus"}, "unknown device 'abacus'; use cpu or cuda"),
+    ({"device": "mps"}, "device mps has no float64, in which fits are made; use cpu or cuda"),
     ({"departures": ()}, "departures must be one or more positive numbers"),
 ])  # fmt: skip
 def test_wrong_settings_are_named(settings, message):
