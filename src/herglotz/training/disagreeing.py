@@ -108,7 +108,9 @@ def outlying(seen: Look, model: ContactLagrangian, sigma: float) -> tuple[LeftOu
     found.problem.parameters.set(found.theta)
     now = _worst(seen, _missed_by(seen, own, noise, followed), followed)
     now = now._replace(properties=own_properties(seen.data, now.recording))
-    return (now,) if now.stands_out and now.recording == worst.recording else ()
+    # Where the others are missed as well, it is the law that is wrong.
+    agree = now.others <= max(AT_THE_NOISE * noise, _least(seen))
+    return (now,) if agree and now.stands_out and now.recording == worst.recording else ()
 
 
 def _worst(seen: Look, missed: Sequence[Tensor], followed: Trajectories) -> LeftOut:

@@ -385,12 +385,11 @@ class Fitter:
     def explain(self, trial: Trial, by_steps: float) -> None:
         """Take the error of the finest steps for the floor of misfits, if it explains what the model of a trial misses.
 
-        The floor stays below the errors that count as none: steps of a wrong model may be as far off as the model.
+        That has to be next to nothing: steps of a wrong model may be as far off as the model.
         """
-        floor = min(by_steps, EXACT_ENOUGH * self.spread)
-        if trial.rms <= math.hypot(floor, self.about_the_noise):
-            order = self.variant.order
-            self.of_steps[order] = max(floor, self.of_steps.get(order, 0.0))
+        least = math.hypot(by_steps, self.about_the_noise)
+        if self.about_the_noise < trial.rms <= min(least, EXACT_ENOUGH * self.spread):
+            self.of_steps[self.variant.order] = least
 
     @property
     def exact(self) -> bool:
