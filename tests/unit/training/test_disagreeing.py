@@ -110,6 +110,25 @@ def test_without_a_search_an_outlier_is_named(given, capsys):
     assert "fit once more without it" in " ".join(found.summary().split())
 
 
+class Spring(torch.nn.Module):
+    """A harmonic oscillator without friction, whose stiffness is trained."""
+
+    def __init__(self):
+        super().__init__()
+        self.k = torch.nn.Parameter(torch.tensor(7.0))
+
+    def forward(self, q0, q1, s0, h):
+        return (q1 - q0).square().sum(-1) / (2 * h) - h * self.k * (q0 + q1).square().sum(-1) / 8 + 0 * s0
+
+
+def test_where_all_are_missed_none_is_of_something_else():
+    # fails if the recording that a wrong law misses most is said to be of something else: of one pendulum, by a spring
+    run = fit(_swings((1.2, 1.3, 1.4, 1.5, 2.9)), model=Spring(), progress=False)
+    assert run.metrics["verdict"].startswith("does not fit")
+    assert not run.metrics["outlying"]
+    assert "something else" not in run.metrics["verdict"]
+
+
 def test_without_a_majority_nothing_is_left_out():
     # fails if one of two recordings is said to be the bad one
     assert fit(_drops(0, 2, 13, bad=1), progress=False).metrics["left_out"] == []

@@ -8,11 +8,13 @@ import torch
 from torch import nn
 
 import herglotz as hz
+from herglotz.cached import cached
 from herglotz.export import export_pt2
 from herglotz.mechanics import autograd_partials
 from herglotz.models import OwnLagrangian
 from herglotz.stepping import Stepper
 from herglotz.training import laplace
+from herglotz.training.parameter_vector import ParameterVector
 
 H = 0.1
 
@@ -217,6 +219,29 @@ def test_function_transforms_go_through_the_residual():  # fails if autograd is 
             torch.testing.assert_close(slopes[f"L_d.{name}"][row], x.grad, rtol=1e-10, atol=0)
     with pytest.raises(hz.InputError, match="vmap does not go through steps"):
         torch.func.vmap(lambda q: Stepper(nets[0]).rollout(q, q, h=H, steps=2).q)(q[:, 0])
+
+
+def test_a_short_step_of_float32_is_taken_as_any_other():
+    # fails if increments of positions are asked of the package's models alone: a fit in float32 ended in an error
+    L_d, q, delta, s = (
+        OwnLagrangian(Spring(), 1),
+        torch.ones(3, 1).double(),
+        torch.full((3, 1), 0.1).double(),
+        torch.ones(3),
+    )
+    parameters = ParameterVector(cast(Any, L_d))
+    at, h = parameters.at(parameters.get()), torch.full((3,), H).double()
+    short, plain = at.partials_increment(q, delta, s.double(), h, 2), L_d.partials(q, q + delta, s.double(), h, 2)
+    for name in ("L", "D1", "D2", "D3", "D12"):
+        torch.testing.assert_close(getattr(short, name), getattr(plain, name), rtol=1e-12, atol=1e-14)
+
+
+def test_what_is_made_once_is_not_of_inference_mode():
+    # fails if a step in inference mode leaves an index behind that stops every later training
+    made = cached(lambda n: torch.arange(n))
+    with torch.inference_mode():
+        assert made(3) is made(3)
+    assert not made(3).is_inference()
 
 
 def test_an_l_d_is_stepped_and_trained_in_inference_mode():
