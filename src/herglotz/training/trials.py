@@ -324,10 +324,7 @@ class Fitter:
         self.data, self.variant, self.freedom = data, variant, freedom
         self.finest = max(1, min(MAX_SUBSTEPS, MAX_STEPS // data.samples))
         bands = variant.functions
-        terms = NamedTerms(config.features) if config.features else candidates(data, config.translations, ratios)
-        terms = terms.joined(NamedTerms(tuple(windings(data.angles)))) if variant.windings else terms
-        terms = terms_with(bands, terms, data.angles, variant.kept) if bands else terms
-        self.terms = terms = replace(terms, dissipation=variant.dissipation)
+        self.terms = terms = _terms(data, config, variant, ratios)
         settings = replace(settings_of(terms, data, config, variant.order, variant.substeps), sticking=variant.sticking)
         known = (smoothed(data), precision(data), relative_spread(data)) if like is None else like.known
         self.known = self.smooth, self.precision, self.spread = known
@@ -341,10 +338,7 @@ class Fitter:
         self.always, every_offer, self.simple = offers_of(
             self.model, list(self.keys.values()), bands, len(input_terms_of(data.columns))
         )
-        # Positions do not determine the scale of the mass of coordinates that no term joins to the first one. Were it
-        # free, a larger mass would stand, to first order, for all forces that leave.
-        apart = groups(config.features, data.angles)[1:] if config.features else []
-        fixed = {f"kinetic.log_diagonal[{own[0] - 1}]" for own in apart}
+        fixed = _undetermined_masses(data, config)
         self.always = tuple(name for name in self.always if name not in fixed)
         without_offers(self.model, every_offer)
         # On a joint that turns one way, a load is the same force as dry friction, which is offered already.
@@ -508,6 +502,27 @@ class Fitter:
         """The model over whole trajectories at once or, if it does not follow these closely, as `grow`."""
         whole = self.fit(trial.taken, trial.values, self.lengths[-1], trial)
         return whole if whole is not None and whole.near else self.grow(trial)
+
+
+def _terms(
+    data: Trajectories, config: FitConfig, variant: Variant, ratios: Mapping[tuple[int, int], str] | None
+) -> NamedTerms:
+    """The named terms of a variant: those of the settings or the candidates, windings, and what its functions need."""
+    terms = NamedTerms(config.features) if config.features else candidates(data, config.translations, ratios)
+    if variant.windings:
+        terms = terms.joined(NamedTerms(tuple(windings(data.angles))))
+    if variant.functions:
+        terms = terms_with(variant.functions, terms, data.angles, variant.kept)
+    return replace(terms, dissipation=variant.dissipation)
+
+
+def _undetermined_masses(data: Trajectories, config: FitConfig) -> set[str]:
+    """Names of the masses whose scale positions do not determine: of coordinates that no term joins to the first one.
+
+    Were such a mass free, a larger one would stand, to first order, for all forces that leave.
+    """
+    apart = groups(config.features, data.angles)[1:] if config.features else []
+    return {f"kinetic.log_diagonal[{own[0] - 1}]" for own in apart}
 
 
 def _minimised(problem: ShootingProblem, x: Tensor, most: int, damping: float) -> tuple[Tensor, Path | None]:
