@@ -19,7 +19,7 @@ import torch
 
 from herglotz.data.files import PathLike
 from herglotz.data.input_terms import input_terms_of
-from herglotz.errors import InputError, refuse
+from herglotz.errors import InputError, check_whole, refuse
 from herglotz.export import ExportedStepper, export_run, load_c
 from herglotz.export.exported import check_range
 from herglotz.export.load import CLibrary
@@ -115,7 +115,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         dtype: str = "float64",
         trust_code: bool = False,
     ):
-        _check_counts(num_envs=num_envs, steps_per_action=steps_per_action, max_episode_steps=max_episode_steps)
+        check_whole(1, num_envs=num_envs, steps_per_action=steps_per_action)
+        if max_episode_steps is not None:
+            check_whole(1, max_episode_steps=max_episode_steps)
         modes = [mode.value for mode in Mode]
         refuse({
             f"autoreset_mode must be one of {', '.join(modes)}, got {autoreset_mode!r}":
@@ -278,13 +280,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 def _read_only(x: Array) -> Array:
     x.flags.writeable = False
     return x
-
-
-def _check_counts(**counts: int | None) -> None:
-    for name, count in counts.items():
-        whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool) and count >= 1
-        if not whole and not (count is None and name == "max_episode_steps"):
-            raise InputError(f"{name} must be a whole number >= 1, got {count!r}")
 
 
 def _stepper_of(source: Any, trust_code: bool) -> ExportedStepper:

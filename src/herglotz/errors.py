@@ -6,6 +6,7 @@ The command line prints one line for an error, and ends with exit code 2.
 import sys
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from numbers import Integral
 from pathlib import Path
 
 
@@ -18,6 +19,13 @@ def refuse(wrong: dict[str, object]) -> None:
     for message, holds in wrong.items():
         if holds:
             raise InputError(message)
+
+
+def check_whole(least: int, **counts: object) -> None:
+    """Raise InputError for the first count, by its name, that is no whole number of at least `least`."""
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, Integral) or count < least:
+            raise InputError(f"{name} must be a whole number >= {least}, got {count!r}")
 
 
 def check_coordinates(where: str, option: str, wanted: Iterable[str], names: Sequence[str]) -> None:

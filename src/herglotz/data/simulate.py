@@ -10,7 +10,7 @@ from torch import Tensor
 
 from herglotz.data.checks import DTYPES, MIN_SAMPLES, check_positive
 from herglotz.data.trajectories import Trajectories
-from herglotz.errors import InputError
+from herglotz.errors import InputError, check_whole
 
 if TYPE_CHECKING:
     from herglotz.scenes import Scene
@@ -164,10 +164,9 @@ def uniform(name: str, limits: Range, shape: tuple[int, int], generator: torch.G
 
 
 def _check_counts(trajectories: int, steps: int, gaps: int, seed: int) -> None:
-    least_of = {"trajectories": (trajectories, 1), "steps": (steps, 2), "gaps": (gaps, 0), "seed": (seed, 0)}
-    for name, (value, least) in least_of.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise InputError(f"{name} must be a whole number >= {least}, got {value!r}")
+    check_whole(1, trajectories=trajectories)
+    check_whole(2, steps=steps)
+    check_whole(0, gaps=gaps, seed=seed)
     shortest = steps + 1 - LONGEST_GAP * gaps
     if shortest < max(MIN_SAMPLES, gaps + 1):
         raise InputError(

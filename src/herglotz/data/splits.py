@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES, offsets_of
-from herglotz.errors import InputError
+from herglotz.errors import InputError, check_whole
 
 # A part of a trajectory has at least so many samples in a row.
 RUN = 200
@@ -120,8 +120,7 @@ def every_mth(lengths: Sequence[int], every: int) -> Tensor:
 
     Raise InputError if `every` is not a whole number >= 1, or leaves a trajectory fewer than three samples.
     """
-    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-        raise InputError(f"every must be a whole number >= 1, got {every!r}")
+    check_whole(1, every=every)
     least = min(lengths)
     if every > max(most := (least - 1) // (MIN_SAMPLES - 1), 1):
         raise InputError(

@@ -173,14 +173,13 @@ def partials(
     return autograd_partials(L_d, q0, q1, s0, h, order)
 
 
-def check_function(L_d: Any) -> None:
+def check_function(L_d: Any, name: str = "L_d") -> None:
     """Raise InputError if L_d is no function of tensors: an object, or a class in place of a module of that class."""
+    what = f"{name} must be a module or function"
     if isinstance(L_d, type):
-        raise InputError(f"L_d must be a module or function, got the class {L_d.__name__}; make one: {L_d.__name__}()")
+        raise InputError(f"{what}, got the class {L_d.__name__}; make one: {L_d.__name__}()")
     if not callable(L_d):
-        raise InputError(
-            f"L_d must be a function L_d(q0, q1, s0, h), got a {type(L_d).__name__}; of a Stepper, give its L_d"
-        )
+        raise InputError(f"{what} L_d(q0, q1, s0, h), got a {type(L_d).__name__}; of a Stepper, give its L_d")
 
 
 def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:

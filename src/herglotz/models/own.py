@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,7 +11,7 @@ from torch import Tensor, nn
 
 from herglotz.errors import InputError
 from herglotz.mechanics import ClosedForm, DiscreteLagrangian, Driven, Forced, Partials
-from herglotz.mechanics.partials import functional_partials
+from herglotz.mechanics.partials import check_function, functional_partials
 from herglotz.models.capabilities import Capabilities, DrivenLagrangian
 
 # The terms of a user's L_d are unknown: every step iterates, and s may enter the motion.
@@ -154,12 +153,7 @@ class OwnLagrangian(nn.Module):
 
 def check_own(L_d: Any, inputs: int) -> None:
     """Raise InputError if L_d is no discrete Lagrangian, or has inputs and no `at(u)`."""
-    if isinstance(L_d, type):
-        raise InputError(
-            f"model must be a module or function, got the class {L_d.__name__}; make one: {L_d.__name__}()"
-        )
-    if not isinstance(L_d, Callable):
-        raise InputError(f"model must be a module or function L_d(q0, q1, s0, h), got a {type(L_d).__name__}")
+    check_function(L_d, "model")
     if inputs and not isinstance(L_d, Driven):
         name = getattr(L_d, "__name__", type(L_d).__name__)
         raise InputError(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, check_whole
 from herglotz.mechanics.contact import join, normal, split
 from herglotz.mechanics.newton import Root
 from herglotz.mechanics.partials import check_arguments, in_vmap
@@ -251,11 +250,11 @@ def step_sizes(h: Tensor, steps: int | None) -> Tensor:
 
     Raise InputError if a scalar comes without a count, or a list has another length than the count.
     """
-    if steps is not None and not isinstance(steps, Integral):
-        raise InputError(f"steps must be a whole number, got {steps!r}")
+    if steps is not None:
+        check_whole(1, steps=steps)
     if h.ndim == 0:
-        if steps is None or steps < 1:
-            raise InputError(f"a scalar h needs steps >= 1, got steps={steps}")
+        if steps is None:
+            raise InputError("a scalar h needs steps >= 1, got steps=None")
         return h.expand(steps)
     if steps is not None and steps != h.shape[-1]:
         raise InputError(f"h lists {h.shape[-1]} steps but steps={steps}; give one of the two")

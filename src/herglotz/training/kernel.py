@@ -269,6 +269,7 @@ class Functions:
         return tuple(y.clone() for y in (point.F, J, end, A, c, G))
 
 
+@torch.inference_mode(mode=False)
 def source_of(model: ContactLagrangian) -> str:
     """The C source of a structure: sizes, traced functions, and the runtime."""
     functions, prepared = Functions(model), Prepared()

@@ -7,13 +7,12 @@ residual.
 
 from __future__ import annotations
 
-from numbers import Integral
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError, refuse
+from herglotz.errors import InputError, check_whole, refuse
 from herglotz.mechanics import (
     DiscreteLagrangian,
     momentum_jacobian,
@@ -162,7 +161,7 @@ def starts(
         If q has fewer than three samples, or length is not positive.
     """
     _checked(q, 1.0, None, None)
-    refuse({f"length must be a whole number >= 1, got {length}": not isinstance(length, Integral) or length < 1})
+    check_whole(1, length=length)
     at = torch.arange(max((q.shape[-2] - 2) // length, 1), device=q.device) * length
     found = Starts(q[..., at, :], q[..., at + 1, :], q.new_zeros((*q.shape[:-2], len(at))))
     return Starts(*(x.detach().clone().requires_grad_() for x in found))

@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.driving import driven, even_times, input_recording
 from herglotz.data.input_terms import waves
-from herglotz.errors import InputError, check_start
+from herglotz.errors import InputError, check_start, check_whole
 from herglotz.stepping import State
 from herglotz.stepping.velocity import velocities
 from herglotz.threads import one_thread
@@ -83,8 +83,7 @@ def free_motion(
 ) -> Motion:
     """Step a run from its last fitted state, or from (q0, v0, s0) or (q0, p0, s0); see `Run.rollout`."""
     check_start(q0 is not None, v0 is not None, p0 is not None)
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
-        raise InputError(f"steps must be a whole number >= 1, got {steps!r}")
+    check_whole(1, steps=steps)
     fitted, time = run.last_fitted(trajectory if q0 is None else 0)
     time = t0 if t0 is not None else time if q0 is None else 0.0
     dtype = fitted.q.dtype

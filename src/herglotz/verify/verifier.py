@@ -51,6 +51,7 @@ NO_CONTACT_MAP = (
 
 
 @one_thread()
+@torch.inference_mode(mode=False)
 def verify(
     target: Any,
     *,
@@ -223,6 +224,7 @@ MAX_UNSEEN_STEPS = 200
 
 
 @one_thread()
+@torch.inference_mode(mode=False)
 def symmetries(
     target: Any,
     *,

@@ -122,7 +122,7 @@ def test_scalars_have_a_remedy(state, message):
     [
         (None, 2, "h must be a number or a tensor, in the unit of time, got None"),
         ("0.1", 2, "h must be a number or a tensor, in the unit of time, got '0.1'"),
-        (0.1, 2.5, r"steps must be a whole number, got 2\.5"),
+        (0.1, 2.5, r"steps must be a whole number >= 1, got 2\.5"),
         (f64(0.1, 0.2, 0.3)[:, None], 1, r"h of shape \(3,\) does not spread over states of shape \(2,\)"),
     ],
 )

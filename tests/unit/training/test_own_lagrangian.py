@@ -14,6 +14,7 @@ from herglotz.mechanics import autograd_partials
 from herglotz.models import OwnLagrangian
 from herglotz.stepping import Stepper
 from herglotz.training import laplace
+from herglotz.training.kernel import source_of
 from herglotz.training.parameter_vector import ParameterVector
 
 H = 0.1
@@ -256,6 +257,10 @@ def test_an_l_d_is_stepped_and_trained_in_inference_mode():
     with torch.inference_mode():
         inside, inner = [way(q) for way in ways], q + 0
         run = hz.fit(hz.simulate(hz.scene("damped_oscillator"), trajectories=1, steps=20, h=H, seed=0))
+        # fails if a check, or a kernel that is not on the disk yet, asks autograd there
+        assert run.verify(samples=4).passed
+        inner_source = source_of(run.model)
+    assert inner_source == source_of(run.model)
     assert run.metrics["verdict"].startswith("fits to the noise")
     for way, found in zip(ways, inside, strict=True):
         assert found.tolist() == way(q).tolist() == way(inner).tolist()
