@@ -36,10 +36,10 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.least_squares import least_squares
 from herglotz.mechanics.partials import DiscreteLagrangian, partials
 from herglotz.stepping import State, Status, Stepper
 from herglotz.stepping.state import check_batch
+from herglotz.theory.symmetry_words import formula, name_of
 
 # Largest drift of a symmetry of a known L_d. Symmetries leave 1e-16 to 1e-13 (float32: 1e-6), and a symmetry broken by
 # 1e-7 of the force leaves more (`tests/unit/theory/test_symmetries.py`).
@@ -189,13 +189,13 @@ class _Columns:
         return _rms(self.shift) > MIN_RELATIVE_DEFECT * self.terms
 
     def chi(self, rows: Tensor) -> Tensor:
-        """The boundary terms that minimise the defects of generators, (r, m) → (r, m')."""
+        """The coefficients χ of boundary terms that minimise the defects of generators, (r, m) → (r, m')."""
         usable = self.usable
         U, S, V = torch.linalg.svd(self.shift[:, usable] / self.terms[usable], full_matrices=False)
-        own = MIN_RELATIVE_DEFECT * (S.amax() if len(S) else 1.0) < S
-        left = (rows @ self.defect.mT) @ (U[:, own] / S[own]) @ V[own]
+        above_rounding = MIN_RELATIVE_DEFECT * (S.amax() if len(S) else 1.0) < S
+        fitted = (rows @ self.defect.mT) @ (U[:, above_rounding] / S[above_rounding]) @ V[above_rounding]
         chi = rows.new_zeros(len(rows), len(usable))
-        chi[:, usable] = -left / self.terms[usable]
+        chi[:, usable] = -fitted / self.terms[usable]
         return chi
 
     def drift(self, rows: Tensor) -> Tensor:
@@ -328,12 +328,12 @@ def _boundary(q: Tensor) -> Tensor:
 
 def _expanded(chi: Tensor, x: _Columns, a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """k, w, B of χ(q) = k + w·q + ½ q·B q, from boundary terms about q̄ and a s about s̄."""
-    n, size = len(x.centre), len(x.straight)
+    n, straight = len(x.centre), len(x.straight)
     slope, B = chi.new_zeros(len(chi), n), chi.new_zeros(len(chi), n, n)
-    i, j = (torch.tensor(x.straight, dtype=torch.int64)[y] for y in torch.triu_indices(size, size))
-    slope[:, x.straight] = chi[:, 1 : 1 + size]
-    B[:, i, j] += chi[:, 1 + size :]
-    B[:, j, i] += chi[:, 1 + size :]
+    i, j = (torch.tensor(x.straight, dtype=torch.int64)[y] for y in torch.triu_indices(straight, straight))
+    slope[:, x.straight] = chi[:, 1 : 1 + straight]
+    B[:, i, j] += chi[:, 1 + straight :]
+    B[:, j, i] += chi[:, 1 + straight :]
     k = chi[:, 0] - slope @ x.centre + 0.5 * (B @ x.centre) @ x.centre - a * x.middle
     # Where c = 1, a constant is no boundary term but a part of J.
     if not bool(x.usable[0]):
@@ -344,92 +344,3 @@ def _expanded(chi: Tensor, x: _Columns, a: Tensor) -> tuple[Tensor, Tensor, Tens
 def _rms(x: Tensor) -> Tensor:
     """Root mean square of every column."""
     return x.square().mean(0).sqrt()
-
-
-# An entry below this share of the largest counts as 0: printed numbers have four digits.
-MIN_RELATIVE_ENTRY = 1e-6
-
-
-def name_of(A: Tensor, b: Tensor, a: float, coordinates: Sequence[str]) -> str:
-    """Words for ξ(q) = A q + b with s ↦ s + ε a s, such as "translation along x"."""
-    A, b = _clean(A, b)
-    keeps_s, about = abs(a) <= MIN_RELATIVE_ENTRY, _fixed_point(A, b)
-    if keeps_s and not bool(A.any()):
-        return _translation(b, coordinates)
-    if keeps_s and about is not None and (plane := _plane(A)):
-        i, j = plane
-        kind = "rotation" if bool(torch.allclose(A, -A.mT)) else "elliptic rotation"
-        return f"{kind} in the plane ({coordinates[i]}, {coordinates[j]}){_around(about)}"
-    eye = torch.eye(len(b), dtype=A.dtype)
-    if about is not None and abs(a - 2) <= 1e-6 and bool(torch.allclose(A, eye)):
-        return f"scaling of q, and of s by its square{_around(about)}"
-    parts = [f"{name}′ = {_sum([*zip(A[i].tolist(), coordinates, strict=True), (float(b[i]), '')])}"
-             for i, name in enumerate(coordinates) if bool(A[i].any()) or b[i] != 0]  # fmt: skip
-    return f"affine motion {', '.join(parts if keeps_s else [*parts, f's′ = {a:.4g} s'])}"
-
-
-def _translation(b: Tensor, coordinates: Sequence[str]) -> str:
-    """Words for ξ(q) = b."""
-    moved = [name for name, x in zip(coordinates, b.tolist(), strict=True) if x]
-    if len(moved) == 1:
-        return f"translation along {moved[0]}"
-    if len(set(b[b != 0].tolist())) == 1:
-        return f"translation of {', '.join(moved[:-1])} and {moved[-1]} together"
-    return f"translation along ({', '.join(f'{x:.4g}' for x in b.tolist())})"
-
-
-def _plane(A: Tensor) -> list[int]:
-    """The two coordinates that A rotates, on circles or ellipses; empty if A is no such rotation."""
-    turned = (A != 0).nonzero().tolist()
-    return turned[0] if len(turned) == 2 and bool((A * A.mT).sum() < 0) else []
-
-
-def formula(
-    generator: Sequence[Tensor], boundary: Sequence[Tensor], coordinates: Sequence[str], drift: float = 0.0
-) -> str:
-    """J = p·(A q + b) − a s − χ(q) as text, from (A, b, a) and the (k, w, B) of χ.
-
-    Entries below ten times the drift, relative to the largest, are left out: the error of a learned χ has that size.
-    """
-    (A, b, a), (k, w, B) = generator, boundary
-    terms = []
-    for i, name in enumerate(coordinates):
-        terms.append((float(b[i]), f"p_{name}"))
-        terms += [(float(A[i, j]), f"{other} p_{name}") for j, other in enumerate(coordinates)]
-    terms.append((-float(a), "s"))
-    chi = [(-float(w[i]), name) for i, name in enumerate(coordinates)]
-    for i, name in enumerate(coordinates):
-        for j in range(i, len(coordinates)):
-            text = f"{name}²" if i == j else f"{name} {coordinates[j]}"
-            chi.append((-float(B[i, j]) * (0.5 if i == j else 1.0), text))
-    return _sum([*terms, *chi, (-float(k), "")], min(max(MIN_RELATIVE_ENTRY, 10 * drift), 0.1))
-
-
-def _sum(terms: list[tuple[float, str]], small: float = MIN_RELATIVE_ENTRY) -> str:
-    """The text `2 x − y + 3` for [(2, "x"), (−1, "y"), (3, "")]."""
-    least = small * max(abs(x) for x, _ in terms)
-    terms = [(x, symbol) for x, symbol in terms if abs(x) > least]
-    first = next((i for i, (x, _) in enumerate(terms) if x > 0), 0)
-    text = ""
-    for x, symbol in [*terms[first : first + 1], *terms[:first], *terms[first + 1 :]]:
-        number = f"{abs(x):.4g}" if abs(abs(x) - 1) > MIN_RELATIVE_ENTRY or not symbol else ""
-        sign = " − " if x < 0 else " + "
-        text += (sign if text else sign.strip().replace("+", "")) + " ".join(y for y in (number, symbol) if y)
-    return text or "0"
-
-
-def _clean(A: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    least = MIN_RELATIVE_ENTRY * max(float(A.abs().max()), float(b.abs().max()))
-    return torch.where(A.abs() > least, A, 0.0), torch.where(b.abs() > least, b, 0.0)
-
-
-def _fixed_point(A: Tensor, b: Tensor) -> Tensor | None:
-    """The point q with A q + b = 0 nearest to 0, or None."""
-    point = least_squares(A, -b[:, None])[:, 0]
-    return point if float((A @ point + b).abs().max()) <= MIN_RELATIVE_ENTRY * max(1.0, float(b.abs().max())) else None
-
-
-def _around(point: Tensor) -> str:
-    if float(point.abs().max()) <= MIN_RELATIVE_ENTRY:
-        return ""
-    return f" about ({', '.join(f'{x:.4g}' for x in point.tolist())})"

@@ -7,7 +7,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import partials
 from herglotz.stepping import State, Stepper
 from herglotz.theory import noether_defect, symmetries
-from herglotz.theory.symmetries import formula, name_of
+from herglotz.theory.symmetry_words import formula, name_of
 
 F64 = torch.float64
 H = 0.1
