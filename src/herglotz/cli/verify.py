@@ -26,9 +26,8 @@ examples:
   herglotz verify runs/pendulum --json
   herglotz verify stepper.onnx --against runs/pendulum
 """
-# Bounds on the largest difference after 1000 steps, relative to the largest value: each step amplifies rounding.
+# The largest difference after 1000 steps, relative to the largest value, is at most this: steps amplify rounding.
 MAX_DIFFERENCE = {"float64": 1e-9, "float32": 1e-3}
-
 
 HELP = "check the identities of the theory"
 FLAGS = (
@@ -47,7 +46,7 @@ FLAGS = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Verify and report; 1 when a check fails."""
+    """Verify and report; return 1 if a check fails, else 0."""
     refuse({
         "--samples must be >= 1, got 0": arguments.samples == 0,
         f"--steps must be >= 2, got {arguments.steps}": arguments.steps < 2,
@@ -55,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     import_torch()
     target = arguments.target
     if Path(target).is_file():
-        target = _opened(Path(target), arguments)
+        target, arguments.against = _opened(Path(target), arguments)
     elif arguments.against is not None:
         raise InputError(f"--against compares an exported file with a run; {target} is no file")
 
@@ -97,7 +96,7 @@ def _model_of(target: Any, arguments: argparse.Namespace) -> Any:
 
 
 def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: argparse.Namespace) -> str:
-    """The report, the symmetries, and the comparison of a file with its run."""
+    """The report, the symmetries, and the comparison of a file with its run, as text."""
     alone = agreement is None and report.passed and Path(arguments.target).is_file()
     verdict = "its identities hold; its numbers are not verified" if alone else ""
     if agreement is not None and not agreement["passed"]:
@@ -110,8 +109,11 @@ def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: 
     return "\n".join(parts)
 
 
-def _opened(path: Path, arguments: argparse.Namespace) -> Any:
-    """Open a file. A C header is trusted without --trust-code if its run is found and generates the same text."""
+def _opened(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path | None]:
+    """The stepper of an exported file, and the run to compare the file with: that of --against, or one nearby.
+
+    A C header is trusted without --trust-code if its run is found and generates the same text.
+    """
     from herglotz.export import load_c, load_exported
     from herglotz.export.load import read_header
     from herglotz.training import load_run
@@ -120,12 +122,11 @@ def _opened(path: Path, arguments: argparse.Namespace) -> Any:
         raise InputError(f"{path}: is data, not a model; fit it first: herglotz fit {path} --out RUN")
     form = FORMATS.get(of_ending(path.suffix) or "")
     if form is None or not form.is_c:
-        found = load_exported(path, trust_code=arguments.trust_code)
-        arguments.against = arguments.against or _exported_from(found.metadata, path)
-        return found
-    arguments.against = arguments.against or _exported_from(read_header(path)[1], path)
-    model = None if arguments.against is None else load_run(arguments.against).model
-    return load_c(path, trust_code=arguments.trust_code, model=model)
+        stepper = load_exported(path, trust_code=arguments.trust_code)
+        return stepper, arguments.against or _exported_from(stepper.metadata, path)
+    against = arguments.against or _exported_from(read_header(path)[1], path)
+    model = None if against is None else load_run(against).model
+    return load_c(path, trust_code=arguments.trust_code, model=model), against
 
 
 def _exported_from(metadata: dict[str, Any], file: Path) -> Path | None:
@@ -150,13 +151,13 @@ def _agreement(target: Any, arguments: argparse.Namespace) -> dict[str, Any]:
     from herglotz.stepping import State
     from herglotz.training import load_run
 
-    found = load_run(arguments.against)
-    states = State(*(x.to(target.dtype) for x in found.states))
+    run = load_run(arguments.against)
+    states = State(*(x.to(target.dtype) for x in run.states))
     states = State(*(x[states.finite] for x in states))
-    result = compare(target, found.stepper, h=arguments.h, states=states, seed=arguments.seed)
+    result = compare(target, run.stepper, h=arguments.h, states=states, seed=arguments.seed)
     bound = MAX_DIFFERENCE[target.metadata["dtype"]]
     close = all(result[name] <= bound for name in "qpsc")
-    other = other_metadata(target.metadata, found)
+    other = other_metadata(target.metadata, run)
     passed = close and result["status"] == 0 and result["same_weights"] is not False and not other
     return {**result, "bound": bound, "other_metadata": other, "passed": passed}
 
@@ -171,6 +172,7 @@ def other_metadata(metadata: dict[str, Any], run: Any) -> list[str]:
 
 
 def _table(agreement: dict[str, Any], against: Path | None) -> str:
+    """The differences of a file from its run as a text table, one row a batch size."""
     lines = [f"beside {against}, 1000 steps:", "largest difference, relative to the largest value"]
     lines.append(f"  {'batch':>6}" + "".join(f"  {name:>9}" for name in "qpsc") + "  failed  other status")
     for size, one in agreement["per_batch"].items():
