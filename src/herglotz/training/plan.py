@@ -15,11 +15,12 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.trades import listed
 
-# Columns of a printed table.
-COLUMNS = 80
-# A term that is a wave of a linear form of the coordinates. More waves of one form with the same factors are a
-# function, in the plan and in the printed equation.
-WAVE, MAX_WAVES = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<factors>(?: [^ ()]+)*)"), 6
+# Lines of the printed table have at most this many characters.
+LINE_WIDTH = 80
+# This pattern matches a term that is a wave of a linear form of the coordinates, with its factors.
+WAVE = re.compile(r"(?:sin|cos)\((?P<form>[^()]*)\)(?P<factors>(?: [^ ()]+)*)")
+# More waves of the same coordinates with the same factors are printed as one function, in the plan and in the equation.
+MAX_WAVES = 6
 # Starting values of the baseline; all other names in `Plan.start` are parameters of the model.
 STARTS = ("stiffness", "tilt", "rate")
 # Settings of a fit that a plan holds under the same name, beside the objective.
@@ -99,6 +100,7 @@ class Plan:
         return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, spreads=self.spreads)
 
     def _has_effect(self, name: str) -> bool:
+        """Whether the fit depends on this decision, so that the table lists the decision."""
         one_step = self.objective in ("residual", "raw")
         needed = {
             "substeps": self.substeps > 1,
@@ -115,17 +117,17 @@ class Plan:
         `unit` is the common unit of the coordinates, if they have one.
         """
         found: dict[str, list[str]] = {}
-        for name in filter(self._has_effect, DECISIONS):
-            taken = in_words(name, getattr(self, name), unit)
-            found.setdefault(self.reasons.get(name, ""), []).append(f"{WORDS[name]}: {taken}")
+        for name in filter(self._has_effect, WORDS):
+            decision = f"{WORDS[name]}: {in_words(name, getattr(self, name), unit)}"
+            found.setdefault(self.reasons.get(name, ""), []).append(decision)
         return [(decisions, reason) for reason, decisions in found.items()]
 
     def table(self, unit: str = "") -> str:
         """The decisions as a text table, each group with its reason below."""
         lines = []
         for decisions, reason in self.by_reason(unit):
-            lines += [textwrap.fill(x, COLUMNS, initial_indent="  ", subsequent_indent="    ") for x in decisions]
-            lines.append(textwrap.fill(reason, COLUMNS, initial_indent="      ", subsequent_indent="      "))
+            lines += [textwrap.fill(x, LINE_WIDTH, initial_indent="  ", subsequent_indent="    ") for x in decisions]
+            lines.append(textwrap.fill(reason, LINE_WIDTH, initial_indent="      ", subsequent_indent="      "))
         return "\n".join(filter(None, lines))
 
     def to_dict(self) -> dict[str, Any]:
@@ -141,7 +143,7 @@ class Plan:
         return replace(plan, start={name: tuple(x) for name, x in plan.start.items()})
 
 
-# Decisions in words. The starting values are too many for a table.
+# The decisions in words, in the order of the table. The starting values are too many for a table.
 WORDS = {
     "level": "level",
     "objective": "fitted to",
@@ -168,7 +170,6 @@ WORDS = {
     "restarts": "random initialisations",
     "departures": "strengths of the prior that are compared",
 }
-DECISIONS = tuple(WORDS)
 # Decisions that are listed only if they are not empty, 0 or False.
 IF_ANY = ("hold", "input_terms", "delay", "lag", "zeros", "drifts", "drag", "absent", "dissipation",
           "continues_probe", "fitted_before", "longest")  # fmt: skip
@@ -204,7 +205,7 @@ FORCES = {
 
 
 def in_words(name: str, value: Any, unit: str = "") -> str:
-    """One decision in words."""
+    """The value of the decision `name` in words; σ has the `unit`."""
     if name in MEANINGS:
         meaning = MEANINGS[name].get(value)
         return f"{meaning} ({value})" if meaning else str(value) or "none"
@@ -219,8 +220,8 @@ def in_words(name: str, value: Any, unit: str = "") -> str:
 
 def _gathered(terms: list[str]) -> list[str]:
     """The terms, with one entry for more than `MAX_WAVES` waves of the same coordinates: 22 waves of q1, q2."""
-    of = [WAVE.fullmatch(term) for term in terms]
-    keys = [x and (", ".join(sorted(set(re.findall(r"[a-z]\d+", x["form"])))), x["factors"]) for x in of]
+    matches = [WAVE.fullmatch(term) for term in terms]
+    keys = [x and (", ".join(sorted(set(re.findall(r"[a-z]\d+", x["form"])))), x["factors"]) for x in matches]
     found, counts = {}, Counter(keys)
     for term, key in zip(terms, keys, strict=True):
         if key is None or counts[key] <= MAX_WAVES:
@@ -232,6 +233,7 @@ def _gathered(terms: list[str]) -> list[str]:
 
 
 def _plainly(value: Any) -> str:
+    """A number, a flag or a name as text; None is a value that the fit still measures."""
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, bool):

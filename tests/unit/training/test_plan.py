@@ -16,7 +16,7 @@ from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, choose, fit, look
 from herglotz.training.choose import RULES, answers, choose_objective
-from herglotz.training.plan import DECISIONS, WORDS, in_words as plan_in_words
+from herglotz.training.plan import WORDS, in_words as plan_in_words
 from herglotz.training.stages import Stages
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "trajectory.md"
@@ -71,7 +71,7 @@ def test_the_first_rule_that_is_answered_decides(noise, settings, number, object
 def test_every_decision_has_a_reason(noise):
     # fails if a field is added to the plan and nobody says why it has its value
     plan = choose(*seen(noise))
-    assert set(plan.reasons) == {*DECISIONS, "start"}
+    assert set(plan.reasons) == {*WORDS, "start"}
     assert all(plan.reasons.values())
     table = plan.table()
     told = [WORDS[name] for name in ("level", "objective", "network", "order", "features", "forces", "outliers")]
