@@ -22,7 +22,7 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import Task
 
-# Lengths of the first segments, in recorded steps: over so few the motion is almost linear in states and forces.
+# The first segments have so few recorded steps that their motion is almost linear in states and forces.
 SHORT_SEGMENTS = (5, 10)
 # Segments stop growing if their error exceeds this multiple of the error of shorter segments.
 LOST = 2.0
@@ -35,16 +35,16 @@ FLOOR, SMALL = 1e-6, 1e-2
 # Factors on the prior strengths: the first range starts where the default one ends, the second at 5 baseline forces.
 # A weaker prior has to halve the error of the shortest segments.
 WEAKER, HALVED = (30.0, 900.0), 2.0
-# Multiple of the data's precision, as in the verdict.
+# A misfit above this multiple of the data's precision is not the noise, as in the verdict.
 NOT_THE_NOISE = 1.5
-# Damping λ of the first iteration: near the minimum, steps are Newton's.
+# The first iteration has this damping λ: near the minimum, steps are Newton's.
 FAR_OFF, NEAR = 1e-3, 1e-8
-# Most iterations of a stage. A start near the optimum needs fewer; a poor optimum is improved by the next stage.
+# A stage has at most this many iterations: a start near the optimum needs fewer, and a later stage improves the rest.
 STAGE = 40
-# The same for compiled models whose motion depends on s: rates and s make up for one another, so that steps are many
-# and small.
+# Stages of compiled models whose motion depends on s have more iterations: rates and s can make up for one another, so
+# that steps are many and small.
 STAGE_WITH_S = 200
-# With more coordinates an iteration takes up to 0.2 s, and gains of 1e-4 would take minutes.
+# With more than four coordinates an iteration takes up to 0.2 s, and gains of 1e-4 would take minutes.
 MANY_COORDINATES = 4
 
 
@@ -276,20 +276,25 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float, *, know
     stages, last = _longest(task, model, sigma, known=known)
     if last is None:
         return None
-    departures = stages.task.config.departures
     if model.potential.network is None:
-        return Chosen(last, departures[0], {departures[0]: last.held_out_errors()})
-    previous, noise = last, last.noise
+        departure = stages.task.config.departures[0]
+        return Chosen(last, departure, {departure: last.held_out_errors()})
     # Only converged fits are compared.
     stages.hurried = task.hurried and not stages.many
+    return _of_best_prior(stages, last)
+
+
+def _of_best_prior(stages: SegmentStages, last: TrajectoryFit) -> Chosen:
+    """The fit with the strength of the prior that held-out blocks choose, over the segments of the fit `last`."""
+    task, departures = stages.task, stages.task.config.departures
+    previous, noise = last, last.noise
 
     def fit(name: str, departure: float) -> TrajectoryFit | None:
         nonlocal previous
-        old = previous.problem
+        old, prior = previous.problem, prior_of(stages.model, task.base, departure)
         problem = ShootingProblem(
-            model, task.data, old.grid, sigma=noise, prior=prior_of(model, task.base, departure), freedom=old.freedom,
-            used=old.used,
-        )  # fmt: skip
+            stages.model, task.data, old.grid, sigma=noise, prior=prior, freedom=old.freedom, used=old.used
+        )
         problem.path = previous.path
         states = problem.states_at(previous.path, old.grid.start_sample)
         found = stages.optimise(problem, previous.theta, states, name)
@@ -320,26 +325,26 @@ def _longest(
 ) -> tuple[SegmentStages, TrajectoryFit | None]:
     """The fit to the longest segments that the model follows, with its stages; its loss is robust if need be.
 
-    A known model is first fitted to whole trajectories by least squares. A heavy-tailed loss replaces this fit unless
-    it gives up samples that least squares follow: the tails are then errors of the model, no outliers.
+    A known model is first fitted to whole trajectories by least squares. The fit by a heavy-tailed loss takes the place
+    of this fit unless it gives up samples that least squares follow: the tails are then errors of the model.
     """
-    plain, known_stages = None, SegmentStages(task, model)
+    plain, plain_stages = None, SegmentStages(task, model)
     if known and task.config.robust != "on":
-        known_to = max(sigma, FLOOR * task.size)
-        plain = known_stages.at_once(known_to)
+        least = max(sigma, FLOOR * task.size)
+        plain = plain_stages.at_once(least)
         tails = plain is not None and task.config.robust != "off" and heavy_tailed(plain.misfit)
-        if plain is not None and plain.noise <= LOST * known_to and not tails:
-            return known_stages, plain
+        if plain is not None and plain.noise <= LOST * least and not tails:
+            return plain_stages, plain
     stages, first = _wide_enough(task, model, sigma)
     if first is None:
-        return known_stages, plain
+        return plain_stages, plain
     first = stages.robust_or_not(first, known=known)
     skips_growth = known or model.potential.network is None
     last = (stages.whole(first, sigma if known else 0.0) if skips_growth else None) or stages.grow(first, sigma)
     if plain is None:
         return stages, last
-    own, its = (float(fit.misfit.square().mean().sqrt()) for fit in (last, plain))
-    return (stages, last) if own <= NOT_THE_NOISE * its else (known_stages, plain)
+    robust_rms, plain_rms = (float(fit.misfit.square().mean().sqrt()) for fit in (last, plain))
+    return (stages, last) if robust_rms <= NOT_THE_NOISE * plain_rms else (plain_stages, plain)
 
 
 def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:
