@@ -7,7 +7,7 @@ looked for:
 * samples that are noise, or too far apart for the motion;
 * positions on a circle, which one angle gives, or a distance from its centre that changes; counts of an encoder;
 * inputs that were recorded more often than the motion, and changed within its steps;
-* an acceleration of something else, a crane's trolley, that was left aside;
+* a column that was left aside and is the acceleration of something else, such as a crane's trolley;
 * an input that was recorded more slowly than the motion and filled in: its steps act at times between rows;
 * kicks, as of blows and end stops, in the residual or in the motion itself: a twentieth of the samples has more than
   half of the sum of squares, in several places with little before and after each;
@@ -22,9 +22,10 @@ which predict y for blocks of time from the other blocks (`left_by_the_past`):
 * from the state and the past z, with k(x, x′) (1 + z·z′/m): sums of functions of x, and of such functions times z_j;
 * from the state and the time since the start of the recording, in the same way with z = (t, t²).
 
-A force of the state that a model lacks is predicted by the state as well. The past of a motion has m signals of each
-coordinate: q̇, q̇² and q² through low-pass filters, as springs behind dampers, heat and the action remember them, and
-the position that a play has lost, as hysteresis remembers it. Time predicts what grows, leaks or wears.
+The present state predicts a missing force that depends on the state. The past of a motion has m signals of each
+coordinate: q̇, q̇² and q² through low-pass filters, which are the memory of springs behind dampers, of heat and of the
+action; and the position lost in a play, which is the memory of hysteresis. Time predicts masses that grow or leak, and
+wear.
 """
 
 from __future__ import annotations
@@ -46,43 +47,45 @@ from herglotz.data.units import COUNTS, size
 from herglotz.training.following import HALF
 from herglotz.training.properties import inverse, properties
 
-# Most samples: the distances between all of them take 32 MB.
+# At most this many samples are compared: the distances between all of them take 32 MB.
 MOST = 2000
-# Fewest accelerations: a twentieth of them is one.
+# Fewer accelerations give no reason: a kick is looked for among a twentieth of them, which has to be one at least.
 FEW = 20
-# Largest distance of neighbours, in standard deviations of the state: forces of a narrow range differ farther apart.
-NEAR = 0.5
+# Neighbours are at most this far apart, in standard deviations of the state: forces may differ beyond.
+MAX_DISTANCE = 0.5
 # The state does not give the acceleration if neighbours differ by more than this share of the variance without noise.
-# Measured: laws with a memory, and forces that were not recorded, 0.2 to 2; forces of the state that were left out at
-# most 0.11.
-OTHER = 0.15
-# The same over the noise: curvatures of windows that share samples differ by 1.5 times the noise by chance.
-CLEAR = 2.0
-# Samples of a kick: blows of a ball that bounces follow one another within 20 samples, and noise is less in five.
+# This share was measured: 0.2 to 2 for laws with a memory and for forces that were not recorded, at most 0.11 for
+# forces of the state that a model lacks.
+MAX_DIFFERENCE = 0.15
+# Neighbours have to differ by more than this multiple of the noise: curvatures of windows that share samples differ by
+# 1.5 times the noise by chance.
+MIN_DIFFERENCE_OVER_NOISE = 2.0
+# A kick has three samples, because blows of a ball that bounces follow one another within 20 samples, or five, because
+# five have less noise.
 KICK_SAMPLES = (3, 5)
-# Share of its square that an acceleration has before and after a kick, at the most.
-QUIET = 0.1
-# Fewest kicks. Motion that decays has its largest accelerations in one or two places.
-KICKS = 5
-# Widths ℓ of the kernel, in standard deviations of x, and ridges: those that predict best are taken.
+# Before and after a kick the square of the acceleration is at most this share of its value in the kick.
+MAX_SQUARE_BESIDE_KICK = 0.1
+# Fewer kicks are none: motion that decays has its largest accelerations in one or two places.
+MIN_KICKS = 5
+# The kernel has the width ℓ, in standard deviations of x, and the ridge that predict best.
 WIDTHS, RIDGES = (0.5, 1.0, 2.0, 4.0), (1e-3, 1e-2, 1e-1, 1.0)
-# Time constants of the filters, in periods 2π σ(q)/σ(q̇) of the motion, and half widths of the play, in σ(q).
+# The filters have these time constants, in periods 2π σ(q)/σ(q̇) of the motion, the plays these half widths, in σ(q).
 FILTERS, PLAYS = (1 / 8, 1 / 2, 2.0), (0.1, 0.3, 1.0)
-# Blocks of time that are predicted together, and blocks in all.
-FOLDS, PIECES = 8, 16
-# Most samples of a regression: an inverse takes about 5 ms.
-MOST_PREDICTED = 400
+# The recording is cut into `BLOCKS` blocks of time, and every eighth block is predicted together.
+FOLDS, BLOCKS = 8, 16
+# A regression has at most this many samples: its inverse then takes about 5 ms.
+MAX_PREDICTED = 400
 
-# The start of the reason of a law that changes with time.
+# The reason of a law that changes with time starts with these words.
 OF_TIME = "What is missed changes with time where positions, velocities and inputs are alike"
 
 
 def reason_of_data(data: Trajectories) -> str:
-    """The reason of a misfit that the data themselves show, and what to try; "" where they show none."""
+    """The reason of a misfit that the data themselves show, with a remedy; "" if they show no reason."""
     if found := circles(data):
         return hint(found)
-    if left := [note.removeprefix("warning: ") for note in data.notes if CIRCLE in note]:
-        return left[0]
+    if circular := [note.removeprefix("warning: ") for note in data.notes if CIRCLE in note]:
+        return circular[0]
     if changes := [note.removeprefix("warning: ") for note in data.notes if LENGTH in note or COUNTS in note]:
         return changes[0][0].upper() + changes[0][1:]
     if any(MEANS in note for note in data.notes):
@@ -122,9 +125,9 @@ def reason_of(
     owner: Tensor,  # (N,) free run of each sample
     level: str = "",
 ) -> str | None:
-    """The reason of a misfit, and what to try, in sentences; "" where none is shown, None where noise hides it.
+    """The reason of a misfit with a remedy, in sentences; "" if the residual shows no reason, None if noise hides it.
 
-    `level` is that of the model, which is not offered once more.
+    `level` is the level of the model, which is no remedy.
     """
     at = _Parabolas(data, owner, SAMPLES)
     if len(at.rows) < FEW:
@@ -139,13 +142,12 @@ def reason_of(
     hidden = float(noise.square().mean())
     if kicks := _kicks(data, miss, owner):
         return kicks
-    # Measured where a force is missing: of 75 recordings with a memory 52 are told, 34 of them by neighbours alone; of
-    # 50 without one 8 are, 7 of them by neighbours alone.
+    # On recordings with a missing force the rule was measured: a memory was told in 52 of 75 recordings that have one,
+    # 34 times by neighbours alone, and in 8 of 50 recordings without a memory, 7 times by neighbours alone.
     by_state, by_past, by_time = (left - hidden for left in left_by_the_past(data, lacking, x, middle))
-    if not _is_other(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle) and not (
-        by_state > OTHER * (1 - hidden) and min(by_past, by_time) < HALF * by_state
-    ):
-        return None if hidden > OTHER else ""
+    explained = by_state > MAX_DIFFERENCE * (1 - hidden) and min(by_past, by_time) < HALF * by_state
+    if not explained and not _neighbours_differ(lacking, hidden, x / x.std(0).clamp_min(1e-300), middle):
+        return None if hidden > MAX_DIFFERENCE else ""
     if by_time < min(by_past, HALF * by_state):
         changes = ", or ".join(ways_of_columns(data)) or "what changes as an input (--inputs)"
         own = "Try shorter recordings, each with a fit of its own"
@@ -157,16 +159,16 @@ def reason_of(
 
 
 def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
-    """What to try where the present state and the inputs do not give the force: only what a fit would take.
+    """Remedies if the present state and the inputs do not give the force: only those that a fit accepts.
 
-    What was recorded and left aside comes first.
+    Columns that were recorded and left aside come first.
     """
     ways = [] if data.u is not None or level == "full" else ["--level full, whose action remembers"]
     return [*columns, *ways] if (columns := ways_of_columns(data)) else [*ways, "a record of what else acts (--inputs)"]
 
 
 def ways_of_columns(data: Trajectories) -> list[str]:
-    """What to try with columns that were left aside by their unit or as rates, and with properties of recordings."""
+    """Remedies by columns that were left aside for their unit or as rates, and by properties of recordings."""
     others, rates = _left_aside(data)
     ways = _as_inputs_unless(data, others, rates)
     if others and len(data) > 1:
@@ -201,9 +203,10 @@ def _as_inputs(data: Trajectories, others: list[str]) -> str:
 
 
 class _Parabolas:
-    """Parabolas through all windows of so many samples that lie in one free run: `rows` (K, width) and mean steps `h`.
+    """Parabolas through all windows of `width` samples that lie in one free run.
 
-    `weights` (3, width) give the value in the middle, the slope and the curvature, in steps.
+    `rows` (K, width) are the samples of the windows, `h` (K, 1) their mean steps. `weights` (3, width) give the value
+    in the middle, the slope and the curvature, in steps.
     """
 
     def __init__(self, data: Trajectories, owner: Tensor, width: int):
@@ -220,12 +223,12 @@ class _Parabolas:
 
 
 def _kicks(data: Trajectories, miss: Tensor, owner: Tensor) -> str:
-    """That the motion is kicked, and what to try; "" if no kicks are seen.
+    """The reason that the motion is kicked, with a remedy; "" if no kicks are seen.
 
-    Terms of a model make up for an end stop, and leave no kicks: the recorded motion itself has them.
+    The recorded motion is looked at beside the residual: terms of a model may imitate an end stop and leave no kicks.
     """
-    seen = (("What is missed comes in kicks", miss, owner), ("The recorded velocity jumps", data.q, data.trajectory))
-    for what, signal, run in seen:
+    signals = (("What is missed comes in kicks", miss, owner), ("The recorded velocity jumps", data.q, data.trajectory))
+    for what, signal, run in signals:
         if (row := _kick(data, signal, run)) is not None:
             unit = "" if data.time_unit == "1" else data.time_unit
             when = f"t = {size(float(data.t[row]), unit)} of {data.label(int(data.trajectory[row]))}"
@@ -244,30 +247,30 @@ def _kick(data: Trajectories, x: Tensor, owner: Tensor) -> int | None:
         # Windows of a kick share its sample; those before and after it do not.
         around = torch.nn.functional.pad(square, (2 * width, 2 * width)).unfold(0, 4 * width + 1, 1)[top]
         beside = torch.cat([around[:, : width + 1], around[:, 3 * width :]], 1)
-        alone = top[beside.amax(1) < QUIET * square[top]]
+        alone = top[beside.amax(1) < MAX_SQUARE_BESIDE_KICK * square[top]]
         places = 1 + int((alone.sort().values.diff() > width).sum())
         most = float(square[top].sum())
-        if places >= KICKS and most > HALF * float(square.sum()) and float(square[alone].sum()) > HALF * most:
+        if places >= MIN_KICKS and most > HALF * float(square.sum()) and float(square[alone].sum()) > HALF * most:
             return int(at.rows[top[0], width // 2])
     return None
 
 
-def _is_other(lacking: Tensor, noise: float, x: Tensor, row: Tensor) -> bool:
+def _neighbours_differ(lacking: Tensor, noise: float, x: Tensor, row: Tensor) -> bool:
     """Whether accelerations (K, n) of variance 1 differ where states x (K, m) of other times are alike.
 
     `noise` is the share of the variance that is noise. The quarter of the samples with the nearest neighbours counts.
-    Forces of the state differ, too, by their slope times the distance, which a regression takes off.
+    A force of the state differs by its slope times the distance; a regression takes this part off the difference.
     """
     apart = torch.cdist(x, x).masked_fill((row[:, None] - row).abs() < 2 * SAMPLES, torch.inf)
     distance, other = apart.min(1)
     near = distance.argsort()[: max(1, len(x) // 4)]
-    if not float(distance[near[-1]]) < NEAR:
+    if not float(distance[near[-1]]) < MAX_DISTANCE:
         return False
     steps, differences = x[near] - x[other[near]], lacking[near] - lacking[other[near]]
     left = differences - steps @ (torch.linalg.pinv(steps) @ differences)
     freedom = max(1, len(near) - x.shape[1])
     differ = float(left.square().sum() / freedom) / (2 * lacking.shape[1])
-    return differ > max(CLEAR * noise, noise + OTHER * (1 - noise))
+    return differ > max(MIN_DIFFERENCE_OVER_NOISE * noise, noise + MAX_DIFFERENCE * (1 - noise))
 
 
 def left_by_the_past(
@@ -276,8 +279,11 @@ def left_by_the_past(
     x: Tensor,  # (K, m) state there
     at: Tensor,  # (K,) rows of these samples
 ) -> tuple[float, float, float]:
-    """Mean squares that remain, over the variance of y, of predictions from the state, alone, with past, with time."""
-    some = slice(None, None, -(-len(y) // MOST_PREDICTED))
+    """Mean squares of the errors of three predictions of y, over the variance of y.
+
+    The force is predicted from the state alone, from state and past, and from state and time.
+    """
+    some = slice(None, None, -(-len(y) // MAX_PREDICTED))
     since = data.t - data.t[list(data.offsets)][data.trajectory]
     time = torch.stack([since, since.square()], 1)
     parts = (y[some], x[some], signals(data)[at[some]], time[at[some]])
@@ -311,7 +317,7 @@ def signals(data: Trajectories) -> Tensor:
 
 def _remains(kernel: Tensor, y: Tensor) -> float:
     """Mean square of the errors of predictions of left-out blocks, with the best ridge; y has variance 1."""
-    blocks = torch.arange(len(y), device=y.device).tensor_split(PIECES)
+    blocks = torch.arange(len(y), device=y.device).tensor_split(BLOCKS)
     folds = [torch.cat(blocks[k::FOLDS]) for k in range(FOLDS)]
     found = []
     for ridge in RIDGES:
