@@ -13,12 +13,12 @@ from torch import Tensor
 
 from herglotz.data.checks import offsets_of
 from herglotz.data.gaps import complete
-from herglotz.data.splits import SHOWN
+from herglotz.data.splits import MIN_SHOWING_NOISE
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.windows import powers, pseudo_inverses
 
 # A polynomial of this degree is fitted to so many samples in a row.
-SAMPLES, DEGREE = SHOWN, 5
+SAMPLES, DEGREE = MIN_SHOWING_NOISE, 5
 # Degrees of `precision`. Noise leaves the same residual at each degree; coarsely sampled motion leaves less at higher
 # degrees.
 DEGREES = (3, 5, 7)

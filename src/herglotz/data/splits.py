@@ -10,11 +10,11 @@ from torch import Tensor
 from herglotz.data.checks import MIN_SAMPLES, offsets_of
 from herglotz.errors import InputError, check_whole
 
-# A part of a trajectory has at least so many samples in a row.
-RUN = 200
-# Samples in a row that show their noise: polynomials in time are fitted to as many (`herglotz.data.noise`).
-SHOWN = 9
-# Rows of the concatenation, and the number of rows of each trajectory.
+# `liveliest_rows` takes at least this many samples in a row of a trajectory.
+MIN_ROW = 200
+# This many samples in a row show their noise: polynomials in time are fitted to as many (`herglotz.data.noise`).
+MIN_SHOWING_NOISE = 9
+# A part is rows of the concatenation, and the number of rows of each trajectory.
 Part = tuple[Tensor, tuple[int, ...]]
 
 
@@ -23,7 +23,7 @@ def time_split(lengths: Sequence[int], fraction: float, source: str = "") -> tup
 
     A trajectory that is too short to be cut trains whole. Of three trajectories or more, none of which has two parts
     that show their noise, whole ones are held out: see `held_out_whole`. Raise InputError if the fraction is not inside
-    (0, 1), or no trajectory has two parts of three samples.
+    (0, 1), or no trajectory has two parts of three samples. Return the part that trains and the part that tests.
     """
     if not 0.0 < fraction < 1.0:
         raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
@@ -58,11 +58,11 @@ def cuts_of(lengths: Sequence[int], fraction: float) -> tuple[int, ...]:
 def held_out_whole(lengths: Sequence[int], fraction: float) -> tuple[bool, ...]:
     """Which trajectories are held out whole, evenly chosen: all but this fraction of three or more short ones.
 
-    They are short if none has two parts of `SHOWN` samples. The first three samples of a trajectory that is held out
-    train all the same: they say where it starts.
+    Trajectories are short if none has two parts of `MIN_SHOWING_NOISE` samples. The first three samples of a trajectory
+    that is held out train all the same: they give its starting state.
     """
     parts = (min(cut := round(fraction * length), length - cut) for length in lengths)
-    if len(lengths) < 3 or fraction == 1 or max(parts) >= SHOWN:
+    if len(lengths) < 3 or fraction == 1 or max(parts) >= MIN_SHOWING_NOISE:
         return (False,) * len(lengths)
     # Of trajectories that can be held out the k-th one is where (1 − fraction) k passes the next whole number.
     found, count = [], 0
@@ -89,19 +89,19 @@ def enough(kept: Tensor, lengths: Sequence[int]) -> Tensor:
     return torch.cat([own & (int(own.sum()) >= MIN_SAMPLES) for own in kept.split(list(lengths))])
 
 
-def leading(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
-    """Which samples are among the first `lengths[b]` of the `of[b]` samples of trajectory b, (N,) bool."""
-    return torch.cat([torch.arange(count) < k for count, k in zip(of, lengths, strict=True)])
+def leading(lengths: Sequence[int], counts: Sequence[int]) -> Tensor:
+    """Which samples are among the first `counts[b]` of the `lengths[b]` samples of trajectory b, (N,) bool."""
+    return torch.cat([torch.arange(length) < count for length, count in zip(lengths, counts, strict=True)])
 
 
-def leading_rows(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
+def leading_rows(lengths: Sequence[int], counts: Sequence[int]) -> Tensor:
     """Rows of the samples that are `leading`."""
-    return leading(of, lengths).nonzero()[:, 0]
+    return leading(lengths, counts).nonzero()[:, 0]
 
 
 def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
-    """At most about `most` samples: from evenly chosen trajectories the run of samples that moves most."""
-    own = min(max(most // len(lengths), RUN), max(lengths))
+    """About `most` samples at the most: of evenly chosen trajectories the samples in a row that move most."""
+    own = min(max(most // len(lengths), MIN_ROW), max(lengths))
     stride = max(1, -(-own * len(lengths) // most))
     rows, kept = [], []
     size = q.std(0, correction=0).clamp_min(torch.finfo(q.dtype).tiny)
@@ -116,7 +116,7 @@ def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
 
 
 def every_mth(lengths: Sequence[int], every: int) -> Tensor:
-    """Return which samples are 0, m, 2m, … of their trajectory, (N,) bool.
+    """Return which samples of their trajectory are 0, m, 2m, …, (N,) bool, with m = `every`.
 
     Raise InputError if `every` is not a whole number >= 1, or leaves a trajectory fewer than three samples.
     """

@@ -9,7 +9,7 @@ import torch
 from herglotz.data import Trajectories
 from herglotz.data.files import DIGITS, ONNX_ENTRY, check_seal, sealed_bytes, sealed_onnx, sealed_text, sealed_zip
 from herglotz.data.smoothing import _quality, local_polynomials, smooth_triples
-from herglotz.data.splits import RUN, liveliest_rows
+from herglotz.data.splits import MIN_ROW, liveliest_rows
 from herglotz.errors import InputError
 
 F64 = torch.float64
@@ -30,13 +30,13 @@ def test_inputs_are_averaged_over_the_window():
 
 def test_the_liveliest_run_is_taken_whole():
     # fails if the run starts where less moves, or ends before it began
-    q = torch.zeros(4 * RUN, 1, dtype=torch.float64)
-    q[3 * RUN - 60 : 3 * RUN - 40, 0] = torch.arange(20, dtype=torch.float64)
-    rows, kept = liveliest_rows(q, (4 * RUN,), RUN)
+    q = torch.zeros(4 * MIN_ROW, 1, dtype=torch.float64)
+    q[3 * MIN_ROW - 60 : 3 * MIN_ROW - 40, 0] = torch.arange(20, dtype=torch.float64)
+    rows, kept = liveliest_rows(q, (4 * MIN_ROW,), MIN_ROW)
     first = int(rows[0])
-    assert kept == (RUN,)
-    assert rows.tolist() == list(range(first, first + RUN))
-    assert first <= 3 * RUN - 60 < 3 * RUN - 40 <= first + RUN
+    assert kept == (MIN_ROW,)
+    assert rows.tolist() == list(range(first, first + MIN_ROW))
+    assert first <= 3 * MIN_ROW - 60 < 3 * MIN_ROW - 40 <= first + MIN_ROW
 
 
 def test_the_length_of_the_seal_of_onnx():
