@@ -38,14 +38,14 @@ from herglotz.training.trajectory_fit import LOST, STAGE
 PROCESS_NOISE = 0.1
 # Rounds of the estimate of both noises, which starts with steps as noisy as the data.
 ROUNDS = 8
-# Largest factor by which the noise of the steps falls in a round: a poor model explains too little.
-FALL = 10.0
-# The rounds end where the logarithm of that noise changes by less.
-SETTLED = 0.1
-# Least noise of the steps over that of the data: below, the states are a motion of the model.
-LEAST = 1e-2
-# Least σ relative to the largest |q|: rounding.
-FLOOR = 1e-8
+# The noise of the steps falls by at most this factor in a round: a poor model of the first rounds explains too little.
+MAX_FALL = 10.0
+# The rounds end if the logarithm of the noise of the steps changes by less than this.
+MIN_CHANGE = 0.1
+# The noise of the steps over the noise of the data is at least this: below, the states are a motion of the model.
+MIN_PROCESS = 1e-2
+# σ relative to the largest |q| is at least this: below, residuals are rounding.
+MIN_SIGMA = 1e-8
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class Smoothed:
 def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
     """The smoothed states of each trajectory for a fixed model; steps may differ, and samples may be missing.
 
-    `sigma` is the standard deviation of the noise of q, in its units, `process` the process noise (`SmoothingProblem`).
-    Small: the states follow the model; large: they follow the data. Raise InputError if sigma or process is not
-    positive, or a step has no solution near the data.
+    `sigma` is the standard deviation of the noise of q, in units of q, `process` the process noise
+    (`SmoothingProblem`). With a small process noise the states follow the model, with a large one the data. Raise
+    InputError if sigma or process is not positive, or a step has no solution near the data.
     """
     check_positive("sigma", sigma)
     check_positive("process", process)
@@ -81,7 +81,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
 
 
 def process_noise(model: ContactLagrangian, h: float) -> float:
-    """`process` of `SmoothingProblem` for steps h; it grows as √h, since the variance of a random force adds up."""
+    """`process` of `SmoothingProblem` for steps h, which grows as √h: the variance of a random force adds up."""
     angle = h * max(v / x for v, x in zip(model.config.speed, model.config.scale, strict=True))
     return PROCESS_NOISE * min(1.0, angle) ** 0.5
 
@@ -135,7 +135,7 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Smoothi
 
     With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. The prior is the
     weakest of the settings: the noise of the steps, not a network, follows pushes. On seven recordings a choice by
-    held-out blocks predicted better by at most 3 %. None where a step near the data has no solution.
+    held-out blocks predicted better by at most 3 %. None if a step near the data has no solution.
     """
     config = task.config
     prior = prior_of(model, task.base, weakest(config, model))
@@ -143,7 +143,7 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Smoothi
     freedom = FREEDOM if config.robust == "on" else None
 
     def stage(name: str, x: Tensor | None, process: float) -> SmoothingFit | None:
-        noise = max(sigma, FLOOR * task.size)
+        noise = max(sigma, MIN_SIGMA * task.size)
         problem = SmoothingProblem(model, task.data, grid, sigma=noise, process=process, prior=prior, freedom=freedom)
         return _minimised(task, name, problem, x)
 
@@ -156,9 +156,9 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Smoothi
     for k in range(ROUNDS):
         before = last.problem.process
         sigma, process = _noises(last)
-        process = max(process, before / FALL)
+        process = max(process, before / MAX_FALL)
         last = stage(f"smoothing, noise {k + 1}", last.x, process) or last
-        if abs(math.log(process / before)) < SETTLED:
+        if abs(math.log(process / before)) < MIN_CHANGE:
             break
     sigma, process = _noises(last)
     return stage("smoothing, last", last.x, process) or last
@@ -170,7 +170,7 @@ def weakest(config: FitConfig, model: ContactLagrangian) -> float:
 
 
 def _minimised(task: Task, name: str, problem: SmoothingProblem, x: Tensor | None) -> SmoothingFit | None:
-    """The fit of a stage from x, or from the data; None where its cost is not finite."""
+    """The fit of a stage from x, or from the data; None if the cost of the fit is not finite."""
     start, most = problem.start() if x is None else x, min(task.config.iterations, STAGE)
     least = partial(levenberg_marquardt, problem, max_iterations=most, rtol=1e-4, patience=3, damping=DAMPING)
     result = task.stages.run(name, start, most, lambda x, callback: least(x, callback=callback))
@@ -194,5 +194,5 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     by = problem.root_weights(defect).square()
     w = problem.process * problem.sigma
     w *= math.sqrt(float((by * defect.square()).sum()) / max(taken - starts, 0.01 * starts))
-    sigma = max(sigma, problem.sigma / FALL)
-    return sigma, max(w / sigma, LEAST)
+    sigma = max(sigma, problem.sigma / MAX_FALL)
+    return sigma, max(w / sigma, MIN_PROCESS)
