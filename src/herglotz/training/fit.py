@@ -45,7 +45,7 @@ from herglotz.training.summary import left_out_of, outlying_of
 from herglotz.training.uncertainty import Laplace, joint_of, laplace
 from herglotz.training.verdict import changes_with_time
 
-# Multiple of the σ of exact data. Smaller changes of the data are rounding.
+# Changes of the data below this multiple of the σ of exact data are rounding.
 ROUNDING = 3.0
 
 
@@ -121,7 +121,7 @@ def fit(
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
     plan = _planned(plan, data)
     data = weighed(data, config.objective if plan is None else plan.objective, config.supervision)
-    read = data
+    as_read = data
     if model is not None:
         return _fit_own(data, model, config, progress, reading, plan or out or resume or tensorboard)
     data = data if plan is None or plan.turning else on_a_line(data)
@@ -137,7 +137,7 @@ def fit(
             remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
         # Later recordings have no angles either if the fit found positions on a line.
-        line = {"angles": False} if any(read.angles) and not any(run.data.angles) else {}
+        line = {"angles": False} if any(as_read.angles) and not any(run.data.angles) else {}
         run = replace(run, reading=reading_told({**reading, **line}, data.names))
         if log is not None:
             log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
@@ -180,13 +180,14 @@ def told_arrival(data: Trajectories, config: FitConfig, planned: Arrival | None)
     # The phase of a periodic force is learned.
     if config.frequencies:
         return replace(data, delay=0.0, lag=0.0)
-    told = Arrival(data.hold, config.input_delay, config.actuator_lag)
-    known = [x for x in (told, data.arrival, planned) if x]
+    wanted = Arrival(data.hold, config.input_delay, config.actuator_lag)
+    known = [x for x in (wanted, data.arrival, planned) if x]
     hold, delay, lag = (next((x for x in each if x not in ("", None)), each[0]) for each in zip(*known, strict=True))
     return replace(data, hold=hold, delay=delay, lag=lag)
 
 
 def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stages) -> Run:
+    """The run of a fit: look, plan, objective, evaluation, then the equation and the verdict in words."""
     started = time.perf_counter()
     with stages.bar:
         seen, left_out = (look(data, config, stages, plan), ()) if plan else look_at_agreeing(data, config, stages)
@@ -197,8 +198,8 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         fitted = OBJECTIVES[plan.objective](task, seen, plan)
-        one = () if left_out else outlying(seen, fitted.model, fitted.sigma)
-        seen = replace(seen, outlying=() if one and changes_with_time(task, fitted, seen, one) else one)
+        suspects = () if left_out else outlying(seen, fitted.model, fitted.sigma)
+        seen = replace(seen, outlying=() if suspects and changes_with_time(task, fitted, seen, suspects) else suspects)
         found["outlying"] = [one.as_dict() for one in seen.outlying]
         _tell_outlying(found, data)
         run = evaluate(task, seen, plan, fitted, config)
@@ -215,6 +216,7 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
 
 
 def _tell_outlying(metrics: Mapping[str, Any], data: Trajectories) -> None:
+    """Print a warning for each recording that may be of something else."""
     for words in outlying_of(metrics, data):
         tell(f"{data.source or 'data'}: warning: {words}")
 
@@ -241,9 +243,10 @@ def _joint(posterior: Laplace | None, least: float) -> Joint | None:
 def _of_short_steps(run: Run, posterior: Laplace) -> Run:
     """The run with the numbers to which those of its model tend as steps get shorter, for the equation.
 
-    A rule of order 2 with steps h fits a stiffness that is h² k/12 of itself too small, many standard deviations of a
-    long recording. The run itself if the exact motion of these numbers is no nearer to the motion of the model, or
-    farther than the data are: the equation then has the rule of the step beside it, with the numbers of the model.
+    A rule of order 2 with steps h fits a stiffness k that is too small by the share h² k/12, which is many standard
+    deviations of a long recording. The run is returned unchanged if the exact motion of the new numbers is no nearer to
+    the motion of the model, or farther from it than the data are: the equation then has the numbers of the model, and
+    states the rule of the step.
     """
     if (limit := posterior.of_short_steps()) is None:
         return run

@@ -1,6 +1,7 @@
-"""`FittedRun`: the part of a `Run` that equation, summary, motion and prediction use, which `Run` imports.
+"""`FittedRun`: the attributes of a `Run` that equation, summary, motion and prediction use.
 
-`as_recorded` reads another recording as that of a run was read.
+These modules cannot import `Run`, because `Run` imports them. `as_recorded` reads another recording in the way in which
+the data of a run were read.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from herglotz.training.config import FitConfig
 
 
 class FittedRun(Protocol):
-    """Attributes of `herglotz.training.Run`, as a protocol against a circle of imports."""
+    """Attributes of `herglotz.training.Run`; a new one that these modules need is added here."""
 
     @property
     def model(self) -> ContactLagrangian: ...  # noqa: D102
@@ -58,19 +59,20 @@ def as_recorded(run: FittedRun, data: Any, **reading: Any) -> Trajectories:
 
     Columns, units, angles, sensors and, unless the file states its own, the hold of the inputs are those of the run.
 
-    `reading` are options of `as_trajectories`, which come before those of the run. Trajectories are positions already,
-    and take no zeros and scales of the run. Raise InputError if each recording of the run has a scale of its own.
+    `reading` are options of `as_trajectories`, which replace those of the run. Trajectories hold positions already, so
+    the zeros and scales of the run's sensors are not applied. Raise InputError if each recording of the run has a zero
+    or a scale of its own, because those of another recording are then unknown.
     """
     sensors = {} if isinstance(data, Trajectories) else run.reading
     for name in {"sensor_zeros", "sensor_scales"} & sensors.keys() - reading.keys():
-        told, what = sensors[name], name.replace("_", " ")
+        numbers, what = sensors[name], name.replace("_", " ")
         remedy = f"--{name.replace('_', '-')} ({name}= in Python)"
         several = f"each recording of the run has {what} of its own; give those of this one: {remedy}"
-        refuse({several: len(told) not in (0, run.data.dof)})
-        if told:
-            tell(f"{what} are those of the run, {', '.join(f'{x:.6g}' for x in told)}; for others {remedy}")
-        reading[name] = told
-    # Means of steps are constant over a step, whatever the hold that the recording was read with.
+        refuse({several: len(numbers) not in (0, run.data.dof)})
+        if numbers:
+            tell(f"{what} are those of the run, {', '.join(f'{x:.6g}' for x in numbers)}; for others {remedy}")
+        reading[name] = numbers
+    # The hold with which the file was read comes first: a fit to means of inputs over steps has the hold "zero".
     hold = run.reading.get("hold") or run.arrival.hold
     # Angles that the fit found to be positions on a line were read as angles, whose turns are counted.
     turning = (run.metrics.get("plan") or {}).get("turning", True)

@@ -26,12 +26,13 @@ from herglotz.training.trials import Trial, Variant
 
 
 class Questions:
-    """The answers so far.
+    """The answers so far; making the object asks questions 1 and 2, its methods ask the others.
 
-    `wanted` is the search of all data. `read` is the search of the part, of readings less the zeros of their sensors
-    once those are found. `best` is the model in `read`, and `differ` the zeros (B, n) with their standard deviations.
-    `hold` and `input_terms` are empty until another hold, or terms of the inputs, are found. `unread` is the search of
-    all data as they were recorded.
+    `wanted` is the search of all data, and `unread` that of all data as they were recorded. `read` is the search of the
+    part; once zeros of sensors are found, `read` has the readings less these zeros. `best` is the model in `read`, and
+    `differ` the zeros (B, n) with their standard deviations. `hold` is empty until another hold is found. `terms` are
+    all terms by which inputs act, `input_terms` those that are further columns of the inputs; `undriven` is the search
+    of all data without these.
     """
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
@@ -42,7 +43,7 @@ class Questions:
         self.best: Trial | None = None
         self.differ: tuple[Tensor, Tensor] | None = None
         asked = False
-        # A model that misses segments by more than the noise need not be grown to whole trajectories for that answer.
+        # A first model that already misses segments by more than the noise is not grown to whole trajectories.
         if wanted.part.misses_segments or (simple := wanted.part.first) is None or not simple.at_the_noise:
             # The whole dictionary lacks no term for which zeros or another hold could make up.
             read, found, differ = self.read.with_zeros_of_segments()
@@ -91,8 +92,9 @@ class Questions:
         """Find terms by which the inputs act, search the terms of the model anew with them, then the hold.
 
         A hold may have made up for a missing term of the inputs. If another hold is found now, terms of the inputs
-        that only made up for the hold leave. Terms make up so well for a wrong hold, u(t + τ) being u + τ u′, that no
-        other may be found beside them: where there are rates, or the noise is not met, every hold is tried without.
+        that only made up for the hold leave. Rates of inputs make up well for a wrong hold, because u(t + τ) is
+        u + τ u′, so that beside them no other hold may be found: if there are rates, or the misfit exceeds the noise,
+        every hold is tried without the rates.
         """
         if self.best is None or (asked := _asked(self.read, self.best)) is None:
             return
@@ -195,8 +197,8 @@ def _may_be_better(line: Search, trial: Trial) -> bool:
     """True if a search on a line is worth its time beside a model of angles."""
     straight = {offer.name for offer in line.fitter(Variant(line.order)).offers}.difference(WEIGHTS)
     turning = trial.taken - straight
-    # No model on a line is simpler than one with a single term for each coordinate. Of several coordinates these terms,
-    # stiffness, have the same names for angles.
+    # The simplest model on a line has a single term for each coordinate, stiffness. With several coordinates this term
+    # has the same name for an angle.
     if trial.lacks_nothing and (len(turning) <= (line.data.dof == 1) or not line.meets_segments):
         return False
     # The first model on a line must be no worse.
@@ -204,16 +206,18 @@ def _may_be_better(line: Search, trial: Trial) -> bool:
 
 
 def _is_better(other: Trial, trial: Trial, read: Search) -> bool:
-    """True if the model `other` on a line is better than a model of angles, over segments that both follow.
+    """True if the model `other` on a line is better than the model `trial` of angles, over segments that both follow.
 
-    Free runs over held-out time must not say otherwise. Of models that are alike the simpler one is better.
+    Free runs over held-out time must not contradict. Of two models with equal errors the simpler model is better.
     """
     length = min(trial.length, other.length)
     turning, line = (x if x.length == length else x.over(length) for x in (trial, other))
     if turning is None or line is None or read.better(turning, line) is turning:
         return turning is None and line is not None
-    its, ahead = (x.fitter.free_run_score(x) for x in (turning, line))
-    if ahead is None or its is None:
-        return ahead is not None
+    of_angles, on_line = (x.fitter.free_run_score(x) for x in (turning, line))
+    if on_line is None or of_angles is None:
+        return on_line is not None
     offered = trial.fitter.offered
-    return not its.replaces(ahead, offered) if its.numbers > ahead.numbers else ahead.replaces(its, offered)
+    if of_angles.numbers > on_line.numbers:
+        return not of_angles.replaces(on_line, offered)
+    return on_line.replaces(of_angles, offered)

@@ -53,13 +53,13 @@ from herglotz.training.trajectory_fit import FAR_OFF, FOLLOWED, LOST, NEAR, SHOR
 ITERATIONS = 15
 # Share of every trajectory to which finalists are fitted; they run free over the rest.
 FITTED_SHARE = 0.75
-# Largest misfit, as a share of the spread of the data, with which a model follows segments.
+# A model does not follow segments if its misfit exceeds this share of the spread of the data.
 MAX_MISFIT = 0.25
 # Halved model steps are tried if they change the motion by more than this share of the misfit.
 FINER = 0.3
-# Misfits below this many σ of exact data are rounding.
+# A misfit below this many σ of exact data is rounding.
 ALIKE = 10.0
-# Noise, as a share of the spread of the data, below which a rule of order 4 is worth its time.
+# A rule of order 4 is worth its time if the noise is below this share of the spread of the data.
 ORDER_4_NOISE = 1e-3
 # Largest number of model steps in a recorded step, and in all trajectories.
 MAX_SUBSTEPS, MAX_STEPS = 64, 15_000
@@ -101,9 +101,9 @@ class Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class Trial:
-    """A fitted model: the offers it has `taken`, the `values` of all numbers of the dictionary, and the path.
+    """A fitted model: the offers `taken` by the model, the `values` of all numbers of the dictionary, and the path.
 
-    `scales` are the prior variances of its functions over those of the fitter.
+    `scales` are the prior variances of the model's functions over those of the fitter.
     """
 
     fitter: Fitter
@@ -133,8 +133,8 @@ class Trial:
     def injecting_friction(self) -> dict[str, int]:
         """Dry friction with an amplitude of 0 or less, which would inject energy: name → coordinate."""
         several = self.fitter.data.dof > 1
-        every = {DRY + (f"[{i}]" if several else ""): i for i in range(self.fitter.data.dof)}
-        return {name: i for name, i in every.items() if name in self.taken and self.values[name] <= 0}
+        amplitudes = {DRY + (f"[{i}]" if several else ""): i for i in range(self.fitter.data.dof)}
+        return {name: i for name, i in amplitudes.items() if name in self.taken and self.values[name] <= 0}
 
     @property
     def length(self) -> int:
@@ -174,9 +174,9 @@ class Trial:
 
     @cached_property
     def unstable(self) -> bool:
-        """True if the model meets the samples of its segments to the noise, and in longer ones noise would be `lost`.
+        """True if the misfit of the samples is about the noise, and the start of longer segments would be `lost`.
 
-        Without the joints, whose misfit of an unstable motion is that of the ends of segments.
+        The residuals of joints do not count: if the motion is unstable, they are the misfit of the segments' ends.
         """
         if self.whole or not self.lost:
             return False
@@ -187,8 +187,8 @@ class Trial:
     def lost(self) -> bool:
         """True if an error of the start as small as the noise grows to the spread of the motion in longer segments.
 
-        In two segments, one after the other, by the linearised steps of this model: as an unstable motion does. Longer
-        segments would tell a wrong start from a wrong force no more. False where the noise is unknown.
+        The linearised steps of this model carry the error through two successive segments. If the motion is so
+        unstable, longer segments cannot distinguish a wrong start from a wrong force. False if the noise is unknown.
         """
         problem, grid, data = self.problem, self.problem.grid, self.problem.data
         if self.whole or not math.isfinite(self.fitter.precision):
@@ -222,6 +222,7 @@ class Trial:
 
     @cached_property
     def _scores(self) -> dict[float, Score]:
+        """The scores computed so far, by their floor."""
         return {}
 
     @property
@@ -240,6 +241,7 @@ class Trial:
 
     @cached_property
     def _shorter(self) -> dict[int, Trial | None]:
+        """The models over shorter segments fitted so far, by the length of their segments."""
         return {}
 
     def over(self, length: int) -> Trial | None:
@@ -312,9 +314,9 @@ class Trial:
 class Fitter:
     """Fits of subsets of a dictionary's parameters to recordings, for one variant of the model.
 
-    `like` is another fitter of the same data, which shares its segments and noise levels. Steps are not halved beyond
-    `finest` in a recorded one. Numbers are scalar parameters, by name; `keys` has the term of each number. Features in
-    the settings take the place of `candidates`; `ratios` are those of the candidates.
+    `like` is another fitter of the same data, which shares its segments and noise levels. A recorded step has at most
+    `finest` model steps. Numbers are scalar parameters, by name; `keys` has the term of each number. Features in the
+    settings take the place of `candidates`, whose `ratios` are the argument of that name.
     """
 
     def __init__(
@@ -362,13 +364,13 @@ class Fitter:
 
     @property
     def constant_forces(self) -> set[str]:
-        """Names of the offers of a force at rest, for which a zero of the sensor can stand."""
+        """Names of the offers of a force at rest, which a zero of the sensor can imitate."""
         own = {key for key, (parameter, _) in own_terms(self.data.angles).items() if parameter == TILT}
         return own.union(key for number, key in self.keys.items() if number.startswith(TILT))
 
     @property
     def floor(self) -> float:
-        """Residuals below it are rounding, or the error of the finest steps, in units of q over the balance."""
+        """Residuals below this floor are rounding or the error of the finest steps, in units of q over the balance."""
         return max(self.rounding, self.of_steps.get(self.variant.order, 0.0))
 
     @property
@@ -377,9 +379,9 @@ class Fitter:
         return math.hypot(AT_THE_NOISE * self.precision, self.floor)
 
     def explain(self, trial: Trial, by_steps: float) -> None:
-        """Take the error of the finest steps for the floor of misfits, if it explains what the model of a trial misses.
+        """Raise the floor of misfits to the error `by_steps` of the finest steps, if this error explains the misfit.
 
-        That has to be next to nothing: steps of a wrong model may be as far off as the model.
+        The misfit has to be at most `EXACT_ENOUGH` of the spread: a larger one may be that of a wrong model.
         """
         least = math.hypot(by_steps, self.about_the_noise)
         if self.about_the_noise < trial.rms <= min(least, EXACT_ENOUGH * self.spread):
@@ -392,7 +394,7 @@ class Fitter:
 
     def _weights(self, numbers: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
         """Prior weights 1/variance by number: all, and those of waves and of powers that waves can imitate."""
-        # Rates of a search stay where they began: under a controller they would make up for wrong forces of the inputs.
+        # A search keeps the prior of rates narrow: under a controller other rates would imitate wrong forces of inputs.
         prior, bands = prior_of(self.model, self.base, None, wide_rates=False), self.variant.functions
         names = [numbers[int(i)] for i in prior.index]
         weights = {name: spread**-2 for name, spread in zip(names, prior.spread.tolist(), strict=True)}
@@ -477,10 +479,11 @@ class Fitter:
         return None if path is None else free_run_score(problem, path, trial.score.numbers, self.floor)
 
     def longer(self, trial: Trial) -> Trial | None:
-        """The model over segments of the next length; None if there is none or the model does not follow so long.
+        """The model over segments of the next length; None if no length is left, or the model does not follow these.
 
-        None, too, if a model at the noise lets noise grow to the spread in these: held-out blocks of such segments
-        compare starts, and no forces. Of a model that misses more, it may be the model that is unstable.
+        None also if the model is `unstable`: held-out blocks of longer segments would compare starts, and no forces. If
+        the misfit exceeds the noise, the segments grow all the same: a wrong model may be unstable where the motion is
+        stable.
         """
         if trial.whole or trial.unstable:
             return None
@@ -519,14 +522,14 @@ def _terms(
 def _undetermined_masses(data: Trajectories, config: FitConfig) -> set[str]:
     """Names of the masses whose scale positions do not determine: of coordinates that no term joins to the first one.
 
-    Were such a mass free, a larger one would stand, to first order, for all forces that leave.
+    If such a mass were free, a larger mass would, to first order, make up for every force that leaves the model.
     """
     apart = groups(config.features, data.angles)[1:] if config.features else []
     return {f"kinetic.log_diagonal[{own[0] - 1}]" for own in apart}
 
 
 def _minimised(problem: ShootingProblem, x: Tensor, most: int, damping: float) -> tuple[Tensor, Path | None]:
-    """The unknowns after a fit from x in at most so many iterations, and their path; None if none is found."""
+    """The unknowns after a fit from x in at most `most` iterations, and their path; None if no path is found."""
     result = levenberg_marquardt(problem, x, max_iterations=most, rtol=1e-3, patience=2, damping=damping)
     return result.x, problem.solve(result.x) if math.isfinite(result.cost) else None
 
@@ -563,17 +566,17 @@ def explained_by_steps(change: float, order: int) -> float:
 
 
 def scores_of(own: Trial, other: Trial) -> tuple[Score, Score]:
-    """The scores of two models with one floor, because losses of different floors cannot be compared."""
+    """The scores of two models with a common floor, because losses of different floors cannot be compared."""
     floor = max(own.fitter.floor, other.fitter.floor)
     return own.score_above(floor), other.score_above(floor)
 
 
 def of_one_length(own: Trial, other: Trial) -> tuple[Trial, Trial] | None:
-    """Two models over segments of one length; None if their segments differ, and longer ones say more.
+    """Two models over segments of one length; None if their segments differ, and the longer segments decide.
 
-    Segments of an unstable motion are as long as they can be if noise grows to the spread in longer ones
-    (`Trial.unstable`). A model that misses longer ones by more than the noise follows them with a motion less
-    unstable than that of a model at the noise of the shorter ones: the two are compared over these.
+    Segments are as long as they can be if noise grows to the spread of the motion in longer segments
+    (`Trial.unstable`). If the model of the shorter segments is so, and the model of the longer segments misses these by
+    more than the noise, the longer segments say nothing: both models are compared over the shorter segments.
     """
     if own.length == other.length:
         return own, other
@@ -603,8 +606,8 @@ def compared_models(fitters: Iterable[Fitter], trial: Trial) -> list[dict[str, A
     rows: dict[frozenset[str], Compared] = {}
     for fitter in fitters:
         for row in fitter.compared:
-            before = rows.get(row.taken)
-            better = math.isfinite(row.held_out) and (before is None or row.held_out < before.held_out)
+            best = rows.get(row.taken)
+            better = math.isfinite(row.held_out) and (best is None or row.held_out < best.held_out)
             if row.length == trial.length and better:
                 rows[row.taken] = row
     rows[trial.taken] = Compared(trial.length, trial.problem.P, trial.score.rms, trial.taken)
