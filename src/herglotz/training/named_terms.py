@@ -24,8 +24,10 @@ MIN_EXCURSION_RATIO = 0.1
 PARTS_OF_RECORDING = 50
 # Minimum distance over RMS distance. Closer to 0 the powers of r are no candidates.
 MIN_DISTANCE_RATIO = 0.02
+# These parameters hold the coefficients of features without and with velocities, of forces, and of powers of s.
 STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
 IN_S = "action.coefficient"
+# The parameter of dry friction, which is one term for all coordinates.
 DRY = "friction.coulomb"
 # The potential of a constant force on a length.
 CONSTANT = "q1"
@@ -63,6 +65,7 @@ class NamedTerms:
         return replace(self._each(lambda _, own: (x for x in own if x in names)), dry=self.dry and DRY in names)
 
     def _each(self, chosen: Callable[[str, tuple[str, ...]], Iterable[str]]) -> NamedTerms:
+        """The terms with `chosen(kind, terms)` in place of the features, the drag and the powers of s."""
         kinds = ("features", "drag", "dissipation")
         return replace(self, **{name: tuple(chosen(name, getattr(self, name))) for name in kinds})
 
@@ -175,6 +178,7 @@ def chains(data: Trajectories) -> list[NamedTerms]:
 
 
 def _where(rule: Callable[[Product], bool], terms: Sequence[tuple[str, Product]]) -> tuple[str, ...]:
+    """The names of the terms that fulfil a rule."""
     return tuple(name for name, f in terms if rule(f))
 
 
@@ -191,6 +195,7 @@ def _by_slides(angles: Sequence[bool]) -> tuple[list[tuple[str, Product]], list[
 
 
 def _form(f: Product) -> dict[int, float]:
+    """The linear form of a term by coordinate, without zeros."""
     return {i: w for i, w in enumerate(f.form) if w}
 
 
@@ -244,18 +249,18 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     )  # fmt: skip
 
 
-def started(base: Baseline, data: Trajectories, values: dict, of: FitConfig) -> Baseline:
+def started(base: Baseline, data: Trajectories, values: dict, config: FitConfig) -> Baseline:
     """The baseline with starting `values`, by the name of a term or of a parameter, for a model of these settings."""
     rest = {name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")}
     rate = rest.pop("damping.rate", (0.0,))[0]
     # Viscous friction of the first mass, which is 1, acts as the rate.
-    if data.dof == 1 or of.level == "linear":
+    if data.dof == 1 or config.level == "linear":
         rate += rest.pop("friction.viscous", (0.0,))[0]
-    for parameter, names in holders(of.features, of.drag, of.dissipation).items():
+    for parameter, names in holders(config.features, config.drag, config.dissipation).items():
         rest[parameter] = tuple(values.get(name, 0.0) for name in names)
-    zero, rest = (0.0,) * data.dof, {own: x for name, x in rest.items() if x and (own := _name_in(of, name))}
+    zero, rest = (0.0,) * data.dof, {own: x for name, x in rest.items() if x and (own := _name_in(config, name))}
     stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
-    step = base.max_step if of.substeps == 1 else JITTER * data.typical_step / of.substeps
+    step = base.max_step if config.substeps == 1 else JITTER * data.typical_step / config.substeps
     return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, model_step=step)
 
 
@@ -265,47 +270,51 @@ def holders(features: Sequence[str], drag: Sequence[str] = (), dissipation: Sequ
     return {STILL: still, MOVING: moving, DRAG: list(drag), IN_S: list(dissipation)}
 
 
-def by_term(start: Mapping[str, Tensor], held: Mapping[str, Sequence[str]]) -> dict:
-    """Values of parameters as plain numbers; coefficients by the names of their terms (`holders`)."""
+def by_term(start: Mapping[str, Tensor], terms: Mapping[str, Sequence[str]]) -> dict:
+    """Values of parameters as plain numbers; coefficients by the names of their `terms`, as `holders` returns them."""
     values: dict = {name: tuple(x.reshape(-1).tolist()) for name, x in start.items()}
-    for parameter, names in held.items():
+    for parameter, names in terms.items():
         values |= zip(names, values.pop(parameter, ()), strict=True)
     return values
 
 
-def _name_in(of: FitConfig, name: str) -> str:
+def _name_in(config: FitConfig, name: str) -> str:
     """The name of a parameter in a model of these settings; "" if the model lacks the parameter."""
     if name.startswith("kinetic.") and name != MOVING:
         name = name.replace("kinetic.base.", "kinetic.")
-        if of.diagonal and name == "kinetic.off_diagonal":
+        if config.diagonal and name == "kinetic.off_diagonal":
             return ""
-        return name.replace("kinetic.", "kinetic.base.") if any("v" in x for x in of.features) else name
+        return name.replace("kinetic.", "kinetic.base.") if any("v" in x for x in config.features) else name
     if name.startswith("friction."):
         dry = name.removeprefix("friction.") in ("coulomb", "breakaway", "log_smooth", "log_stribeck")
-        gone = of.level != "forced" or (dry and not of.coulomb) or (of.sticking and name == "friction.log_smooth")
+        gone = (
+            config.level != "forced"
+            or (dry and not config.coulomb)
+            or (config.sticking and name == "friction.log_smooth")
+        )
         return "" if gone else name
-    return "" if name == "coupling.viscous" and not of.coupled else name
+    return "" if name == "coupling.viscous" and not config.coupled else name
 
 
 def values_of(parameters: ParameterVector, theta: Tensor) -> dict:
     """Values by the name of a term, or as tuples by the name of a parameter."""
-    named, of = parameters.unflatten(theta), parameters.model.config
+    named, config = parameters.unflatten(theta), parameters.model.config
     # As features the baseline's coefficients are −k, b for an angle and k/2, b for a length.
-    if baseline_is_named(of):
-        own, named[STILL] = named[STILL][: 2 * of.dof], named[STILL][2 * of.dof :]
-        turn = own.new_tensor([-1.0 if angle else 2.0 for angle in of.angles])
-        named |= {"potential.stiffness": own[::2] * turn, "potential.tilt": own[1::2]}
-    return by_term(named, holders(of.features, of.drag, of.dissipation))
+    if baseline_is_named(config):
+        own, named[STILL] = named[STILL][: 2 * config.dof], named[STILL][2 * config.dof :]
+        factor = own.new_tensor([-1.0 if angle else 2.0 for angle in config.angles])
+        named |= {"potential.stiffness": own[::2] * factor, "potential.tilt": own[1::2]}
+    return by_term(named, holders(config.features, config.drag, config.dissipation))
 
 
 def places(parameters: ParameterVector) -> dict[str, list[int]]:
     """Places in the parameter vector of the coefficients of each term; dry friction has one per coordinate."""
-    of, at = parameters.model.config, {}
-    for parameter, names in holders(of.features, of.drag, of.dissipation).items():
-        at |= zip(names, ([i] for i in parameters.index(parameter).tolist()), strict=True)
-    if of.coulomb:
-        at[DRY] = parameters.index(DRY).tolist()
-    return at
+    config, found = parameters.model.config, {}
+    for parameter, names in holders(config.features, config.drag, config.dissipation).items():
+        found |= zip(names, ([i] for i in parameters.index(parameter).tolist()), strict=True)
+    if config.coulomb:
+        found[DRY] = parameters.index(DRY).tolist()
+    return found
 
 
 def shapes_of_dry(parameters: ParameterVector) -> Tensor:
