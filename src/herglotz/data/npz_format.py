@@ -23,13 +23,14 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 from herglotz.schema import check_entries
 
+# Names of the arrays that are read from an archive.
 USED = (*ARRAYS, "lengths", "metadata")
-# Bytes that the arrays of an archive may take: 67 million samples of t and three coordinates.
+# The arrays of an archive may take this many bytes: 67 million samples of t and three coordinates.
 MAX_BYTES = 2**31
 
 
 class Metadata(TypedDict, total=False):
-    """The metadata of an archive: fields of `Trajectories`; each column is name, role and unit."""
+    """The metadata of an archive: fields of `Trajectories`; each of the `columns` is a name, a role and a unit."""
 
     names: list[str]
     units: list[str]
@@ -51,9 +52,9 @@ def read_npz(path: PathLike) -> Trajectories:
 
     Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and `metadata`
     (a JSON object with names, units, angles, time_unit, source, hold, delay, lag, columns, recordings) may follow.
-    Integer arrays become float64. In an archive without metadata, marks of missing readings (`herglotz.data.marks`) are
-    missing, with a warning; `write_npz` writes metadata, and what it wrote stays as it is. InputError names the file,
-    the array, what is wrong with the array and the remedy.
+    Integer arrays become float64. Marks of missing readings (`herglotz.data.marks`) count as missing, with a warning,
+    unless the archive has metadata: an archive of `write_npz` has metadata and is read as it was written. Raise
+    InputError that names the file, the array, the fault and the remedy.
     """
     return trajectories_of(read_bytes(path), Path(path))
 
@@ -82,16 +83,16 @@ def _without_marks(data: Trajectories) -> Trajectories:
     Positions that are marks are missing; inputs that are marks are held from the sample before.
     """
     parts = [x.double().numpy() for x in (data.t[:, None], data.q, data.u) if x is not None]
-    names = [(name, False) for name in data.names] + [(name, True) for name, _ in data.input_labels]
-    columns = [(k, *own) for k, own in enumerate(names, 1)]
+    labels = [(name, False) for name in data.names] + [(name, True) for name, _ in data.input_labels]
+    columns = [(k, name, is_input) for k, (name, is_input) in enumerate(labels, 1)]
     table, notes = without_marks(np.hstack(parts), data.trajectory.tolist(), range(data.samples), columns)
     if not notes:
         return data
     numbers = torch.from_numpy(table[:, 1:]).to(data.q)
     q, u = numbers[:, : data.dof], numbers[:, data.dof :]
     u = last_read(u, ~u.isnan(), data.trajectory)
-    held = None if data.u is None else u.nan_to_num(nan=0.0)
-    found = replace(data, u=held, notes=(*data.notes, *notes))
+    inputs = None if data.u is None else u.nan_to_num(nan=0.0)
+    found = replace(data, u=inputs, notes=(*data.notes, *notes))
     return with_missing(found, ~q.isnan(), lambda k: f"sample {k}", u.isnan().any(1))
 
 
@@ -113,7 +114,7 @@ def npz_bytes(trajectories: Trajectories) -> bytes:
 
 
 def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an archive. Arrays that no set has stay empty: a small archive can hold gigabytes of zeros."""
+    """The arrays of an archive by name. Those that are not `USED` stay empty: they may unpack to gigabytes of zeros."""
     if not content.startswith(b"PK"):
         raise InputError(f"{path}: is not a .npz archive; write it with numpy.savez or herglotz.data.save")
     arrays: dict[str, np.ndarray] = {}
@@ -138,7 +139,7 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
 
 
 def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
-    """Raise before memory is taken for arrays of more than `MAX_BYTES`."""
+    """Raise InputError if the arrays take more than `MAX_BYTES`, before they take memory."""
     size = sum(one.file_size for one in archive.infolist() if one.filename.removesuffix(".npy") in USED)
     memory = f"{size / 2**30:.1f} GB of memory, more than {MAX_BYTES / 2**30:.0f}"
     refuse({f"{path}: its arrays take {memory}; save fewer samples": size > MAX_BYTES})

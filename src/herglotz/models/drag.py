@@ -118,6 +118,7 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
         refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
         return DragFeature(0, 0, b=1, c=1, air=True)
     f = _read(text, plain)
+    # Indices are checked first, because the checks of angles below use them.
     powers = map(int, re.findall(r"\^(\d+)", plain))
     refuse({
         f"drag '{text}': the coordinates are numbered 1 … {n}": not {f.on, f.at, f.of} <= {None, *range(n)},
@@ -139,6 +140,7 @@ Parts = dict[str, str]
 
 
 def _read(text: str, plain: str) -> DragFeature:
+    """The feature of a text with single blanks, `plain`; messages quote the user's `text`."""
     for pattern, read in _FORMS:
         if match := pattern.fullmatch(plain):
             return read(match.groupdict("") | {"text": text})
@@ -163,6 +165,7 @@ def _place(found: Parts) -> dict[str, Any]:
 
 
 def _power_of_speed(found: Parts) -> DragFeature:
+    """A power of a speed, alone or times |v| and a factor of a position."""
     speed = found["v"] or found["pair"]
     if found["size"] not in ("", speed):
         raise InputError(f"drag '{found['text']}': |v| and v are one speed; write '|{speed}|' before it")
@@ -172,22 +175,25 @@ def _power_of_speed(found: Parts) -> DragFeature:
 
 
 def _wave_of_speed(found: Parts) -> DragFeature:
+    """A sine or cosine of a speed."""
     joints = _joints(found["v"] or found["pair"])
     return DragFeature(**joints, at=joints["on"], wave=found["wave"], rate=float(found["rate"] or 1), of_speed=True)
 
 
 def _of_an_input(found: Parts) -> DragFeature:
+    """An input times a factor of a position, on the coordinate of that position or on another one."""
     place = _place(found)
     on = int(found["on"]) - 1 if found["on"] else place["at"]
     return DragFeature(on, **place, input=int(found["input"]) - 1)
 
 
 def _on_a_joint(found: Parts, **more: Any) -> DragFeature:
+    """A feature of the joint `on` with these fields."""
     on = int(found["on"]) - 1
     return DragFeature(on, **{"at": on, **more})
 
 
-# Each form of a force, and what reads the form.
+# Each form of a force, and the function that reads the form.
 _FORMS: tuple[tuple[re.Pattern[str], Callable[[Parts], DragFeature]], ...] = tuple(
     (re.compile(pattern), read)
     for pattern, read in (
@@ -227,7 +233,8 @@ class Drag(nn.Module):
         ratio = torch.tensor([f.ratio for f in features], dtype=torch.float64)[:, None]
         e, place = ratio * eye[on] - eye[of], eye[[f.at for f in features]]
         self.register_buffer("on", e, persistent=False)
-        # Arguments of the factors: of those of the position, and of those of the speed; waves have a rate.
+        # Rows of `at` give the arguments of factors of the position, rows of `along` those of factors of the speed. The
+        # rate of a wave multiplies the row of its argument.
         self.register_buffer("at", torch.where(of_speed, place, rate * place), persistent=False)
         self.register_buffer("along", torch.where(of_speed, rate * e, e), persistent=False)
         self.on: Tensor  # (G, n)
@@ -248,7 +255,7 @@ class Drag(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return φ_g, and its derivatives by the arguments at·q̄ and along·v of its factors, each (..., G).
 
-        Dry terms have the `widths` (n,), those of inputs u (..., m), and are 0 without.
+        Dry terms need the `widths` (n,) of dry friction, and terms of inputs need u (..., m); they are 0 without.
         """
         x, y = q @ self.at.T, v @ self.along.T
         columns = []
@@ -268,9 +275,9 @@ class Drag(nn.Module):
         self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces, widths: Tensor | None = None,
         u: Tensor | None = None,
     ) -> Forces:  # fmt: skip
-        """Return the forces `own` plus the drag at the mean position q and the velocity v, with derivatives if any.
+        """Return the forces `own` plus the drag at the mean position q and the velocity v.
 
-        `widths` (n,) are those of smooth dry friction, u (..., m) the inputs.
+        `widths` (n,) are those of smooth dry friction, u (..., m) the inputs. If `own` has derivatives, so has the sum.
         """
         value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v, widths, u))
         slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.along), (by_q, self.at)))

@@ -11,9 +11,9 @@ from herglotz.models.config import ModelConfig
 from herglotz.models.jet import pairs
 from herglotz.models.term import Term
 
-# Starting widths v_s and v_st of dry friction, in typical speeds.
+# The widths v_s and v_st of dry friction start at these shares of the typical speed.
 START_SMOOTH_WIDTH, START_STRIBECK_WIDTH = 0.02, 0.2
-# Least width, in typical speeds: without a bound, data with sticking would make a step arbitrarily stiff.
+# Widths are at least this share of the typical speed: else data with sticking would make a step arbitrarily stiff.
 MIN_WIDTH = 0.001
 
 
@@ -130,8 +130,8 @@ class Friction(nn.Module):
 class CoupledFriction(Term):
     """f_i = −Σ_{j≠i} b_ij v_j with b symmetric, beside the b_ii of `Friction`: F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
 
-    Two links with angles from the vertical and viscous hinges b have b₁₁ = 2b, b₂₂ = b and b₁₂ = −b, which
-    no number per coordinate expresses. The entries are plain parameters that start at 0; b may be indefinite.
+    For example, two links with angles from the vertical and viscous hinges β have b₁₁ = 2β, b₂₂ = β and b₁₂ = −β: one
+    number per coordinate cannot express the last. The entries are parameters that start at 0; b may be indefinite.
     """
 
     def __init__(self, config: ModelConfig):

@@ -88,11 +88,10 @@ class OwnLagrangian(nn.Module):
         super().__init__()
         check_own(L_d, inputs)
         self.L_d = L_d
-        name = getattr(L_d, "__name__", type(L_d).__name__)
         forced = isinstance(L_d, Forced) or (inputs and isinstance(cast(Driven, L_d).at(torch.zeros(inputs)), Forced))
         one, none = (1.0,) * dof, (False,) * dof
         self.config = OwnConfig(
-            name, angles or none, scale or one, speed or one, inputs, "forced" if forced else "full"
+            _name_of(L_d), angles or none, scale or one, speed or one, inputs, "forced" if forced else "full"
         )
         # A function without parameters gets an empty parameter, which carries the dtype.
         if next(self.parameters(), None) is None:
@@ -124,7 +123,7 @@ class OwnLagrangian(nn.Module):
     def partials(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1, u: Tensor | None = None
     ) -> Partials:
-        """See `herglotz.mechanics.partials`."""
+        """L_d with its derivatives up to this order, as `herglotz.mechanics.partials` returns them."""
         L_d, h = self._driven(u), torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
         if isinstance(L_d, ClosedForm):
             return L_d.partials(q0, q1, s0, h, order)
@@ -148,6 +147,7 @@ class OwnLagrangian(nn.Module):
         return h * max(self.config.speed)
 
     def _driven(self, u: Tensor | None) -> DiscreteLagrangian:
+        """The user's L_d of a step with the inputs u; without inputs the L_d itself."""
         return self.L_d if u is None else cast(Driven, self.L_d).at(u)
 
 
@@ -155,11 +155,15 @@ def check_own(L_d: Any, inputs: int) -> None:
     """Raise InputError if L_d is no discrete Lagrangian, or has inputs and no `at(u)`."""
     check_function(L_d, "model")
     if inputs and not isinstance(L_d, Driven):
-        name = getattr(L_d, "__name__", type(L_d).__name__)
         raise InputError(
-            f"{name} takes no inputs, and the data have some: give it a method `at(u)` that returns the L_d of a step "
-            "with input u (..., m), or leave the inputs out (inputs=())"
+            f"{_name_of(L_d)} takes no inputs, and the data have some: give it a method `at(u)` that returns the L_d "
+            "of a step with input u (..., m), or leave the inputs out (inputs=())"
         )
+
+
+def _name_of(L_d: Any) -> str:
+    """The name of a function or of a module's class."""
+    return getattr(L_d, "__name__", type(L_d).__name__)
 
 
 def own_name(model: Any) -> str | None:

@@ -18,8 +18,9 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.models.features import expand, parse
 
-# Rounding of the pseudo-inverse, for numbers of size 1.
+# The pseudo-inverse rounds numbers of size 1 by less than this.
 ROUNDING = 1e-9
+# Every message about a translation that cannot be read ends with this remedy.
 HOW = "name what moves together, as 'q1 + q2'"
 
 
@@ -76,15 +77,15 @@ def differences(angles: Sequence[bool], moved: Sequence[tuple[float, ...]]) -> l
     """Forms of two moved lengths, "(q1 - q2)", that are invariant along the first direction in which both move."""
     found = []
     for (i, a), (j, b) in combinations(enumerate(zip(*moved, strict=True)), 2):
-        by = next((y / x for x, y in zip(a, b, strict=True) if x and y), 0.0)
-        if by and not (angles[i] or angles[j]):
-            first = f"q{i + 1}" if abs(by) == 1 else f"{abs(by)!r}q{i + 1}"
-            found.append(f"({first} - q{j + 1})" if by > 0 else f"({first} + q{j + 1})")
+        ratio = next((y / x for x, y in zip(a, b, strict=True) if x and y), 0.0)
+        if ratio and not (angles[i] or angles[j]):
+            first = f"q{i + 1}" if abs(ratio) == 1 else f"{abs(ratio)!r}q{i + 1}"
+            found.append(f"({first} - q{j + 1})" if ratio > 0 else f"({first} + q{j + 1})")
     return found
 
 
 def projection(translations: Sequence[str], angles: Sequence[bool]) -> Tensor | None:
-    """The projection (n, n) on the orthogonal complement of the translations' directions; None without any."""
+    """The projection (n, n) on the orthogonal complement of the translations' directions; None without translations."""
     moved = directions(translations, angles)
     return _complement(torch.tensor(moved, dtype=torch.float64)) if moved else None
 
@@ -93,14 +94,14 @@ def across_in_words(P: Tensor, names: Sequence[str]) -> list[tuple[str, float]]:
     """The rows of a projection as text "(x − y)" with the factor in front; the text of a zero row is ""."""
     found = []
     for row in P.tolist():
-        size = next((w for w in row if w), 1.0)
-        parts = [(w / size, name) for w, name in zip(row, names, strict=True) if w]
+        factor = next((w for w in row if w), 1.0)
+        parts = [(w / factor, name) for w, name in zip(row, names, strict=True) if w]
         texts = [
             f"{'−' if w < 0 else '+'} {'' if abs(abs(w) - 1) < ROUNDING else f'{abs(w):.10g} '}{name}"
             for w, name in parts
         ]
         form = " ".join(texts).removeprefix("+ ")
-        found.append((f"({form})" if len(parts) > 1 else form, size))
+        found.append((f"({form})" if len(parts) > 1 else form, factor))
     return found
 
 
@@ -110,7 +111,11 @@ def _complement(rows: Tensor) -> Tensor:
 
 
 def blind(config: Any, velocities: int) -> Tensor | None:
-    """The projection (m, m) onto the invariant features (position, then velocities); None without translations."""
+    """The projection (m, m) of a network's features on those that the translations do not change.
+
+    The features are those of the position, then the velocities, which no translation changes. None without
+    translations.
+    """
     moved = directions(config.translations, config.angles)
     if not moved:
         return None

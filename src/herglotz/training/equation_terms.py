@@ -39,7 +39,7 @@ MORE = "what is no formula moves the model, too: these lines alone are another m
 
 @dataclass(frozen=True)
 class Line:
-    """value · what, on the right-hand side of the line of coordinate `of`, or in L if that is ""."""
+    """The term value · what on the right-hand side of the line of coordinate `of`; in L if `of` is ""."""
 
     left: str
     what: str
@@ -68,12 +68,12 @@ def newtonian(model: ContactLagrangian) -> bool:
         return False
     if config.dof == 1 or config.diagonal or config.alike:
         return True
-    # Masses between coordinates that a search has left out.
+    # A search may have left out every mass between two coordinates.
     return sum("off_diagonal" in name for name in config.absent) == config.dof * (config.dof - 1) // 2
 
 
 class Reader:
-    """The terms of a run's model: M q̈ = forces with one line per coordinate, or L and the forces."""
+    """Reads the terms off a run's model: M q̈ = forces with one line per coordinate, or L and the forces."""
 
     def __init__(self, run: FittedRun, numbers: Numbers):
         self.model, self.data, self.shown = run.model, run.data, numbers.shown
@@ -95,7 +95,7 @@ class Reader:
     def _over_masses(self, lines: Sequence[Line]) -> list[Line]:
         """The lines of M q̈ = forces. If coordinates share a force, their masses stand on the left.
 
-        The line of an uncoupled coordinate is divided by its mass, which the motion does not determine.
+        Each line of an uncoupled coordinate is divided by that coordinate's mass, which the motion does not determine.
         """
         found = list(lines)
         for k, (m, own, name) in enumerate(zip(self._masses().diagonal(), self.own, self.names, strict=True)):
@@ -109,6 +109,7 @@ class Reader:
         return found
 
     def _masses(self) -> Tensor:
+        """The constant mass matrix, (n, n)."""
         kinetic = getattr(self.model.kinetic, "base", self.model.kinetic)
         assert isinstance(kinetic, Kinetic)
         return kinetic.mass()
@@ -189,6 +190,7 @@ class Reader:
             yield Line(left, f"exp(−({name}′/{width})²) {self._sign(i)}", unit, -excess[i])
 
     def _dry_by_position(self, i: int) -> bool:
+        """Whether a part of the dry friction of this coordinate depends on the position."""
         found = (parse_drag(text, self.config.angles) for text in self.config.drag)
         return any(f.dry and f.on == i for f in found)
 
@@ -239,6 +241,7 @@ class Reader:
                     yield Line(self.lefts[i], what, size, value * by * factor)
 
     def _spring_in_L(self, x: str, w: float, angle: bool, k: Tensor, b: Tensor) -> Iterator[Line]:
+        """The terms of one spring in L, of w times the coordinate or difference x."""
         for power, value in ((2, k * (1.0 if angle else w**2)), (1, b * (1.0 if angle else w))):
             what, factor = own_term(x, angle, power, False)
             yield Line("L", what, "", value * factor)
@@ -266,11 +269,14 @@ class Reader:
 
     @staticmethod
     def _numbers(
-        of: Combination, learned: list[Feature], known: list[Feature], first: int = 0
+        combination: Combination, learned: list[Feature], known: list[Feature], first: int = 0
     ) -> Iterator[tuple[Feature, Tensor]]:
-        """Each feature with its coefficient; 1 for known features, whose coefficient is part of their text."""
-        yield from zip(learned, of.coefficient[first:], strict=False)
-        one = of.coefficient.new_ones(())
+        """Each feature with its coefficient; 1 for known features, whose coefficient is part of their text.
+
+        The coefficients of `learned` begin at place `first` of the combination.
+        """
+        yield from zip(learned, combination.coefficient[first:], strict=False)
+        one = combination.coefficient.new_ones(())
         yield from ((feature, one) for feature in known)
 
     def explained(self) -> list[str]:
