@@ -1,5 +1,8 @@
 """The dictionary that a compiled kernel holds: every named term that coordinates of one kind may have.
 
+A further term is one text in `features_of` (terms of L) or `drag_of` (forces); the search for terms then offers it
+(`named_terms.candidates`), and the kernel is compiled anew at its first use.
+
 One kernel serves all models of a kind of coordinates, and is compiled once. It evaluates every model whose terms are in
 the dictionary, with 0 for the absent numbers; any other model has a kernel of its own. The dictionary of models with
 learned functions has the waves of all functions besides, with the standard numbers of `rates`.
@@ -20,11 +23,13 @@ from herglotz.models.features import expand, lengths, revolute, slides, spherica
 from herglotz.training.rates import RATIO, rates_of
 from herglotz.training.waves import BRAKES, waves_of
 
-# Highest power of a length in the potential of one coordinate: forces up to x⁵.
+# The potential of one length has powers up to this one: forces up to x⁵.
 HIGHEST = 6
-# Potentials of the weight of a body that turns, where its angle is taken for a position on a line.
+# These potentials of one length have a kink of the force at 0.
+KINKS = ("|q1| q1", "|q1|^3")
+# These are potentials of the weight of a body that turns, if its angle is taken for a position on a line.
 WEIGHTS = ("cos(q1)", "sin(q1)")
-# Highest harmonic of one angle.
+# The potential of one angle has harmonics up to this one.
 WAVES = 3
 # A sum or a difference of two coordinates, or of their speeds.
 PAIR = re.compile(r"\([qv](?P<i>\d+) [-+] [qv](?P<j>\d+)\)")
@@ -99,7 +104,7 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
     if len(angles) == 1:
         if angles[0]:
             return tuple(f"{f}({'' if k == 1 else k}q1)" for k in range(1, WAVES + 1) for f in ("cos", "sin"))
-        return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", "|q1| q1", "|q1|^3", *WEIGHTS)
+        return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", *KINKS, *WEIGHTS)
     if any(angles):
         still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
         return (*revolute(angles), *still, *slides(angles), *spherical(angles))

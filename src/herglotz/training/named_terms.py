@@ -15,7 +15,7 @@ from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.models.translations import differences, directions, unchanged
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.dictionary import HIGHEST, WAVES, WEIGHTS, drag_of, features_of, in_proportion
+from herglotz.training.dictionary import KINKS, WEIGHTS, drag_of, features_of, in_proportion
 from herglotz.training.parameter_vector import ParameterVector
 
 # Minimum ratio of the smaller to the larger excursion from 0. Below it the data say nothing about a kink at 0.
@@ -94,10 +94,12 @@ def special(data: Trajectories) -> tuple[str, ...]:
 
 
 def _of_one(data: Trajectories) -> list[str]:
-    """Potentials of one coordinate; with inputs no constant force on a length, which the zero of the input gives."""
-    waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
-    powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
-    every = [*own_terms(data.angles), *(waves if data.angles[0] else powers)]
+    """Potentials of one coordinate, those of the baseline first; `special` ones are left out.
+
+    With inputs no constant force on a length is a candidate, because the zero of the input gives this force.
+    """
+    own = own_terms(data.angles)
+    every = (*own, *(name for name in features_of(data.angles) if name not in {*own, *KINKS, *WEIGHTS}))
     return [name for name in every if data.u is None or name != CONSTANT]
 
 
@@ -136,7 +138,7 @@ def kinks(data: Trajectories) -> tuple[str, ...]:
     """
     away, beyond = sorted((abs(float(data.q.min())), abs(float(data.q.max()))))
     crossed = float(data.q.min()) < 0 < float(data.q.max()) and away > MIN_EXCURSION_RATIO * beyond
-    return ("|q1| q1", "|q1|^3") if data.dof == 1 and not any(data.angles) and crossed else ()
+    return KINKS if data.dof == 1 and not any(data.angles) and crossed else ()
 
 
 def weights(data: Trajectories) -> tuple[str, ...]:
