@@ -39,6 +39,12 @@ NETWORKS = {
 }
 # How an objective uses the strengths of the prior.
 PRIORS = {"trajectory": "held-out blocks of time choose among them", "smoothing": "smoothing uses the weakest"}
+# Why angles turn in a plan, or are positions on a line; and why a plan names no longest segments.
+TURNING = {
+    True: "no terms of positions on a line were better",
+    False: "terms of positions on a line, as of a free spring, miss the data by less",
+}
+NO_LONGEST = "no search ended at shorter segments"
 # Settings that the search for terms decides.
 AS_FOUND = ("order", "features", "drag", "absent", "dissipation")
 
@@ -80,7 +86,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     one_step, covered = objective in ("residual", "raw"), seen.baseline_motion is not None
     # Named terms that follow whole trajectories.
     found = None if seen.found is None or seen.found.sigma is None else seen.found
-    named = found is not None
+    named, longest = found is not None, 0 if found is None else found.length
     exact = "covered" if covered else "correction"
     network = "none" if named else "plain" if objective == "raw" else exact if one_step else "potential"
     restarts = c.restarts or (RESTARTS if covered else 1)
@@ -93,11 +99,12 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         forces={name: bool(getattr(c, name)) for name in FORCES}, turning=seen.turning, spreads=dict(base.spreads),
         start={"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,), **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
-        longest=0 if found is None else found.length,
+        longest=longest,
         input_terms=input_terms_of(seen.data.columns), zeros=seen.zeros, drifts=seen.drifts,
         reasons=_reasons(seen, user_settings, named, objective) | {
             "objective": why,
             "network": NETWORKS[network],
+            "longest": "over longer ones the search followed or foretold nothing" if longest else NO_LONGEST,
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
             "sigma": "error of the fit that named the terms" if named else _sigma_reason(seen, one_step, sigma),
             "restarts": _restart_reason(user_settings, covered),
@@ -111,7 +118,7 @@ def _reasons(seen: Look, user_settings: FitConfig, named: bool, objective: str) 
     why = seen.structure or AS_SET
     return {name: why if name in changed else AS_SET for name in AS_FOUND} | {
         "level": _level_reason(seen, user_settings),
-        "turning": "terms of positions on a line, as of a free spring, miss the data by less",
+        "turning": TURNING[seen.turning],
         "substeps": _substeps_reason(seen) if named else AS_SET,
         "input_terms": AS_SET,
         "drifts": "no sensor was found to drift",
@@ -121,7 +128,6 @@ def _reasons(seen: Look, user_settings: FitConfig, named: bool, objective: str) 
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),
         "fitted_before": "the search for terms fitted the same model" if named else "a first fit",
-        "longest": "over longer ones the search followed or foretold nothing",
         "departures": "there is no network" if named else PRIORS.get(objective, "one-step fits use the last"),
     }
 
