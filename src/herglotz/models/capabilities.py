@@ -38,8 +38,6 @@ class Capabilities:
         Dry friction is set-valued.
     coupling
         A force that depends on the velocities of other joints, or on the position.
-    inputs_by_position
-        An input acts through the position.
     """
 
     order: int
@@ -52,7 +50,6 @@ class Capabilities:
     nonlinear_force: bool
     sticking: bool
     coupling: bool
-    inputs_by_position: bool = False
 
     @property
     def carries_s(self) -> bool:

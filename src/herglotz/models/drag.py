@@ -227,7 +227,6 @@ class Drag(nn.Module):
         eye = torch.eye(dof + 1, dof, dtype=torch.float64)
         on, of = [f.on for f in features], [f.on if f.air else dof if f.of is None else f.of for f in features]
         self.air, self.dry = ([g for g, f in enumerate(features) if getattr(f, kind)] for kind in ("air", "dry"))
-        self.driven = any(f.input is not None for f in features)
         rate = torch.tensor([f.rate for f in features], dtype=torch.float64)[:, None]
         of_speed = torch.tensor([f.of_speed for f in features])[:, None]
         ratio = torch.tensor([f.ratio for f in features], dtype=torch.float64)[:, None]

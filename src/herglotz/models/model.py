@@ -162,7 +162,6 @@ class ContactLagrangian(nn.Module):
             or not all(term.linear for term in self.forces_between),
             sticking=self.friction is not None and self.friction.sticking,
             coupling=bool(self.forces_between) or self.drag is not None,
-            inputs_by_position=self.drag is not None and self.drag.driven,
         )
 
     def terms(self, phase: Phase, instant: bool = False) -> Terms:
