@@ -86,6 +86,12 @@ def _check_shapes(where: str, arrays: Mapping[str, Tensor]) -> None:
             raise InputError(f"{where}: {name} must have shape {wanted}, got {tuple(x.shape)}")
 
 
+def check_trajectory(trajectory: int, count: int) -> None:
+    """Raise InputError unless `trajectory` is the number of one of `count` trajectories, from 0."""
+    if not 0 <= trajectory < count:
+        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {count - 1}")
+
+
 def _check_lengths(where: str, lengths: tuple[int, ...], samples: int) -> None:
     refuse({f"{where}: there is no trajectory; give at least one of {MIN_SAMPLES} samples": not lengths})
     for b, length in enumerate(lengths):

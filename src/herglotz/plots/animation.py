@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from herglotz.data import Trajectories
+from herglotz.data.checks import check_trajectory
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.data.units import as_recorded
 from herglotz.errors import InputError
@@ -67,8 +68,7 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
     data = run.data.unwrapped()
     if Path(path).suffix.lower() != ".gif":
         raise InputError(f"{path}: an animation's name must end in .gif")
-    if not 0 <= trajectory < len(data):
-        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(data) - 1}")
+    check_trajectory(trajectory, len(data))
     rows = slice(data.offsets[trajectory], data.offsets[trajectory] + data.lengths[trajectory])
     t, q, model = (x[rows].detach().double().cpu().numpy() for x in (data.t, data.q, run.prediction))
     boundary = t[max(min(run.train_lengths[trajectory], len(t)) - 1, 0)]

@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from herglotz.data import Trajectories
+from herglotz.data.checks import check_trajectory
 from herglotz.data.splits import leading
 from herglotz.data.units import as_recorded, common_unit, size
-from herglotz.errors import InputError
 from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.training import Run
 from herglotz.training.predict import Prediction
@@ -51,8 +51,8 @@ def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
     `trajectory` of this number are drawn; None: up to four trajectories spread over the data. Raise InputError if the
     data have no such trajectory.
     """
-    if trajectory is not None and not 0 <= trajectory < len(run.data):
-        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(run.data) - 1}")
+    if trajectory is not None:
+        check_trajectory(trajectory, len(run.data))
     motion = _Motion(run.data, run.prediction, run.train_lengths, ("model, trained here", "model, free run"))
     return _drawn(motion, trajectory_title(run), trajectory)
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.anything import split_options
+from herglotz.data.checks import check_trajectory
 from herglotz.data.holds import Arrival
 from herglotz.data.trajectories import GAP, Trajectories
 from herglotz.errors import InputError, refuse
@@ -190,8 +191,7 @@ class Run:
         InputError
             If there is no such trajectory.
         """
-        if not 0 <= trajectory < len(self.data):
-            raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(self.data) - 1}")
+        check_trajectory(trajectory, len(self.data))
         row = self.data.offsets[trajectory] + max(self.train_lengths[trajectory], 1) - 1
         return State(*(x[row].detach() for x in self.states)), float(self.data.t[row])
 
