@@ -142,7 +142,7 @@ def _seen(
     recorded, (data, arrival, why) = data, _read(measured(data, zeros, drifts=drifts), settings)
     train, unseen = split(data, settings)
     _check_size(train)
-    dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
+    dropped = dropped_samples(train, settings)
     kept, drag = train.keep(~dropped), drag_starts_the_fit(settings)
     outliers = settings.robust == "on" or bool(dropped.any())
     outliers = outliers or (settings.robust == "auto" and outliers_pull(kept, drag=drag))
@@ -196,6 +196,11 @@ def read_like(data: Trajectories, seen: Look) -> Trajectories:
 def split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Trajectories | None]:
     """The first part of every trajectory, which is fitted, and the rest; None where nothing is held out."""
     return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
+
+
+def dropped_samples(train: Trajectories, settings: FitConfig) -> Tensor:
+    """Which samples a fit leaves out because they are single spikes, (N,) bool; with `robust` "off" no sample."""
+    return torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
 
 
 def _check_size(data: Trajectories) -> None:

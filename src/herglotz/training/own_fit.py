@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from herglotz.data import Trajectories
-from herglotz.data.noise import roughness, spikes
+from herglotz.data.noise import roughness
 from herglotz.errors import InputError, refuse
 from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.models import OwnLagrangian
@@ -21,7 +21,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.disagreeing import outlying
 from herglotz.training.evaluate import evaluate
 from herglotz.training.first_states import states_of_pairs
-from herglotz.training.look import Look, split
+from herglotz.training.look import Look, dropped_samples, split
 from herglotz.training.objectives import Fitted
 from herglotz.training.one_step_fit import NOISE_OF_R, fit_one_step
 from herglotz.training.problems.grid import step_inputs
@@ -95,7 +95,7 @@ def _prepared(data: Trajectories, L_d: Any, config: FitConfig) -> tuple[OwnLagra
     data = data if config.use_inputs else replace(data, u=None)
     data = data.unwrapped().to(dtype=config.torch_dtype, device="cpu")
     train, unseen = split(data, config)
-    dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
+    dropped = dropped_samples(train, config)
     kept = train.keep(~dropped)
     base = estimate_baseline(kept, substeps=config.substeps)
     model = own_model(L_d, data, base).to(dtype=config.torch_dtype, device="cpu")
