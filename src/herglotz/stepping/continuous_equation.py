@@ -107,7 +107,7 @@ class ContinuousEquation:
 
     def field(self, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """X̃ = (q̇, ṗ, ṡ), shapes (..., n), (..., n), (...); NaN where a step fails."""
-        X, _ = self._sum(State(q, p, s), 0.0, 1)
+        X, _ = self._slope(q, p, s)
         return split(X[..., :-1] / self.h)
 
     def hamiltonian(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
@@ -135,10 +135,11 @@ class ContinuousEquation:
 
     def error(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         """The error estimate of X̃, (...): the difference of two orders, relative to the move to the next iterate."""
-        return self._sum(State(q, p, s), 0.0, 1)[1]
+        return self._slope(q, p, s)[1]
 
-    def _sum(self, state: State, theta: float, derivative: int) -> tuple[Tensor, Tensor]:
-        return _summed(_Iterates(self, state), 0, theta, derivative)
+    def _slope(self, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """The first derivative of the interpolated iterates at the state, per step, and its error estimate."""
+        return _summed(_Iterates(self, State(q, p, s)), 0, 0.0, 1)
 
 
 class _Iterates:
