@@ -289,9 +289,8 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
     pairs, warnings = usable(path, files, partial(read, wanted))
     # A column that is the same in every row of one file may move in another.
     sets = [one for _, one in pairs]
-    moving = [
-        name for name in dict.fromkeys(x for one in sets for x in one.names) if all(_has(one, name) for one in sets)
-    ]
+    columns = [{name for name, *_ in one.columns} for one in sets]
+    moving = [name for name in dict.fromkeys(x for one in sets for x in one.names) if all(name in x for x in columns)]
     if any(name not in one.names for one in sets for name in moving):
         told = replace(wanted, positions=(*wanted.positions, *moving))
         pairs, warnings = usable(path, files, partial(read, told))
@@ -299,11 +298,6 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
     found = _joined(*zip(*pairs, strict=True))
     notes = (textwrap.shorten(names, MAX_NOTE_LENGTH), *found.notes, *warnings)
     return replace(found, source=path.resolve().name, notes=notes)
-
-
-def _has(one: Trajectories, name: str) -> bool:
-    """Whether a file has a column with this name."""
-    return any(column == name for column, *_ in one.columns)
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
