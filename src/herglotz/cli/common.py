@@ -177,9 +177,9 @@ def complain(message: str) -> None:
 
 def print_table(rows: Sequence[tuple[str, str]]) -> None:
     """Print names and values in two aligned columns, wrapped."""
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        print(textwrap.fill(value, COLUMNS, initial_indent=f"  {name:<{width}}  ", subsequent_indent=" " * (width + 4)))
+    from herglotz.training.summary import aligned
+
+    print(*aligned(rows), sep="\n")
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from textwrap import fill
 from typing import Any
@@ -12,10 +12,11 @@ from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.equation import ON_SCREEN, Equation
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.left_out import from_then_on
+from herglotz.training.plan import LINE_WIDTH
 from herglotz.training.properties import by_property, inverse
 from herglotz.training.recorded_range import range_in_words
 
-MAX_FEATURES, COLUMNS = 5, 80
+MAX_FEATURES = 5
 # More coordinates are not explained: they form a chain, and their order is enough.
 MAX_NAMES = 4
 
@@ -79,19 +80,23 @@ def _missed(one: Mapping[str, Any], unit: str) -> str:
     return by + from_then_on(one.get("since"))
 
 
+def aligned(table: Sequence[tuple[str, str]]) -> list[str]:
+    """Names and values in two aligned columns, wrapped: the text of each row."""
+    width = max(len(name) for name, _ in table)
+    return [fill(value, LINE_WIDTH, initial_indent=f"  {name:<{width}}  ", subsequent_indent=" " * (width + 4))
+            for name, value in table]  # fmt: skip
+
+
 def summary(run: FittedRun) -> str:
     """A few lines of text, the verdict last."""
-    table = rows(run)
-    width = max(len(name) for name, _ in table)
-    lines = [fill(value, COLUMNS, initial_indent=f"  {name:<{width}}  ", subsequent_indent=" " * (width + 4))
-             for name, value in table]  # fmt: skip
+    lines = aligned(rows(run))
     if run.metrics.get("extrapolation_status") not in (None, "ok"):
-        lines.append(fill(f"Note: {run.metrics['extrapolation_status']}", COLUMNS))
+        lines.append(fill(f"Note: {run.metrics['extrapolation_status']}", LINE_WIDTH))
     equation = run.metrics.get("equation")
     if equation:
         shown = Equation.from_dict(equation).text(ON_SCREEN)
         lines += ["Learned equation:", *(f"  {line}" for line in shown.splitlines())]
-    return "\n".join([*lines, fill(f"Verdict: {run.metrics.get('verdict', 'not judged')}", COLUMNS)])
+    return "\n".join([*lines, fill(f"Verdict: {run.metrics.get('verdict', 'not judged')}", LINE_WIDTH)])
 
 
 def one_line(run: FittedRun) -> str:
