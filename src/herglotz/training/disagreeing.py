@@ -3,11 +3,12 @@
 Of every recording the part that a fit uses is followed from a start of its own, with the numbers of the model fixed:
 as a whole by a model that a search has found, else over short segments. Twenty steps hide a damping that is a fifth
 larger, or a scale that is wrong by 3 %. A recording disagrees if more than a tenth of its readings (`reach`) are
-outliers (`TAIL`) of the misfit of the others: fewer are single ones, and what the error of the model's steps explains
-is no outlier. A bad recording may have bent the model so far that none stands out. Where the model is not at the noise,
-the recording that it misses most, or else the one whose accelerations are least like the others', is left out if the
-whole dictionary would follow the others to their noise. The model is then found anew. What is left out stays so if the
-others agree, whose model is at their noise, and if it is an outlier of that model. Most recordings have to agree.
+outliers (`TAIL`) of the misfit of the others, which the model meets to their noise: fewer are single ones, and what the
+error of the model's steps explains is no outlier. A bad recording may have bent the model so far that the others are
+missed as well, as where the law is wrong. The recording that is missed most, or else the one whose accelerations are
+least like the others', is then left out if the whole dictionary would follow the others to their noise. The model is
+then found anew. What is left out stays so if the others agree, whose model is at their noise, and if it is an outlier
+of that model. Most recordings have to agree.
 
 Where nothing is left out, as where no terms are searched (more than three coordinates, a given plan, own terms), an
 outlier of the finished model is named (`outlying`).
@@ -77,9 +78,10 @@ def _disagreeing(seen: Look, data: Trajectories, rest: Sequence[int], missed: Se
     None, too, if the recording has a property of its own: the law may depend on that property.
     """
     worst = max(rest, key=lambda b: reach(missed[b]))
-    most = TAIL * scale_of_all([missed[b] for b in rest if b != worst], _least(seen))
-    far = reach(missed[worst])
-    if far > most and far > _of_steps(seen, data, worst):
+    remaining = [b for b in rest if b != worst]
+    others, far = scale_of_all([missed[b] for b in remaining], _least(seen)), reach(missed[worst])
+    met = others <= max(AT_THE_NOISE * precision(data.select(remaining)), _least(seen))
+    if met and far > TAIL * others and far > _of_steps(seen, data, worst):
         bad = worst
     else:
         # Once a recording is left out, the model is no longer bent.
@@ -223,10 +225,12 @@ def _misfit(seen: Look, model: ContactLagrangian, sigma: float, data: Trajectori
     """Misfit of segments that start anew, (N, n) in units of q; None if a step fails."""
     config = replace(seen.settings, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(seen.task(Stages()), data=data, config=config), model, frozen=True)
-    found = stages.from_least_squares(sigma, FREEDOM)
-    # The first samples of a pendulum that rests near the top do not tell to which side the pendulum falls.
-    if whole and found is not None:
-        found = stages.grow(found, sigma)
-        if found.problem.grid.length < stages.lengths[-1]:
-            return None
+    found = stages.all_followed(sigma, FREEDOM) if whole else None
+    if found is None:
+        found = stages.from_least_squares(sigma, FREEDOM)
+        # The first samples of a pendulum that rests near the top do not tell to which side the pendulum falls.
+        if whole and found is not None:
+            found = stages.grow(found, sigma)
+            if found.problem.grid.length < stages.lengths[-1]:
+                return None
     return None if found is None else found.problem.misfit(found.path) * data.balance

@@ -49,8 +49,8 @@ class HeldOut:
         r = problem.misfit(path) / problem.sigma
         by = (problem.weight * problem.root_weights(problem.weight * r))[..., None]
         slopes = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
-        order = torch.tensor([*range(P), P + problem.d, *range(P, P + problem.d)], device=r.device)
-        rows = torch.cat([slopes, r[..., None]], -1)[..., order]  # (N, n, P + 1 + d) of numbers, residual, start
+        # (N, n, P + 1 + d) of numbers, residual, start
+        rows = torch.cat([slopes[..., :P], r[..., None], slopes[..., P:]], -1)
         segment = problem.grid.segment
         piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
         weighted = rows * by

@@ -321,7 +321,7 @@ def _remains(kernel: Tensor, y: Tensor) -> float:
     folds = [torch.cat(blocks[k::FOLDS]) for k in range(FOLDS)]
     found = []
     for ridge in RIDGES:
-        inverse = torch.linalg.inv(kernel + ridge * torch.eye(len(y)).to(kernel))
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(kernel + ridge * torch.eye(len(y)).to(kernel)))
         weights = inverse @ y
         errors = [torch.linalg.solve(inverse[fold][:, fold], weights[fold]) for fold in folds]
         found.append(float(torch.cat(errors).square().mean()))
