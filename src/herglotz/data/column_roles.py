@@ -106,6 +106,7 @@ _WORDS = {
     "angle": "theta phi psi angle alpha beta gamma roll pitch yaw winkel angulo angolo θ φ ϕ ψ α β",
     "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle kraft drehmoment moment "
               "strom spannung couple courant tension fuerza corriente voltaje coppia corrente forza tensione grf",
+    "torque": "torque torques tau drehmoment moment couple coppia",
     "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse "
                  "eingang eingangssignal entree entrada ingresso",
     "reading": "pot potentiometer lvdt encoder laser",
@@ -216,6 +217,11 @@ def is_rate_of_others(name: str, coordinates: Collection[str]) -> bool:
 def is_angular(name: str) -> bool:
     """Whether a name is usual for angles."""
     return bool(words_of(name) & WORDS["angle"])
+
+
+def is_torque(name: str) -> bool:
+    """Whether a name is usual for torques, which act on angles."""
+    return bool(words_of(name) & WORDS["torque"])
 
 
 def is_time(name: str, unit: str) -> bool:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, as_columns, as_tensor, check, check_alike, offsets_of, unnamed
-from herglotz.data.column_roles import is_angular
+from herglotz.data.column_roles import is_angular, is_torque
 from herglotz.data.holds import Arrival, check_arrival, interpolated, interpolated_input, last_read
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
@@ -406,15 +406,22 @@ def of_file(name: str, note: str) -> str:
     return f"{WARNING}{name}: {note[len(WARNING) :]}" if note.startswith(WARNING) else f"{name}: {note}"
 
 
+def perhaps_angles(data: Trajectories) -> tuple[str, ...]:
+    """Coordinates without a unit that are no angles, although their names or a torque among the inputs say so."""
+    turned = any(is_torque(name) for name, _ in data.input_labels)
+    every = zip(data.names, data.units, data.angles, strict=True)
+    return tuple(name for name, unit, angle in every if unit == "1" and not angle and (turned or is_angular(name)))
+
+
 def column_rows(data: Trajectories) -> list[tuple[str, str, str]]:
     """Name, final role and final unit of each column of `Trajectories`, in words."""
     now = dict(zip(data.names, zip(data.units, data.angles, strict=True), strict=True))
-    rows = []
+    asked, rows = perhaps_angles(data), []
     for name, role, unit in data.columns:
         if role == "coordinate" and name in now:
             role = "angle" if now[name][1] else role
             unit = _converted(unit, now[name][0])
-            if role == "coordinate" and not unit and is_angular(name):
+            if role == "coordinate" and not unit and name in asked:
                 far = float(data.q[:, data.names.index(name)].abs().max()) > 2 * math.pi
                 unit = f"- (an angle in {'deg? --degrees' if far else 'rad? --angles'} {name})"
         elif role == "polar":

@@ -109,13 +109,22 @@ def reason_of_idle_inputs(
 
 
 def reason_of_set_points(model: ContactLagrangian, data: Trajectories) -> str:
-    """That a set point acts in the model, although a force was recorded, with a remedy; "" if that is not so."""
+    """That a set point acts in a model that misses data with a recorded force, with a remedy; "" if that is not so."""
     names = acting_set_points(model, data)
-    if not names or not any(is_recorded_effort(*label) for label in data.input_labels):
+    if not names or not _has_recorded_effort(data):
         return ""
     place = "in the equation, in the place of the machine's"
-    remedy = f"--drop {shlex.quote(','.join(names))}, which leaves the forces that were recorded"
-    return f"{_through(names)} {place}. Try {remedy}"
+    return f"{_through(names)} {place}. Try {_without(names)}, which leaves the forces that were recorded"
+
+
+def _has_recorded_effort(data: Trajectories) -> bool:
+    """Whether an input is a force that was recorded, by its name and unit."""
+    return any(is_recorded_effort(*label) for label in data.input_labels)
+
+
+def _without(names: list[str]) -> str:
+    """The flag that leaves columns of these names out."""
+    return f"--drop {shlex.quote(','.join(names))}"
 
 
 def caveat_of_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor) -> str:
@@ -124,7 +133,8 @@ def caveat_of_inputs(model: ContactLagrangian, data: Trajectories, states: Tenso
     Set points follow from nothing; the motion follows them.
     """
     if names := acting_set_points(model, data):
-        return f"{_through(names)} a part of the equation"
+        alone = f"; for the law of the machine alone, by the forces that were recorded, try {_without(names)}"
+        return f"{_through(names)} a part of the equation{alone if _has_recorded_effort(data) else ''}"
     if data.u is None or not bool(torch.isfinite(states).all()) or (left := unexplained(data, states)) >= HALF:
         return ""
     return (

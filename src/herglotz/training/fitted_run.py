@@ -57,7 +57,8 @@ class FittedRun(Protocol):
 def as_recorded(run: FittedRun, data: Any, **reading: Any) -> Trajectories:
     """Another recording, or a file of recordings, read as the data of the run were.
 
-    Columns, units, angles, sensors and, unless the file states its own, the hold of the inputs are those of the run.
+    Columns, units, angles, sensors, what the user read in degrees and, unless the file states its own, the hold of the
+    inputs are those of the run.
 
     `reading` are options of `as_trajectories`, which replace those of the run. Trajectories hold positions already, so
     the zeros and scales of the run's sensors are not applied. Raise InputError if each recording of the run has a zero
@@ -72,6 +73,10 @@ def as_recorded(run: FittedRun, data: Any, **reading: Any) -> Trajectories:
         if numbers:
             tell(f"{what} are those of the run, {', '.join(f'{x:.6g}' for x in numbers)}; for others {remedy}")
         reading[name] = numbers
+    if (names := sensors.get("degrees")) and "degrees" not in reading:
+        read = f"{', '.join(names)} read in degrees, as in the run"
+        tell(f"{read}; for positions in rad --degrees '' (degrees=() in Python)")
+        reading["degrees"] = names
     # The hold with which the file was read comes first: a fit to means of inputs over steps has the hold "zero".
     hold = run.reading.get("hold") or run.arrival.hold
     # Angles that the fit found to be positions on a line were read as angles, whose turns are counted.

@@ -43,6 +43,7 @@ from herglotz.data.noise import SAMPLES, precisions
 from herglotz.data.polar import CIRCLE, LENGTH, circles, hint
 from herglotz.data.rates import filled_inputs
 from herglotz.data.smoothing import slopes
+from herglotz.data.trajectories import perhaps_angles
 from herglotz.data.units import COUNTS, size
 from herglotz.training.following import HALF
 from herglotz.training.properties import inverse, properties
@@ -168,9 +169,12 @@ def _ways_to_the_past(data: Trajectories, level: str) -> list[str]:
 
 
 def ways_of_columns(data: Trajectories) -> list[str]:
-    """Remedies by columns that were left aside for their unit or as rates, and by properties of recordings."""
+    """Remedies by angles, by columns left aside for their unit or as rates, and by properties of recordings."""
     others, rates = _left_aside(data)
     ways = _as_inputs_unless(data, others, rates)
+    if angles := perhaps_angles(data):
+        are = f"{angles[0]} is an angle" if len(angles) == 1 else "these are angles"
+        ways.insert(0, f"--angles {shlex.quote(','.join(angles))}, where {are} in rad")
     if others and len(data) > 1:
         numbers = "is a number" if len(others) == 1 else "are numbers"
         ways.append(f"where {', '.join(others)} {numbers} of each recording, {inverse(others)}")

@@ -83,7 +83,9 @@ def candidates(
     features = tuple(_of_one(data)) if len(angles) == 1 else features_of(angles)
     # The length |v| of a velocity needs one unit.
     one_unit = len(set(data.units)) == 1
-    drag = tuple(text for text in drag_of(angles) if one_unit or text != AIR)
+    # Over a motion one way v² and |v| v are one force.
+    gone = {f"v{i + 1}^2" for i in range(len(angles)) if moves_one_way(data, i)} | ({AIR} if not one_unit else set())
+    drag = tuple(text for text in drag_of(angles) if text not in gone)
     features, drag = (in_proportion(texts, ratios or {}) for texts in (features, drag))
     return NamedTerms((*features, *special(data)), drag, dry=True)
 
@@ -105,12 +107,17 @@ def _of_one(data: Trajectories) -> list[str]:
 
 def turns_one_way(data: Trajectories, i: int) -> bool:
     """True if an angle never turns back for 1/50 of a recording: dry friction is then a constant force."""
+    return data.angles[i] and moves_one_way(data, i)
+
+
+def moves_one_way(data: Trajectories, i: int) -> bool:
+    """True if a coordinate never moves back for 1/50 of a recording."""
     signs = []
     for one in data:
         lag = max(1, one.samples // PARTS_OF_RECORDING)
         signs.append((one.q[lag:, i] - one.q[:-lag, i]).sign())
     seen = torch.cat(signs)
-    return data.angles[i] and bool((seen == seen[0]).all()) and float(seen[0]) != 0
+    return bool((seen == seen[0]).all()) and float(seen[0]) != 0
 
 
 def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTerms:

@@ -180,7 +180,7 @@ def judged(
     kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
     shown = partial(_shown_reason, task, fitted, seen)
     model, train = fitted.model, task.data
-    reasons = reason_of_set_points(model, train), reason_of_idle_inputs(model, train, states)
+    reasons = reason_of_set_points(model, train) if errors.missed else "", reason_of_idle_inputs(model, train, states)
     words = ". ".join(filter(None, (misread(kept, seen, errors.missed), *reasons)))
     caveat = caveat_of_inputs(model, train, states)
     beyond = partial(unseen_outlier, seen, everywhere)

@@ -49,6 +49,27 @@ def test_a_longer_warm_up_is_named(tiny_run, other_csv, capsys, monkeypatch):
     assert "the start that 20 samples tell misses, and not the model; try --warmup 37" in said
 
 
+def test_degrees_of_a_run_are_those_of_other_recordings(tiny_run, other_csv, tmp_path, capsys):
+    # fails if a header that says rad in another recording, too, replaces what the user said of the first: 474 rad
+    run = load_run(tiny_run)
+    save_run(replace(run, reading={**run.reading, "degrees": ["theta"]}), tmp_path / "run")
+    head, *rows = other_csv.read_text().splitlines()
+    at = head.split(",").index("theta[rad]")
+    cells = [row.split(",") for row in rows]
+    turned = [",".join([*row[:at], repr(float(np.degrees(float(row[at])))), *row[at + 1 :]]) for row in cells]
+    (tmp_path / "other.csv").write_text("\n".join([head, *turned]) + "\n")
+    errors = []
+    for of, file, flags in ((tiny_run, other_csv, ()), (tmp_path / "run", tmp_path / "other.csv", ()),
+                            (tmp_path / "run", other_csv, ("--degrees", ""))):  # fmt: skip
+        assert main(["predict", str(of), str(file), "--json", *flags]) == 0
+        found = capsys.readouterr()
+        errors.append(json.loads(found.out)["rms"])
+        assert ("theta read in degrees, as in the run; for positions in rad --degrees ''" in found.err) is (
+            file != other_csv
+        )
+    assert errors == pytest.approx([errors[0]] * 3, rel=1e-6)
+
+
 @pytest.fixture(scope="module")
 def two_rates(tmp_path_factory):
     """Two recordings of a damped spring under a force; the force is written at other times than the position."""

@@ -13,6 +13,7 @@ from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.sheet import from_frame
 from herglotz.data.units import in_degrees, size
 from herglotz.errors import InputError
+from herglotz.training.missed import ways_of_columns
 from herglotz.training.run_folder import reading_in
 
 
@@ -158,6 +159,12 @@ def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
     ]
     read(tmp_path, "t,theta\n0,1\n1,2\n2,3\n")
     assert "theta   coordinate    - (an angle in rad? --angles theta)" in capsys.readouterr().err
+    # fails if joints that torques turn are lengths without a word
+    data = read(tmp_path, "t,q1,q2,tau1\n" + rows([0, 1, 2], [1, 2, 3], [2, 1, 3], [4, 5, 6]))
+    assert "q2      coordinate    - (an angle in rad? --angles q2)" in capsys.readouterr().err
+    assert ways_of_columns(data) == ["--angles q1,q2, where these are angles in rad"]
+    assert not ways_of_columns(read(tmp_path, "t,q1,F1\n" + rows([0, 1, 2], [1, 2, 3], [4, 5, 6]), show=False))
+    capsys.readouterr()
     read(tmp_path, "t,x\n0,1\n1,2\n2,3\n", show=False)
     assert capsys.readouterr().err == ""
 

@@ -271,3 +271,13 @@ def test_a_constant_force_is_the_zero_of_an_input():
     free, driven = (candidates(Trajectories.of(t, t[:, None], u=u)) for u in (None, t[:, None]))
     assert "q1" in free.features
     assert set(free.features) - set(driven.features) == {"q1"}
+
+
+def test_friction_even_in_the_speed_is_offered_where_the_motion_goes_both_ways():
+    # fails if v² is no offer, so that waves and a drift of the sensor stand for it, or is one over a fall, where it is
+    # the force of |v| v
+    t = torch.arange(50, dtype=torch.float64)
+    for q, offered in ((torch.sin(t / 3), True), (t, False)):
+        drag = candidates(Trajectories.of(t, q[:, None])).drag
+        assert ("v1^2" in drag) is offered
+        assert "|v1| v1" in drag
