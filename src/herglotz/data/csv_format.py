@@ -54,6 +54,17 @@ def cells_of(line: str, separator: str = ",") -> list[str]:
     return [cell.strip().strip('"').strip() for cell in parts]
 
 
+def has_samples(path: PathLike) -> bool:
+    """Whether a line of a text file has two numbers, as every sample has: notes and lists of properties have none."""
+
+    def is_sample(line: str) -> bool:
+        numbers = {separator: [is_number(cell) for cell in cells_of(line, separator)] for separator in SEPARATORS}
+        # Words between spaces are a sentence, in which numbers may stand.
+        return any(sum(found) > 1 and (separator != " " or all(found)) for separator, found in numbers.items())
+
+    return any(map(is_sample, read_lines(path)))
+
+
 def table_of(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
     """The cells of a file's table, header first, with decimal points; notes on the text.
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from herglotz.data.checks import Unusable, check_alike
 from herglotz.data.column_roles import is_usual
 from herglotz.data.csv_columns import Names, Wanted, as_names
-from herglotz.data.csv_format import read_csv, write_csv
+from herglotz.data.csv_format import has_samples, read_csv, write_csv
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import complete, parted
@@ -110,10 +110,12 @@ class Format:
     begins: str = ""
 
 
+# Endings of tables in text.
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".lvm")
 FORMATS = (
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
     Format("Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, begins="%"),
-    *(Format(f"t[s],q[rad],... ({end})", end, read_csv, True) for end in (".csv", ".txt", ".tsv", ".dat", ".lvm")),
+    *(Format(f"t[s],q[rad],... ({end})", end, read_csv, True) for end in TEXTS),
     Format("columns as in csv (.parquet)", ".parquet", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_packed, True),
@@ -273,10 +275,12 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
     if (path / "model.pt").exists():
         raise InputError(f"{path}: is the folder of a run, not data; name a recording, or a folder of them")
     known = {one.suffix for one in FORMATS}
-    every = (file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
-    files = sorted(file for file in every if file.stem.casefold() != "readme")
+    every = sorted(file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
+    files = [file for file in every if file.suffix.lower() not in TEXTS or has_samples(file)]
     if not files:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
+    notes = tuple(file.name for file in every if file not in files)
+    left_out = (f"warning: left out of the folder, for no line has two numbers: {', '.join(notes)}",) if notes else ()
 
     def read(wanted: Wanted, file: Path) -> tuple[Path, Trajectories]:
         try:
@@ -292,12 +296,12 @@ def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
     columns = [{name for name, *_ in one.columns} for one in sets]
     moving = [name for name in dict.fromkeys(x for one in sets for x in one.names) if all(name in x for x in columns)]
     if any(name not in one.names for one in sets for name in moving):
-        told = replace(wanted, positions=(*wanted.positions, *moving))
-        pairs, warnings = usable(path, files, partial(read, told))
+        wanted = replace(wanted, positions=(*wanted.positions, *moving))
+        pairs, warnings = usable(path, files, partial(read, wanted))
     names = f"{len(pairs)} recordings: {', '.join(file.name for file, _ in pairs)}"
     found = _joined(*zip(*pairs, strict=True))
-    notes = (textwrap.shorten(names, MAX_NOTE_LENGTH), *found.notes, *warnings)
-    return replace(found, source=path.resolve().name, notes=notes)
+    told = (textwrap.shorten(names, MAX_NOTE_LENGTH), *found.notes, *warnings, *left_out)
+    return replace(found, source=path.resolve().name, notes=told)
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:

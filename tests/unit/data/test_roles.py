@@ -345,7 +345,8 @@ def test_volts_of_a_sensor_are_a_coordinate_where_nothing_else_is(head):
 
 
 def test_a_readme_beside_recordings(tmp_path, capsys):
-    # fails if a folder is refused for its README, a recording in .txt is left out, or a warning of one file has no name
+    # fails if a folder is refused for its README, notes or a list of properties, if what is left out for that is not
+    # said, if a recording in .txt is left out, or a warning of one file has no name
     for name, header in (("a.csv", "t[s],x[m]"), ("b.txt", "t[s],x[m]"), ("c.csv", "t[s],x[m]")):
         (tmp_path / name).write_text(table(header))
     (tmp_path / "README.txt").write_text("x[m]   the cart\nt[s]   time\n")
@@ -357,6 +358,11 @@ def test_a_readme_beside_recordings(tmp_path, capsys):
     load(tmp_path)
     err = capsys.readouterr().err
     assert f"warning: {tmp_path.name}: c.csv: road is taken for an input" in err
-    (tmp_path / "notes.txt").write_text("no numbers")
-    with pytest.raises(InputError, match=r"notes.txt, row 1: .*; or take notes.txt out of the folder"):
+    (tmp_path / "notes.txt").write_text("of 3. 5. 2024, the spring of 52 N/m\n")
+    (tmp_path / "info.csv").write_text("mass,0.3\nspring;52,1\n")
+    assert len(load(tmp_path)) == 3
+    out = "left out of the folder, for no line has two numbers: README.txt, info.csv, notes.txt"
+    assert out in " ".join(capsys.readouterr().err.split())
+    (tmp_path / "d.csv").write_text("t[s],x[m]\n0,1\n1,two\n2,3\n3,4\n")
+    with pytest.raises(InputError, match=r"d.csv: .*; or take d.csv out of the folder"):
         load(tmp_path)
