@@ -364,5 +364,5 @@ def test_a_readme_beside_recordings(tmp_path, capsys):
     out = "left out of the folder, for no line has two numbers: README.txt, info.csv, notes.txt"
     assert out in " ".join(capsys.readouterr().err.split())
     (tmp_path / "d.csv").write_text("t[s],x[m]\n0,1\n1,two\n2,3\n3,4\n")
-    with pytest.raises(InputError, match=r"d.csv: .*; or take d.csv out of the folder"):
+    with pytest.raises(InputError, match=r"d.csv, row 3, .*; or take d.csv out of the folder"):
         load(tmp_path)
