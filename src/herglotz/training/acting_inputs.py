@@ -123,21 +123,29 @@ def _of_kind(search: Search, kind: str, terms: Sequence[str], trial: Trial) -> t
     None if no path is found.
     """
     every = tuple(term for term in terms if (of := saturation(term)) is None or of[0] == kind)
-    best: tuple[tuple[str, ...], Trial | None] = every, _with(search, every, trial)
-    if (found := best[1]) is None:
-        return best
-    # An input that saturates need not act beside its saturation, though it makes up for a wrong level.
+    found = _with(search, every, trial)
+    # Terms that were taken at a wrong level are not those that are taken at a better one, where another level is best.
+    while found is not None and (better := _sharper(search, every, found)) is not None:
+        every, found = better
+    return every, found
+
+
+def _sharper(search: Search, every: tuple[str, ...], found: Trial) -> tuple[tuple[str, ...], Trial] | None:
+    """The terms at the levels at which a model misses the data least, and the model settled there; None if no better.
+
+    An input that saturates need not act beside its saturation, though it makes up for a wrong level.
+    """
     names, taken = [name for name, _ in search.data.input_labels], taken_terms(found, every)
     alone = {names.index(of[2]) for term in taken if (of := saturation(term))}
     beside_it = {name for name in found.taken if name.startswith(INPUTS) and _column(name, found) in alone}
-    sharp = every
-    for own in dict.fromkeys((found.taken, found.taken - beside_it)):
-        sharp = sharpened(search, replace(found, taken=own), sharp)
-        other = search.driven_by(sharp)
+    best: tuple[tuple[str, ...], Trial] = every, found
+    for own in dict.fromkeys((found.taken, found.taken - beside_it)) if alone else ():
+        every = sharpened(search, replace(found, taken=own), every)
+        other = search.driven_by(every)
         again = other.again(replace(found, taken=own))
         if again is not None and search.better(best[1], settled := other.settled(again)) is settled:
-            best = sharp, settled
-    return best
+            best = every, settled
+    return best if best[1] is not found else None
 
 
 def beside(trial: Trial, more: int) -> Trial:
