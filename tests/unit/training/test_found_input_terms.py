@@ -108,6 +108,22 @@ SATURATING = {
 }
 
 
+def test_levels_are_sharpened_until_nothing_is_better(monkeypatch):
+    # fails if they are sharpened once, with the terms that were taken at the first guess: x⁵ for x³, and an input beside
+    # its saturation at 1.03 in the place of 1.2, with 3 times the noise
+    better: Any = {"tanh(u/0.65)": ("tanh(u/1.03)", 3.1), "tanh(u/1.03)": ("tanh(u/1.2)", 1.0)}
+
+    def sharper(_, every, __):
+        if every[-1] in better:
+            return (*every[:-1], better[every[-1]][0]), better[every[-1]][1]
+
+    monkeypatch.setattr(acting_inputs, "_with", lambda *_: 11.2)
+    monkeypatch.setattr(acting_inputs, "_sharper", sharper)
+    search: Any = None
+    found = acting_inputs._of_kind(search, "tanh", ("u^2", "sat(u/0.94)", "tanh(u/0.65)"), search)
+    assert found == (("u^2", "tanh(u/1.2)"), 1.0)
+
+
 @pytest.mark.parametrize(("kind", "level", "off"), [("sat", 0.6, 0.01), ("tanh", 2.5, 2e-3)])
 def test_the_level_at_which_an_input_saturates_is_found(kind, level, off):
     # fails if a level stays where accelerations put it, one kind of saturation stands for the other, or the input stays
