@@ -109,8 +109,8 @@ SATURATING = {
 
 
 def test_levels_are_sharpened_until_nothing_is_better(monkeypatch):
-    # fails if they are sharpened once, with the terms that were taken at the first guess: x⁵ for x³, and an input beside
-    # its saturation at 1.03 in the place of 1.2, with 3 times the noise
+    # fails if they are sharpened once, with the terms that were taken at the first guess: x⁵ for x³, and an input
+    # beside its saturation at 1.03 in the place of 1.2, with 3 times the noise
     better: Any = {"tanh(u/0.65)": ("tanh(u/1.03)", 3.1), "tanh(u/1.03)": ("tanh(u/1.2)", 1.0)}
 
     def sharper(_, every, __):
