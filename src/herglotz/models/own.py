@@ -172,6 +172,9 @@ def own_name(model: Any) -> str | None:
 
 
 def refuse_own(model: Any, what: str, instead: str) -> None:
-    """Raise InputError for a function that reads the terms of a model, if the model is a user's L_d without terms."""
+    """Raise InputError if the model is a user's L_d, whose terms are unknown: `what` is made of a model's terms."""
     if isinstance(model, OwnLagrangian):
-        raise InputError(f"{what} reads the terms of the package's models, not an L_d of your own; {instead}")
+        raise InputError(
+            f"there is no {what} of {model.config.name}, an L_d of your own, whose terms herglotz does not know; "
+            f"{instead}"
+        )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.data.files import PathLike
+from herglotz.models import own_name
 from herglotz.plots.animation import save_animation as save_animation
 from herglotz.plots.learned import plot_bands as plot_bands, plot_learned as plot_learned
 from herglotz.plots.motion import plot_data as plot_data, plot_trajectory as plot_trajectory
@@ -71,14 +72,15 @@ def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
     -------
     list of Path
         The files, in the order of `FIGURES`. `plan` is left out for a run without a plan, `sizes` for a run without a
-        search for terms, and `training` for a run without a history, as where no stage of its fit found a path. Every
-        figure is drawn before the first is written.
+        search for terms, `learned` for an L_d of your own, and `training` for a run without a history, as where no
+        stage of its fit found a path. Every figure is drawn before the first is written.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written to.
     """
-    required = {"plan": run.metrics.get("plan"), "sizes": run.metrics.get("compared"), "training": run.history}
+    required = {"plan": run.metrics.get("plan"), "sizes": run.metrics.get("compared"), "training": run.history,
+                "learned": not own_name(run.model)}  # fmt: skip
     plots = {name: plot for name, plot in FIGURES.items() if required.get(name, True)}
     return save_all({name: plot(run) for name, plot in plots.items()}, folder, form)

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from herglotz.data.units import common_unit
 from herglotz.errors import InputError
+from herglotz.models import refuse_own
 from herglotz.plots.style import INK, MODEL, MUTED, SUPPORT, UNSEEN, label, logarithmic, new_figure, styled, with_unit
 from herglotz.training import Run
 from herglotz.training.plan import Plan
@@ -97,6 +98,7 @@ def plot_plan(run: Run) -> Figure:
 
     Raise InputError if the run holds no plan.
     """
+    refuse_own(run.model, "plan", 'run.plot("training") draws the stages of its fit')
     if "plan" not in run.metrics:
         raise InputError("the run holds no plan; fit it again to get one")
     plan = Plan.from_dict(run.metrics["plan"])
@@ -131,6 +133,7 @@ def plot_sizes(run: Run) -> Figure:
     The line joins the best models of each size, and the model that was taken is in colour. Raise InputError if the
     run has no search for terms.
     """
+    refuse_own(run.model, "search for terms", 'run.plot("training") draws the stages of its fit')
     compared = run.metrics.get("compared")
     if not compared:
         raise InputError("the run has no search for terms whose models could be drawn; fit without naming terms")

@@ -77,7 +77,7 @@ def write_report(run: Run, folder: str | Path, against: Trajectories | None = No
     InputError
         If the folder or a file cannot be written, or the columns of `against` are not those of the run.
     """
-    refuse_own(run.model, "the report", "run.verify(), run.summary() and run.plot() show what was reached")
+    refuse_own(run.model, "report", "run.verify(), run.summary() and run.plot() show what was reached")
     document = describe(run, against, name)
     folder = folder_at(folder)
     written = {folder / "report.html": as_html(document), folder / "report.md": as_markdown(document)}

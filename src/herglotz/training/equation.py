@@ -265,7 +265,7 @@ def _wrapped(left: str, terms: Sequence[str]) -> list[str]:
 
 def notes_of(run: FittedRun, printed: FittedRun | None = None) -> tuple[str, ...]:
     """The notes of a run, whose equation has the numbers of `printed`, by default its own; empty ones are left out."""
-    refuse_own(run.model, "the equation", "herglotz.theory.ContinuousEquation evaluates that of any L_d")
+    refuse_own(run.model, "printed equation", "run.continuous evaluates its force, energy and Lagrangian")
     return tuple(filter(None, (_inputs(run), _sensors(run), _steps(run, printed or run))))
 
 

@@ -23,6 +23,7 @@ from herglotz.data.holds import Arrival
 from herglotz.data.input_terms import with_input_terms, with_waves
 from herglotz.data.splits import trained_whole
 from herglotz.errors import InputError, refuse, tell
+from herglotz.models import refuse_own
 from herglotz.stepping.state import state_of
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
@@ -146,6 +147,8 @@ def fit(
 
 def _planned(given: Plan | Run | None, data: Trajectories) -> Plan | None:
     """The given plan, or the plan of the given run."""
+    if isinstance(given, Run):
+        refuse_own(given.model, "plan", "leave plan= out, and give the module: model=net")
     plan = Plan.from_dict(given.metrics["plan"]) if isinstance(given, Run) and "plan" in given.metrics else given
     if plan is None:
         return None

@@ -148,7 +148,7 @@ def learned_functions(of: Run | Laplace, *, points: int = 101, beyond: float = 0
     >>> low, high = force.interval(0.9)
     """
     run = of.run if isinstance(of, Laplace) else of
-    refuse_own(run.model, "its functions", "evaluate the module itself")
+    refuse_own(run.model, "figure or table of functions", "evaluate parts of the module, such as net.V(q)")
     refuse({f"points must be 2 or more, got {points}": points < 2, f"beyond must be >= 0, got {beyond:g}": beyond < 0})
     lines = _Lines(run, points, beyond)
     with torch.no_grad():

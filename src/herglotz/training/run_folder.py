@@ -19,6 +19,7 @@ import herglotz
 from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.npz_format import npz_bytes, trajectories_of
 from herglotz.errors import InputError, refuse
+from herglotz.formats import FORMATS
 from herglotz.models import ContactLagrangian, ModelConfig, refuse_own
 from herglotz.schema import check_entries, matches
 from herglotz.stepping import State
@@ -98,8 +99,11 @@ def save_run(run: Run, folder: str | Path) -> None:
     OSError
         If the folder cannot be written.
     """
-    remedy = "keep the module: torch.save(module.state_dict(), path), and export files of the run"
-    refuse_own(run.model, "a run's folder", remedy)
+    refuse_own(
+        run.model, "folder",
+        "keep the whole run by torch.save(run, path), its weights by torch.save(net.state_dict(), path), and its steps "
+        'without the code of the module by run.export("model.pt2")',
+    )  # fmt: skip
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = {
@@ -148,7 +152,7 @@ def load_run(folder: str | Path) -> Run:
     """
     folder = Path(folder)
     if folder.is_file():
-        raise InputError(f"{folder}: is a file, and no run; fit data first: herglotz fit {folder} --out RUN")
+        raise InputError(f"{folder}: is a file, and no run; {_remedy_of_a_file(folder)}")
     if not (folder / "model.pt").is_file():
         what = "no model.pt in this folder" if folder.is_dir() else "no such folder"
         raise InputError(f"{folder}: {what}; give the folder that `herglotz fit --out` wrote")
@@ -182,6 +186,15 @@ def load_run(folder: str | Path) -> Run:
     )  # fmt: skip
     _check_sizes(run, stored["data_digest"], folder)
     return run
+
+
+def _remedy_of_a_file(path: Path) -> str:
+    """What to do with a file that was given in place of the folder of a run."""
+    if path.suffix.lower() in {form.ending for form in FORMATS.values()}:
+        return f"a model that was exported is opened by herglotz.export.load_exported, and by herglotz verify {path}"
+    if path.suffix.lower() in (".pt", ".pth"):
+        return "torch.load reads what torch.save wrote, and net.load_state_dict takes the weights of a module"
+    return f"fit data first: herglotz fit {path} --out RUN"
 
 
 def _bound(folder: Path) -> dict[str, bytes]:

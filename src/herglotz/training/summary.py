@@ -25,13 +25,12 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
     """Names and values of the results that the run has."""
     m, data = run.metrics, run.data
     unit, degrees = common_unit(data.units), bool(data.degrees)
-    level = f"own L_d {m['own']}" if "own" in m else f"{run.decided.level} level"
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", as_recorded(data)[0].summary()),
         ("left out", "; ".join(left_out_of(m, data))),
         ("outlier", "; ".join(outlying_of(m, data))),
-        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {level}"),
+        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {_level(run)}"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
         ("extrapolation RMS", _told(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
@@ -102,7 +101,13 @@ def summary(run: FittedRun) -> str:
 def one_line(run: FittedRun) -> str:
     """The run in one line of 80 characters or little more."""
     names, verdict = ", ".join(run.data.names), run.metrics.get("verdict", "not judged").split(":")[0]
-    return f"Run({run.decided.level} level, {names} of {run.data.source or 'data'}; {verdict})"
+    return f"Run({_level(run)}, {names} of {run.data.source or 'data'}; {verdict})"
+
+
+def _level(run: FittedRun) -> str:
+    """The level of the model, or the name of an L_d of the user's."""
+    own = run.metrics.get("own")
+    return f"own L_d {own}" if own else f"{run.decided.level} level"
 
 
 def as_html(run: FittedRun) -> str:

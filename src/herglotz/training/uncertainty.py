@@ -234,7 +234,7 @@ def laplace(run: Run) -> Laplace:
     InputError
         If the trajectories cannot be solved from the run's states.
     """
-    refuse_own(run.model, "the posterior", "fit several seeds for a spread")
+    refuse_own(run.model, "posterior", "fit several starting weights for a spread")
     return Laplace(run)
 
 

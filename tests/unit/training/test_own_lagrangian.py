@@ -9,9 +9,11 @@ from torch import nn
 
 import herglotz as hz
 from herglotz.cached import cached
+from herglotz.cli import main
 from herglotz.export import export_pt2
 from herglotz.mechanics import autograd_partials
 from herglotz.models import OwnLagrangian
+from herglotz.plots import save_figures
 from herglotz.stepping import Stepper
 from herglotz.training import laplace
 from herglotz.training.kernel import source_of
@@ -297,14 +299,45 @@ def test_a_module_is_fitted_in_place(fitted):  # fails if a copy is trained, or 
 
 def test_a_run_says_what_it_cannot_do_with_a_module(fitted, tmp_path):  # fails if an attribute is missing inside
     _, run = fitted
-    for ask in (run.equation, lambda: laplace(run), lambda: run.plot("learned"), lambda: run.report(tmp_path / "r")):
-        with pytest.raises(hz.InputError, match="not an L_d of your own"):
+    refused = (
+        (run.equation, "no printed equation of Spring, an L_d of your own.*run.continuous"),
+        (lambda: laplace(run), "no posterior"),
+        (lambda: run.report(tmp_path / "r"), r"no report.*run\.verify"),
+        (lambda: run.save(tmp_path / "run"), r"no folder.*torch\.save\(run, path\).*run\.export"),
+        (lambda: run.plot("learned"), "functions.*parts of the module"),
+        (lambda: run.plot("plan"), "no plan.*training"),
+        (lambda: run.plot("sizes"), "no search.*training"),
+        (lambda: hz.fit(run.data, plan=run), "no plan.*model=net"),
+    )
+    for ask, words in refused:
+        with pytest.raises(hz.InputError, match=words):
             ask()
-    with pytest.raises(hz.InputError, match=r"torch\.save"):
-        run.save(tmp_path / "run")
-    with pytest.raises(hz.InputError, match="no plan"):
-        run.plot("plan")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_of_a_module_draws_predicts_and_is_kept_whole(fitted, tmp_path):  # fails if a remedy is none
+    _, run = fitted
+    names = [path.stem for path in save_figures(run, tmp_path / "figures")]
+    assert names == ["trajectory", "phase_portrait", "training"]
+    for name in ("momentum_vs_dS", "hj_residual"):
+        assert run.plot(name).axes
+    assert run.predict(run.data).rms < 1e-3
+    assert repr(run).startswith("Run(own L_d Spring, ")
+    torch.save(run, tmp_path / "run.pt")
+    again = torch.load(tmp_path / "run.pt", weights_only=False)
+    assert again.summary() == run.summary()
+    assert (again.rollout(5).q == run.rollout(5).q).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("net.pt", "load_state_dict"), ("net.pt2", "load_exported"), ("motion.csv", "herglotz fit ")]
+)
+def test_a_file_in_place_of_a_run_is_named(name, words, tmp_path, capsys):  # fails if `herglotz fit net.pt` is advised
+    (tmp_path / name).touch()
+    with pytest.raises(hz.InputError, match=f"is a file, and no run.*{words}"):
+        hz.load_run(tmp_path / name)
+    assert main(["report", str(tmp_path / name)]) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_what_cannot_be_fitted_says_so():  # fails if the message names a setting that the user did not give
