@@ -180,6 +180,10 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
             time = data.index
     q = torch.from_numpy(_floats("positions", data))
     refuse({
+        f"{data!r} is no recording; give positions (N,) or (N, n), a table, the path of a file, or a list of these":
+            q.ndim == 0 or not q.numel(),
+    })  # fmt: skip
+    refuse({
         "positions without times: give h, the time between two samples, or time, an array of times":
             (h is None) == (time is None),
         "h is the time between two samples, one number; where steps differ, give time":

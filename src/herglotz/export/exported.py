@@ -16,7 +16,15 @@ from herglotz.export.step import Box, s_matters
 from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
 from herglotz.stepping.events import Watch
 from herglotz.stepping.rollout import Plan, Track, without_lost_factors
-from herglotz.stepping.state import check_h, check_moving, check_rows, check_started, check_state
+from herglotz.stepping.state import (
+    action_of,
+    check_h,
+    check_moving,
+    check_rows,
+    check_started,
+    check_state,
+    parts_of,
+)
 from herglotz.stepping.velocity import Legendre, momentum, velocity
 
 Program = Callable[..., tuple[Tensor, ...]]
@@ -105,7 +113,7 @@ class ExportedStepper(OneStepMethod):
         """
         if "init" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file starts from (q, p, s) only; use a .pt2 file for init")
-        s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
+        s0 = action_of(s0, q0=q0, q1=q1)
         self._check(q0, q1, s0, ("q0", "q1", "s0"), finite=True)
         p, s = self.programs["init"](*map(plain, self._flat(State(q0, q1, s0), h, u)))
         return check_started(State(q1, p.reshape(q1.shape), s.reshape(s0.shape)))
@@ -115,7 +123,7 @@ class ExportedStepper(OneStepMethod):
 
         Raise InputError as in `step`, and where the file has no velocities.
         """
-        s = torch.zeros_like(q[..., 0]) if s is None else s
+        s = action_of(s, q=q, v=v)
         self._check(q, v, s, ("q", "v", "s"), finite=True)
         flat = [plain(x) for x in self._flat(State(q, v, s), h, None)[:4]]
         transform: Any = self.programs.get("momentum", partial(momentum, self._legendre))
@@ -127,7 +135,7 @@ class ExportedStepper(OneStepMethod):
 
         Raise InputError as in `step`, and where the file has no velocities; StepError where a state has no velocity.
         """
-        self._check(*state, finite=True)
+        self._check(*parts_of(state), finite=True)
         with torch.no_grad():
             q, p, s, h = (plain(x) for x in self._flat(state, h, None)[:4])
             if "velocity" in self.programs:
@@ -148,7 +156,7 @@ class ExportedStepper(OneStepMethod):
         InputError if the file does not take this shape, dtype, h or u; a state that is not finite has a status instead.
         """
         del guess
-        self._check(*state)
+        self._check(*parts_of(state))
         flat = self._flat(state, h, u)
         if self.differentiable:
             return self._step(self.programs["model"](*map(plain, flat)), state)
@@ -169,7 +177,7 @@ class ExportedStepper(OneStepMethod):
             message = f"{self._file} file{many} holds no derivative; use a .pt2 or ONNX file, or Stepper.linearise"
             raise InputError(f"{self.path}: {message}")
         with torch.no_grad():
-            self._check(*state)
+            self._check(*parts_of(state))
             state = State(*(x.detach() for x in state))
             *out, J = self.programs["linearise"](*map(plain, self._flat(state, h, u)))
         J, size = J.reshape(*state.s.shape, *J.shape[1:]), 2 * self.dof + 1

@@ -205,14 +205,22 @@ def check_tensors(**arguments: Any) -> None:
     """Raise InputError for the first argument that is no tensor."""
     for name, x in arguments.items():
         if not isinstance(x, Tensor):
-            raise InputError(f"{name} must be a tensor, got a {type(x).__name__}; {REMEDY}")
+            remedy = "give its parts with a star, as in (*state, h=h)" if isinstance(x, tuple) else REMEDY
+            raise InputError(f"{name} must be a tensor, got a {type(x).__name__}; {remedy}")
+
+
+def check_positions(**positions: Any) -> None:
+    """Raise InputError for the first argument that is no tensor (..., n) of coordinates."""
+    check_tensors(**positions)
+    for name, x in positions.items():
+        if x.ndim == 0 or not x.shape[-1]:
+            raise InputError(f"{name} needs shape (..., n), got {tuple(x.shape)}; {REMEDY}")
 
 
 def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] = ("q0", "q1", "s0")) -> None:
     """Raise InputError for an argument that is no tensor, or positions without a last axis for the coordinates."""
-    check_tensors(**dict(zip(names, (q0, q1, s0), strict=True)))
-    if q0.ndim == 0 or q1.ndim == 0:
-        raise InputError(f"{names[0]} and {names[1]} need shape (..., n), got (); {REMEDY}")
+    check_positions(**{names[0]: q0, names[1]: q1})
+    check_tensors(**{names[2]: s0})
 
 
 REMEDY = (

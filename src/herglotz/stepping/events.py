@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.mechanics.newton import select
 from herglotz.stepping.state import Crossings, State, Status, Step
 
@@ -51,6 +51,8 @@ class Watch:
     """The events of a rollout: the samples that have stopped, and every crossing so far."""
 
     def __init__(self, events: Sequence[Event | Callable[[State], Tensor]], start: State):
+        refuse({f"events must be a list of functions of a state, or of Event, got a {type(events).__name__}; write "
+                "events=[...]": not isinstance(events, Sequence)})  # fmt: skip
         self.events = [e if isinstance(e, Event) else Event(e) for e in events]
         self.values = [self._value(e, start) for e in self.events]
         self.stopped = torch.zeros_like(start.s, dtype=torch.bool)

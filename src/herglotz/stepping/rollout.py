@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as save_start_only
 
-from herglotz.errors import InputError
-from herglotz.mechanics.partials import check_tensors
+from herglotz.errors import InputError, check_whole
+from herglotz.mechanics.partials import ABSENT
 from herglotz.progress import ProgressBar
 from herglotz.stepping.events import Event, Watch
 from herglotz.stepping.state import (
@@ -30,9 +30,11 @@ from herglotz.stepping.state import (
     Status,
     Step,
     StepError,
+    action_of,
     check_h,
     check_spreads,
     check_state,
+    rows_of,
     step_sizes,
     throw_failure,
 )
@@ -130,10 +132,8 @@ class Plan:
     checkpoint: int | None = None
 
     def __post_init__(self):
-        for name in ("every", "chunk", "checkpoint"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"{name} must be >= 1, got {value}")
+        segment = {} if self.checkpoint is None else {"checkpoint": self.checkpoint}
+        check_whole(1, every=self.every, chunk=self.chunk, **segment)
         if self.steps % self.every:
             raise InputError(f"every={self.every} does not divide the number of steps {self.steps}")
 
@@ -281,7 +281,7 @@ class OneStepMethod(ABC):
     def rollout(
         self,
         q: Tensor,
-        p: Tensor,
+        p: Tensor = ABSENT,
         s: Tensor | None = None,
         *,
         h: Tensor | float,
@@ -327,10 +327,9 @@ class OneStepMethod(ABC):
         InputError
             If h is not positive, lengths disagree, the L_d takes no inputs, or options do not fit together.
         """
-        check_tensors(q=q, p=p)
-        start = self._checked(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
+        start = self._checked(State(q, p, action_of(s, q=q, p=p)))
         if inputs is not None:
-            inputs = self._checked_inputs(torch.as_tensor(inputs), q)
+            inputs = self._checked_inputs(rows_of(inputs), q)
             steps = inputs.shape[-2] if steps is None and torch.as_tensor(h).ndim == 0 else steps
         if events and checkpoint is not None:
             raise InputError("events and checkpoint exclude one another; leave one out")

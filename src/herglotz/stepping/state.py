@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError, check_whole
+from herglotz.errors import InputError, check_whole, refuse
 from herglotz.mechanics.contact import join, normal, split
 from herglotz.mechanics.newton import Root
-from herglotz.mechanics.partials import check_arguments, in_vmap
+from herglotz.mechanics.partials import check_arguments, check_positions, check_tensors, in_vmap
 
 
 class Status(IntEnum):
@@ -144,9 +144,42 @@ class Rollout:
         return ((self.status == Status.CONVERGED) | (self.status == Status.STOPPED)).all(-1)
 
 
+def parts_of(state: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """q, p and s of a state; raise InputError for an object that is no three of them."""
+    refuse({
+        f"a state is State(q, p, s), got a {type(state).__name__}; init_qv(q, v, h=h) makes one, and a rollout has "
+        "those of its .states, the last of which is .final":
+            not isinstance(state, tuple | list) or len(state) != 3,
+    })  # fmt: skip
+    q, p, s = state
+    return q, p, s
+
+
+def action_of(s: Tensor | None, **positions: Tensor) -> Tensor:
+    """s, by default 0 for every sample of the first of the `positions` (..., n), which are checked."""
+    check_positions(**positions)
+    return torch.zeros_like(next(iter(positions.values()))[..., 0]) if s is None else s
+
+
+def spread_over(state: State, h: Tensor) -> State:
+    """The state in the shape (...) that it has together with steps h; raise InputError if they do not spread."""
+    check_spreads(h, state.s)
+    batch = torch.broadcast_shapes(h.shape, state.s.shape)
+    return State(state.q.expand(*batch, -1), state.p.expand(*batch, -1), state.s.expand(batch))
+
+
+def guess_of(guess: Tensor | None, q: Tensor) -> Tensor | None:
+    """The start of Newton's method for the positions q (..., n), in their dtype; raise InputError for other shapes."""
+    if guess is None:
+        return None
+    check_tensors(guess=guess)
+    refuse({f"guess needs the shape of q, {tuple(q.shape)}, got {tuple(guess.shape)}": guess.shape != q.shape})
+    return guess.to(q)
+
+
 def check_batch(states: tuple[Tensor, Tensor, Tensor]) -> State:
     """The states as a batch (B, n), (B, n), (B); raise InputError for other types or shapes."""
-    q, p, s = states
+    q, p, s = parts_of(states)
     check_arguments(q, p, s, ("q", "p", "s"))
     if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
         raise InputError(f"states need shapes (B, n), (B, n), (B,); got {[tuple(x.shape) for x in (q, p, s)]}")
@@ -162,7 +195,7 @@ def check_state(
     Raise InputError if shapes or dtypes do not fit one another and the parameters of L_d (of an exported file: `dof`
     and `dtype`); with `finite`, also if a number is not finite.
     """
-    q, p, s = state
+    q, p, s = parts_of(state)
     check_arguments(q, p, s, names)
     if in_vmap(q) or in_vmap(p) or in_vmap(s):
         raise InputError(
@@ -237,6 +270,14 @@ def check_spreads(h: Tensor, s: Tensor) -> None:
             f"h of shape {tuple(h.shape)} does not spread over states of shape {tuple(s.shape)}; give one step for all "
             "or one for each"
         ) from None
+
+
+def rows_of(inputs: Any) -> Tensor:
+    """The inputs of a rollout as a tensor; raise InputError if they are no numbers."""
+    try:
+        return torch.as_tensor(inputs)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"inputs must be numbers of shape (K, m) or (..., K, m), got {inputs!r}") from None
 
 
 def check_rows(inputs: Tensor) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from numbers import Real
 
 import torch
 from torch import Tensor
 
+from herglotz.errors import check_whole, refuse
 from herglotz.mechanics import DiscreteLagrangian, legendre_plus
 from herglotz.mechanics.partials import check_function
 from herglotz.models import capabilities
@@ -19,12 +21,15 @@ from herglotz.stepping.state import (
     State,
     Step,
     StepError,
+    action_of,
     check_h,
     check_moving,
     check_rows,
     check_spreads,
     check_started,
     check_state,
+    guess_of,
+    spread_over,
     throw_failure,
 )
 from herglotz.stepping.velocity import legendre, momentum, velocity
@@ -57,6 +62,8 @@ class Stepper(OneStepMethod):
         explicit: bool = True,
     ):
         check_function(L_d)
+        check_whole(1, max_iterations=max_iterations)
+        refuse({f"tol must be a number > 0, got {tol!r}": tol is not None and not (isinstance(tol, Real) and tol > 0)})
         self.L_d = L_d
         self.tol = tol
         self.max_iterations = max_iterations
@@ -99,10 +106,10 @@ class Stepper(OneStepMethod):
         StepError
             If p1 or s1 of a sample is too large a number.
         """
-        s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
-        check_state(State(q0, q1, s0), self.L_d, ("q0", "q1", "s0"), finite=True)
+        s0 = action_of(s0, q0=q0, q1=q1)
+        start = check_state(State(q0, q1, s0), self.L_d, ("q0", "q1", "s0"), finite=True)
         h = check_h(h, q0)
-        return check_started(State(*legendre_plus(driven_by(self.L_d, u), q0, q1, s0, h)))
+        return check_started(State(*legendre_plus(driven_by(self.L_d, u), *spread_over(start, h), h)))
 
     def init_qv(self, q: Tensor, v: Tensor, s: Tensor | None = None, h: Tensor | float = 1.0) -> State:
         """The state (q, p, s) of a position and a velocity: p = L_v(q, v, s) of the model's L = lim L_d/h, h → 0.
@@ -131,9 +138,10 @@ class Stepper(OneStepMethod):
         StepError
             If p of a sample is too large a number.
         """
-        s = torch.zeros_like(q[..., 0]) if s is None else s
-        check_state(State(q, v, s), self.L_d, ("q", "v", "s"), finite=True)
-        return check_started(State(q, momentum(partial(legendre, self.L_d), q, v, s, check_h(h, q)), s))
+        start = check_state(State(q, v, action_of(s, q=q, v=v)), self.L_d, ("q", "v", "s"), finite=True)
+        h = check_h(h, q)
+        q, v, s = spread_over(start, h)
+        return check_started(State(q, momentum(partial(legendre, self.L_d), q, v, s, h), s))
 
     def velocity(self, state: State, h: Tensor | float = 1.0) -> Tensor:
         """The velocity v (..., n) of states: L_v(q, v, s) = p solved for v, the inverse of `init_qv`.
@@ -160,8 +168,9 @@ class Stepper(OneStepMethod):
         StepError
             If no velocity of a sample has this p; the message names the sample.
         """
-        check_state(state, self.L_d, finite=True)
-        v, status = velocity(partial(legendre, self.L_d), state, check_h(h, state.q))
+        state = check_state(state, self.L_d, finite=True)
+        h = check_h(h, state.q)
+        v, status = velocity(partial(legendre, self.L_d), spread_over(state, h), h)
         return check_moving(v, status)
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
@@ -195,7 +204,7 @@ class Stepper(OneStepMethod):
         state = check_state(state, self.L_d)
         h = check_h(h, state.q)
         check_spreads(h, state.s)
-        step, _ = self._single_step()(state, h, guess, u)
+        step, _ = self._single_step()(state, h, guess_of(guess, state.q), u)
         self._check_step(step, state, h, u)
         return step
 
@@ -254,8 +263,8 @@ class Stepper(OneStepMethod):
             As `init` and `step`.
         """
         state = self.init(q0, q1, s0, h0)
-        step = self.step(state, h0 if h1 is None else h1, 2 * q1 - q0)
-        return q1, step.state.q, state.s
+        step = self.step(state, h0 if h1 is None else h1, 2 * state.q - q0)
+        return state.q, step.state.q, state.s
 
     def _checked(self, state: State) -> State:
         return check_state(state, self.L_d)

@@ -95,7 +95,7 @@ def test_functions_of_the_theory_are_held_to_the_same():
     [
         (
             (f64(1.0)[0], f64(0.5)[0], f64(0.3)[0]),
-            r"q and p need shape \(..., n\), got \(\); one coordinate is q = torch",
+            r"q needs shape \(..., n\), got \(\); one coordinate is q = torch",
         ),
         ((1.0, 0.5, 0.3), "q must be a tensor, got a float; one coordinate is q = torch"),
         ((f64(1.0), [0.5], f64(0.3)[0]), "p must be a tensor, got a list"),
@@ -112,7 +112,7 @@ def test_scalars_have_a_remedy(state, message):
             call()
     with pytest.raises(
         InputError,
-        match=message.replace("q and p", "q0 and q1").replace("q must", "q0 must").replace("p must", "q1 must"),
+        match=message.replace("q needs", "q0 needs").replace("q must", "q0 must").replace("p must", "q1 must"),
     ):
         partials(oscillator, *state, 0.1)  # pyright: ignore
 

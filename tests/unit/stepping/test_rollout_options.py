@@ -149,9 +149,30 @@ def test_extrapolation_is_exact_for_cubics():
         (lambda s, x: s.step(x, 0.1, u=torch.ones(1)), "takes no inputs"),
         (lambda s, x: s.init(x.q, x.q, u=torch.ones(1)), "takes no inputs"),
         (lambda s, x: s.rollout(*x, h=0.1, steps=4, every=3), "every=3 does not divide the number of steps 4"),
-        (lambda s, x: s.rollout(*x, h=0.1, steps=4, every=0), "every must be >= 1, got 0"),
-        (lambda s, x: s.rollout(*x, h=0.1, steps=4, checkpoint=0), "checkpoint must be >= 1, got 0"),
+        (lambda s, x: s.rollout(*x, h=0.1, steps=4, every=0), "every must be a whole number >= 1, got 0"),
+        (lambda s, x: s.rollout(*x, h=0.1, steps=4, checkpoint=0), "checkpoint must be a whole number >= 1, got 0"),
         (lambda _, x: Stepper(Motor()).rollout(*x, h=0.1, inputs=torch.ones(4)), r"shape \(K, m\) or"),
+        (lambda s, x: s.rollout(x, h=0.1, steps=4), r"q must be a tensor, got a State; .* \(\*state, h=h\)"),
+        (lambda s, x: s.rollout(x.q[:, :0], x.p, h=0.1, steps=4), r"q needs shape \(..., n\), got \(3, 0\)"),
+        (lambda s, x: s.rollout(*x, h=0.1, steps=4, every="2"), "every must be a whole number >= 1, got '2'"),
+        (lambda s, x: s.rollout(*x, h=0.1, steps=4, chunk=None), "chunk must be a whole number >= 1, got None"),
+        (lambda s, x: s.rollout(*x, h=0.1, steps=4, events=len), r"got a builtin.*write events=\[...\]"),
+        (lambda _, x: Stepper(Motor()).rollout(*x, h=0.1, **{"inputs": "u"}), r"inputs must be numbers .* got 'u'"),
+        (lambda s, _: s.init([1.0], [1.0], h=0.1), "q0 must be a tensor, got a list"),
+        (lambda s, x: s.init(x.s[0], x.s[0], h=0.1), r"q0 needs shape \(..., n\), got \(\)"),
+        (lambda s, x: s.init_qv(x.q.numpy(), x.p.numpy(), h=0.1), "q must be a tensor, got a ndarray"),
+        (lambda s, x: s.init_qv(x.q, 1.0, h=0.1), "v must be a tensor, got a float"),
+        (lambda s, x: s.init_qv(x.q, x.p, h=[0.1, 0.2]), "does not spread"),
+        (lambda s, x: s.step(x.q, 0.1), r"a state is State\(q, p, s\), got a Tensor; .*\.final"),
+        (lambda s, x: s.velocity(s.rollout(*x, h=0.1, steps=2), 0.1), r"got a Rollout; .*\.final"),
+        (lambda s, x: s.linearise((x.q, x.p), 0.1), r"a state is State\(q, p, s\), got a tuple"),
+        (lambda s, x: s.step(x, 0.1, guess=x.q.numpy()), "guess must be a tensor, got a ndarray"),
+        (lambda s, x: s.step(x, 0.1, guess=x.q[:1]), r"guess needs the shape of q, \(3, 1\), got \(1, 1\)"),
+        (
+            lambda s, _: Stepper(s.L_d, **{"max_iterations": 2.5}),
+            r"max_iterations must be a whole number >= 1, got 2\.5",
+        ),
+        (lambda s, _: Stepper(s.L_d, **{"tol": "a"}), "tol must be a number > 0, got 'a'"),
         (
             lambda _, x: Stepper(Motor()).rollout(*x, h=0.1, steps=5, inputs=torch.ones(4, 1)),
             "inputs list 4 steps, but the rollout has 5",
@@ -165,3 +186,15 @@ def test_wrong_options_are_named(call, message):
 
     with pytest.raises(InputError, match=message):
         call(Stepper(plain), start())
+
+
+def test_steps_of_a_start_spread_over_its_parts():  # fails if p has another batch than q, or q another dtype than s
+    def plain(q0, q1, s0, h):
+        return ((q1 - q0) ** 2).sum(-1) / (2 * h) - 0.1 * h * s0
+
+    s, q, h = Stepper(plain), torch.tensor([1.0], dtype=torch.float64), torch.tensor([0.1, 0.2], dtype=torch.float64)
+    for made in (s.init(q, 1.1 * q, h=h), s.init_qv(q, q, h=h)):
+        assert [tuple(x.shape) for x in made] == [(2, 1), (2, 1), (2,)]
+        assert s.velocity(State(q, q, q[0]), h).shape == (2, 1)
+    assert [x.shape[0] for x in s.step_pair(q, 1.1 * q, q[0], h)] == [2, 2, 2]
+    assert s.step(State(q, q, q[0]), 0.1, guess=q.float()).state.q.dtype == torch.float64
