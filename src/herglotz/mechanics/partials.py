@@ -7,7 +7,8 @@ does. No other module calls autograd on a Lagrangian.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from inspect import signature
 from typing import Any, Protocol, cast, runtime_checkable
@@ -228,6 +229,8 @@ REMEDY = (
 )
 
 
+# What torch says where the derivative of a compiled function shall have derivatives.
+OF_COMPILED = ("donated buffers", "does not currently support double backward")
 # What torch says of tensors that do not fit together.
 OF_SHAPES = ("have the same dtype", "expected scalar type", "size of tensor", "shapes cannot be multiplied")
 
@@ -297,6 +300,20 @@ def _check_alone(L_d: Any, L: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Ten
         )
 
 
+@contextmanager
+def _refused_if_compiled() -> Iterator[None]:
+    """Raise InputError where torch finds that a function of torch.compile has no second derivatives."""
+    try:
+        yield
+    except RuntimeError as error:
+        if not any(words in str(error) for words in OF_COMPILED):
+            raise
+        raise InputError(
+            "L_d was compiled by torch.compile, whose derivatives cannot be differentiated again, as steps and losses "
+            "need; give the module that was compiled (hz.compile(stepper) makes fast steps of a trained one)"
+        ) from None
+
+
 def _name(L_d: Any) -> str:
     return getattr(L_d, "__name__", type(L_d).__name__).replace("<lambda>", "the function")
 
@@ -317,7 +334,7 @@ def autograd_partials(
     s0 = s0[..., 0]
     keep_graph = torch.is_grad_enabled() and _differentiable(L_d, q0, q1, s0, h)
     # Autograd records nothing in inference mode.
-    with torch.inference_mode(False), torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad(), _refused_if_compiled():
         q0, q1, s0 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q1, s0))
         # `* 1` gives each argument a graph node of its own, so that views of one tensor differentiate separately.
         a, b, s = q0 * 1, q1 * 1, s0 * 1

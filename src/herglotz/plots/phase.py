@@ -138,13 +138,12 @@ def _mark_pi(ax: Axes, low: float, high: float) -> None:
 
 
 def _title(run: Run) -> str:
-    """Return the title: the damping rate, if the model has a single constant one."""
+    """Return the title: the damping rate, if the model has a single constant one that positions determine."""
     damping = getattr(run.model, "damping", None)
     rate = getattr(damping, "rate", None)
     if run.model.inputs:
         return "States of the driven motion"
-    if rate is None or not getattr(damping, "constant", False):
+    if rate is None or run.model.s_enters_motion:
         return "States and flow of the learned model"
     unit = "" if run.data.time_unit in ("", "1") else f" per {run.data.time_unit}"
-    at = " at s = 0" if run.model.config.dissipation else ""
-    return f"States decay along the learned flow: γ = {rate.item():.3g}{unit}{at}"
+    return f"States decay along the learned flow: γ = {rate.item():.3g}{unit}"

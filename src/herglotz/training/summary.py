@@ -36,7 +36,8 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
         ("extrapolation RMS", _told(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
         ("training RMS", _told(m.get("train_rms"), unit, degrees)),
         ("one-step RMS", _told(m.get("one_step_rms"), unit, degrees)),
-        ("damping rate", _told(m.get("rate"), f"per {per}")),
+        # Where s enters the motion, the same positions have other γ, p and s (gauge, trap 3 of docs/mathematics.md).
+        ("damping rate", "" if run.model.s_enters_motion else _told(m.get("rate"), f"per {per}")),
         ("time", _told(m.get("seconds"), "s")),
     ]
     return [(name, value) for name, value in found if value]

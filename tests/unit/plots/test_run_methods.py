@@ -11,6 +11,7 @@ from fake_run import fake_run
 import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.theory.symmetries import symmetries
 from herglotz.training.motion import Motion
 
@@ -46,6 +47,19 @@ def test_steps_beyond_those_of_the_fit_are_warned_of():  # fails if Python is si
     with pytest.warns(UserWarning, match=r"steps of 0.5 s are outside of those that .* fitted to, 0.2 s"):
         run.rollout(2, h=0.5)
     run.rollout(2, h=0.2)  # its own step: warnings are errors here
+
+
+@pytest.mark.parametrize(("level", "told"), [("linear", True), ("forced", True), ("affine", False), ("full", False)])
+def test_a_damping_rate_is_told_where_positions_determine_it(level, told):
+    # fails if γ is told at a level where other γ have the same motion, or at no level
+    run = fake_run(level=level, steps=20)
+    run = replace(run, metrics={**run.metrics, "rate": 0.2})
+    assert ("damping rate" in run.summary()) == told
+    assert ("γ = 0.2" in str(run.plot("phase_portrait").get_suptitle())) == told
+    powers = ModelConfig(angles=(True,), level="forced", rate=0.2, potential_width=0, dissipation=("s^2",))
+    of_s = replace(run, model=ContactLagrangian(powers))
+    assert "damping rate" not in of_s.summary()
+    assert "γ" not in of_s.plot("phase_portrait").get_suptitle()
 
 
 def test_words_are_short():  # fails if a run, data or a prediction fill the screen again (repr had 64 kB)

@@ -1,5 +1,7 @@
 """Inputs, decimation, chunks and checkpoints of a rollout."""
 
+from typing import Any, cast
+
 import pytest
 import torch
 
@@ -157,7 +159,7 @@ def test_extrapolation_is_exact_for_cubics():
         (lambda s, x: s.rollout(*x, h=0.1, steps=4, every="2"), "every must be a whole number >= 1, got '2'"),
         (lambda s, x: s.rollout(*x, h=0.1, steps=4, chunk=None), "chunk must be a whole number >= 1, got None"),
         (lambda s, x: s.rollout(*x, h=0.1, steps=4, events=len), r"got a builtin.*write events=\[...\]"),
-        (lambda _, x: Stepper(Motor()).rollout(*x, h=0.1, **{"inputs": "u"}), r"inputs must be numbers .* got 'u'"),
+        (lambda _, x: Stepper(Motor()).rollout(*x, h=0.1, inputs=cast(Any, "u")), r"inputs must be numbers .* got 'u'"),
         (lambda s, _: s.init([1.0], [1.0], h=0.1), "q0 must be a tensor, got a list"),
         (lambda s, x: s.init(x.s[0], x.s[0], h=0.1), r"q0 needs shape \(..., n\), got \(\)"),
         (lambda s, x: s.init_qv(x.q.numpy(), x.p.numpy(), h=0.1), "q must be a tensor, got a ndarray"),
@@ -169,10 +171,10 @@ def test_extrapolation_is_exact_for_cubics():
         (lambda s, x: s.step(x, 0.1, guess=x.q.numpy()), "guess must be a tensor, got a ndarray"),
         (lambda s, x: s.step(x, 0.1, guess=x.q[:1]), r"guess needs the shape of q, \(3, 1\), got \(1, 1\)"),
         (
-            lambda s, _: Stepper(s.L_d, **{"max_iterations": 2.5}),
+            lambda s, _: Stepper(s.L_d, max_iterations=cast(Any, 2.5)),
             r"max_iterations must be a whole number >= 1, got 2\.5",
         ),
-        (lambda s, _: Stepper(s.L_d, **{"tol": "a"}), "tol must be a number > 0, got 'a'"),
+        (lambda s, _: Stepper(s.L_d, tol=cast(Any, "a")), "tol must be a number > 0, got 'a'"),
         (
             lambda _, x: Stepper(Motor()).rollout(*x, h=0.1, steps=5, inputs=torch.ones(4, 1)),
             "inputs list 4 steps, but the rollout has 5",

@@ -14,7 +14,7 @@ from herglotz.export import export_pt2
 from herglotz.mechanics import autograd_partials
 from herglotz.models import OwnLagrangian
 from herglotz.plots import save_figures
-from herglotz.stepping import Stepper
+from herglotz.stepping import State, Stepper
 from herglotz.training import laplace
 from herglotz.training.kernel import source_of
 from herglotz.training.parameter_vector import ParameterVector
@@ -198,6 +198,20 @@ def test_wrong_arguments_are_named(change, words):  # fails if a wrong shape spr
     given: dict[str, Any] = {"L_d": Spring(), "q": motion(Spring()).q, "h": H} | change
     with pytest.raises(hz.InputError, match=words):
         hz.losses.herglotz_residual(**given)
+
+
+# torch.compile warns of its own modules.
+@pytest.mark.filterwarnings("ignore")
+def test_a_compiled_module_is_refused():  # fails if torch's words on donated buffers reach the user
+    compiled, q = torch.compile(Spring(), backend="aot_eager"), motion(Spring()).q
+    start = State(q[0, 0], q[0, 0], q[0, 0, 0])
+    for ask in (
+        lambda: hz.losses.herglotz_residual(compiled, q, H),
+        lambda: hz.losses.shooting(compiled, q, H, hz.losses.starts(q, 10), length=10),
+        lambda: Stepper(compiled).step(start, H),
+    ):
+        with pytest.raises(hz.InputError, match=r"compiled by torch\.compile.*give the module that was compiled"):
+            ask()
 
 
 def test_starts_of_another_length_are_refused():  # fails if segments are cut elsewhere than they start
