@@ -22,6 +22,8 @@ GROWTH = 2.0
 NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
 # Least and largest length of the step after a rejected one, over the length of the latter.
 SHORTER = (0.1, 0.5)
+# Dampings that are tried between one with too long a step and one with a step far shorter than that.
+HALVINGS = 4
 # Damping at which a search ends without a descent.
 MAX_DAMPING = 1e12
 
@@ -108,12 +110,25 @@ class _Search:
         """
         # Parameters without influence yet, behind a layer that starts at 0, get the largest scale.
         scale = torch.where(self.scale > 0, self.scale, float(self.scale.max()) or 1.0)
-        while True:
-            step = _damped_step(A, b, self.damping * scale)
-            length = 0.0 if step is None else float((scale * step.square()).sum().sqrt())
-            if length <= self.longest or self.damping > MAX_DAMPING:
-                return step, length
-            self.grow()
+
+        def at(damping: float) -> tuple[Tensor | None, float]:
+            step = _damped_step(A, b, damping * scale)
+            return step, 0.0 if step is None else float((scale * step.square()).sum().sqrt())
+
+        found, below, growth = at(self.damping), 0.0, GROWTH
+        while found[1] > self.longest and self.damping <= MAX_DAMPING:
+            below, self.damping, growth = self.damping, self.damping * growth, growth * 2
+            found = at(self.damping)
+        # The damping may have grown far beyond what the length asks for.
+        for _ in range(HALVINGS if below else 0):
+            if found[1] > SHORTER[1] * self.longest:
+                break
+            between = math.sqrt(below * self.damping)
+            if (other := at(between))[1] <= self.longest:
+                self.damping, found = between, other
+            else:
+                below = between
+        return found
 
 
 def levenberg_marquardt(
@@ -161,7 +176,7 @@ def levenberg_marquardt(
                 at.quiet = patience
                 break
             # Most steps are accepted, unless the step before was not.
-            if getattr(problem, "at_once", False) and at.growth == GROWTH:
+            if getattr(problem, "at_once", False) and at.growth == GROWTH and at.longest == math.inf:
                 equations = problem.normal_equations(at.x + step)
             new = float(of_first(problem.cost(at.x + step) if equations is None else equations[0])[0])
         # Rounding errors differ between machines; the search must not depend on their sign.
@@ -177,10 +192,11 @@ def levenberg_marquardt(
             at.damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
             at.damping, at.growth, at.longest = max(at.damping, 1e-14), GROWTH, math.inf
         else:
-            if step is not None and not settled:
-                at.longest = length * _descending_part(at.best, float(b @ step), new)
             at.quiet += settled
-            at.grow()
+            if step is None or settled:
+                at.grow()
+            else:
+                at.longest = length * _descending_part(at.best, float(b @ step), new)
         if callback is not None:
             callback(at.iteration, at.best, at.x, lambda: {"search": asdict(at), "memory": memory_of(problem)})
     reason = at.over(patience) or "max_iterations"
