@@ -20,12 +20,6 @@ ROUNDING = 1e-11
 GROWTH = 2.0
 # Below this damping λ a step is a Newton step. The search ends if it predicts less than this share of the tolerance.
 NEWTON_DAMPING, NEGLIGIBLE = 1e-6, 0.01
-# Least and largest length of the step after a rejected one, over the length of the latter.
-SHORTER = (0.1, 0.5)
-# Dampings that are tried between one with too long a step and one with a step far shorter than that.
-HALVINGS = 4
-# Damping at which a search ends without a descent.
-MAX_DAMPING = 1e12
 
 
 # (½|r|², JᵀJ, Jᵀr)
@@ -92,43 +86,10 @@ class _Search:
     growth: float = GROWTH
     quiet: int = 0
     iteration: int = 0
-    # Largest length of the next step.
-    longest: float = math.inf
 
     def over(self, patience: int) -> str | None:
         """Why the search is over; None while it is not."""
-        return "converged" if self.quiet >= patience else "no_descent" if self.damping > MAX_DAMPING else None
-
-    def grow(self) -> None:
-        """Raise the damping, by a factor that doubles from time to time."""
-        self.damping, self.growth = self.damping * self.growth, self.growth * 2
-
-    def step(self, A: Tensor | Arrowhead, b: Tensor) -> tuple[Tensor | None, float]:
-        """The step at this damping or, if it is too long, at a larger one, and its length; None if it is not finite.
-
-        The length is √(δᵀ D δ). After a rejected step without damping, many larger dampings give almost the same step.
-        """
-        # Parameters without influence yet, behind a layer that starts at 0, get the largest scale.
-        scale = torch.where(self.scale > 0, self.scale, float(self.scale.max()) or 1.0)
-
-        def at(damping: float) -> tuple[Tensor | None, float]:
-            step = _damped_step(A, b, damping * scale)
-            return step, 0.0 if step is None else float((scale * step.square()).sum().sqrt())
-
-        found, below, growth = at(self.damping), 0.0, GROWTH
-        while found[1] > self.longest and self.damping <= MAX_DAMPING:
-            below, self.damping, growth = self.damping, self.damping * growth, growth * 2
-            found = at(self.damping)
-        # The damping may have grown far beyond what the length asks for.
-        for _ in range(HALVINGS if below else 0):
-            if found[1] > SHORTER[1] * self.longest:
-                break
-            between = math.sqrt(below * self.damping)
-            if (other := at(between))[1] <= self.longest:
-                self.damping, found = between, other
-            else:
-                below = between
-        return found
+        return "converged" if self.quiet >= patience else "no_descent" if self.damping > 1e12 else None
 
 
 def levenberg_marquardt(
@@ -146,8 +107,7 @@ def levenberg_marquardt(
 
     Each iteration solves (JᵀJ + λ D) δ = −Jᵀr with D the running maximum of diag JᵀJ (Marquardt's scaling, Moré's
     monotone version) by Cholesky, or by eliminating the states of an `Arrowhead`; λ starts at `damping` and
-    follows the ratio of actual to predicted decrease (Nielsen's rule). The step after a rejected one is shorter: as far
-    as a parabola through both costs descends, and by a half at least.
+    follows the ratio of actual to predicted decrease (Nielsen's rule).
 
     The search ends after `patience` accepted steps in a row that each lower the cost by less than `atol`, or `rtol`
     relative. A step that changes the cost only by rounding is not taken, but counts as such a step. The search ends at
@@ -168,7 +128,9 @@ def levenberg_marquardt(
     while at.iteration < max_iterations and at.over(patience) is None:
         at.iteration += 1
         beat()
-        step, length = at.step(A, b)
+        # Parameters without influence yet, behind a layer that starts at 0, get the largest scale.
+        floor = float(at.scale.max()) or 1.0
+        step = _damped_step(A, b, at.damping * torch.where(at.scale > 0, at.scale, floor))
         new, predicted, equations = math.inf, 0.0, None
         if step is not None:
             predicted = float(-(b @ step) - 0.5 * step @ (A @ step))
@@ -176,7 +138,7 @@ def levenberg_marquardt(
                 at.quiet = patience
                 break
             # Most steps are accepted, unless the step before was not.
-            if getattr(problem, "at_once", False) and at.growth == GROWTH and at.longest == math.inf:
+            if getattr(problem, "at_once", False) and at.growth == GROWTH:
                 equations = problem.normal_equations(at.x + step)
             new = float(of_first(problem.cost(at.x + step) if equations is None else equations[0])[0])
         # Rounding errors differ between machines; the search must not depend on their sign.
@@ -190,23 +152,14 @@ def levenberg_marquardt(
             at.history.append(at.best)
             at.scale = torch.maximum(at.scale, A.diagonal())
             at.damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
-            at.damping, at.growth, at.longest = max(at.damping, 1e-14), GROWTH, math.inf
+            at.damping, at.growth = max(at.damping, 1e-14), GROWTH
         else:
             at.quiet += settled
-            if step is None or settled:
-                at.grow()
-            else:
-                at.longest = length * _descending_part(at.best, float(b @ step), new)
+            at.damping, at.growth = at.damping * at.growth, at.growth * 2
         if callback is not None:
             callback(at.iteration, at.best, at.x, lambda: {"search": asdict(at), "memory": memory_of(problem)})
     reason = at.over(patience) or "max_iterations"
     return OptimiserResult(at.x, at.best, reason, at.iteration, at.history, memory_of(problem))
-
-
-def _descending_part(cost: float, slope: float, new: float) -> float:
-    """The part of a rejected step to the minimum of the parabola of this cost, this slope and the new cost, bounded."""
-    part = -slope / (2 * (new - cost - slope)) if math.isfinite(new) and new > cost else 0.0
-    return min(max(part, SHORTER[0]), SHORTER[1])
 
 
 def _of_first(equations: Equations) -> Equations:
