@@ -33,7 +33,7 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
 # Iterations for the scale of Student's t, and the relative change at which they end.
-SCALE_ITERATIONS, SCALE_RTOL = 20, 1e-4
+SCALE_ITERATIONS, SCALE_RTOL = 20, 1e-6
 # Log-loss of a residual that is infinite or NaN: more than any finite residual of a model that follows the data has.
 LOSS_IF_NOT_FINITE = 1e3
 

@@ -118,7 +118,7 @@ def test_no_damping_by_s_is_asked_for_beside_friction_that_holds():
 
 def test_the_best_model_by_the_score_is_asked_for_it():
     # fails if the model that free runs chose is asked, which may be so poor that s² makes no better model of it
-    data = recorded(3, 0.003, 0, driven=True, steps=60)
+    data = recorded(3, 0.003, 0, driven=True, steps=100)
     search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
     best = search.full
     assert best is not None

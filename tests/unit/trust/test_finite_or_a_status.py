@@ -135,7 +135,7 @@ def test_the_door(model):
         (one.repeat(1, 2), one.repeat(1, 2), s, 0.1, "the model 1"), (one, one[:2], s, 0.1, "need shapes"),
         (one, one.float(), s, 0.1, "one dtype"), (one, one, s, 0.0, "h must be > 0"),
         (one, one, s, float("inf"), "h must be finite, got inf"), (one, one, s, float("nan"), "got nan"),
-        (one.long(), one.long(), s.long(), 0.1, "floating point"), (one[0, 0], one[0, 0], s[0], 0.1, "need shape"),
+        (one.long(), one.long(), s.long(), 0.1, "floating point"), (one[0, 0], one[0, 0], s[0], 0.1, "needs shape"),
     ]  # fmt: skip
     for q, p, action, h, message in wrong:
         for call in (lambda q, p, s, h: stepper.step(State(q, p, s), h), stepper.init):
