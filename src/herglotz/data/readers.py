@@ -270,17 +270,22 @@ def save(path: PathLike, trajectories: Trajectories) -> None:
     WRITERS[suffix](path, trajectories)
 
 
+def _files_of(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """The files of a folder that may hold recordings, in order; a warning that names files of text without samples."""
+    known = {one.suffix for one in FORMATS}
+    every = sorted(file for file in folder.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
+    files = [file for file in every if file.suffix.lower() not in TEXTS or has_samples(file)]
+    if not files:
+        raise InputError(f"{folder}: is a folder without recordings; files end in {', '.join(sorted(known))}")
+    notes = ", ".join(file.name for file in every if file not in files)
+    return files, (f"warning: left out of the folder, for no line has two numbers: {notes}",) if notes else ()
+
+
 def _read_folder(path: Path, wanted: Wanted) -> Trajectories:
     """The recordings of a folder, file by file, with a note of their names, and a warning of unusable recordings."""
     if (path / "model.pt").exists():
         raise InputError(f"{path}: is the folder of a run, not data; name a recording, or a folder of them")
-    known = {one.suffix for one in FORMATS}
-    every = sorted(file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
-    files = [file for file in every if file.suffix.lower() not in TEXTS or has_samples(file)]
-    if not files:
-        raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
-    notes = tuple(file.name for file in every if file not in files)
-    left_out = (f"warning: left out of the folder, for no line has two numbers: {', '.join(notes)}",) if notes else ()
+    files, left_out = _files_of(path)
 
     def read(wanted: Wanted, file: Path) -> tuple[Path, Trajectories]:
         try:
