@@ -225,7 +225,7 @@ def _misfit(seen: Look, model: ContactLagrangian, sigma: float, data: Trajectori
     """Misfit of segments that start anew, (N, n) in units of q; None if a step fails."""
     config = replace(seen.settings, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(seen.task(Stages()), data=data, config=config), model, frozen=True)
-    found = stages.all_followed(sigma, FREEDOM) if whole else None
+    found = stages.all_followed(sigma) if whole else None
     if found is None:
         found = stages.from_least_squares(sigma, FREEDOM)
         # The first samples of a pendulum that rests near the top do not tell to which side the pendulum falls.

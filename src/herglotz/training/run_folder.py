@@ -101,8 +101,8 @@ def save_run(run: Run, folder: str | Path) -> None:
     """
     refuse_own(
         run.model, "folder",
-        "keep the whole run by torch.save(run, path), its weights by torch.save(net.state_dict(), path), and its steps "
-        'without the code of the module by run.export("model.pt2")',
+        "keep the weights by torch.save(net.state_dict(), path), and steps without the code of the module by "
+        'run.export("model.pt2")',
     )  # fmt: skip
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
