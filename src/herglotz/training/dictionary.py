@@ -112,8 +112,12 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
 
 
 def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
-    """Friction beside viscous and dry friction; dampers between lengths are here, those between joints in `coupled`."""
-    drag = [text for i in range(1, len(angles) + 1) for text in (f"|v{i}| v{i}", f"|v{i}|", f"v{i}^2")]
+    """Friction beside viscous and dry friction; dampers between lengths are here, those between joints in `coupled`.
+
+    Of several coordinates v² has no friction, because masses that depend on the position have such forces.
+    """
+    drag = [text for i in range(1, len(angles) + 1) for text in (f"|v{i}| v{i}", f"|v{i}|")]
+    drag += ["v1^2"] if len(angles) == 1 else []
     drag += [f"load {i}" for i, angle in enumerate(angles, 1) if angle]
     drag += [text for i, angle in enumerate(angles, 1) if not angle for text in (f"q{i} v{i}", f"q{i}^2 v{i}")]
     if not any(angles) and len(angles) > 1:

@@ -84,7 +84,7 @@ def candidates(
     # The length |v| of a velocity needs one unit.
     one_unit = len(set(data.units)) == 1
     # Over a motion one way v² and |v| v are one force.
-    gone = {f"v{i + 1}^2" for i in range(len(angles)) if moves_one_way(data, i)} | ({AIR} if not one_unit else set())
+    gone = ({"v1^2"} if moves_one_way(data, 0) else set()) | ({AIR} if not one_unit else set())
     drag = tuple(text for text in drag_of(angles) if text not in gone)
     features, drag = (in_proportion(texts, ratios or {}) for texts in (features, drag))
     return NamedTerms((*features, *special(data)), drag, dry=True)

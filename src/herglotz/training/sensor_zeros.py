@@ -12,6 +12,7 @@ Drifts are fitted in the same way with the whole dictionary, one rate d for each
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -36,6 +37,8 @@ CENTRE = "alike in all recordings, so that the terms of the model are about them
 SIGNIFICANT = 5.0
 # Strides in the parts of a recording whose zeros are fitted: all parts, or every m-th if some cannot be followed.
 STRIDES = (1, 2, 4, 8)
+# Groups of successive parts whose zeros are compared.
+GROUPS = 6
 
 
 def reference_of(data: Trajectories) -> int:
@@ -54,22 +57,37 @@ def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max
     Multiple shooting over the zeros and the start states of the parts. A zero that is not significant is 0. If the
     model cannot follow some part, every second part is fitted, or fewer (`STRIDES`); if none can be followed, all
     zeros are 0.
+
+    Within a part a zero and an error of the model's forces look alike. The standard deviation of a zero is therefore at
+    least what its values in groups of successive parts say.
     """
-    strides = (stride for stride in STRIDES if stride <= len(data))
-    found = (_of_parts(model, data.select(range(0, len(data), stride)), sigma, max_step) for stride in strides)
-    return next((zeros for zeros in found if zeros is not None), (0.0,) * data.dof)
+
+    def of(parts: Trajectories) -> tuple[Tensor, Tensor] | None:
+        return _of_parts(model, parts, sigma, max_step)
+
+    for stride in (stride for stride in STRIDES if stride <= len(data)):
+        parts = data.select(range(0, len(data), stride))
+        if (found := of(parts)) is None:
+            continue
+        z, deviations = found
+        edges = torch.linspace(0, len(parts), GROUPS + 1).long().tolist() if len(parts) >= GROUPS else []
+        groups = [own[0] for edge in pairwise(edges) if (own := of(parts.select(range(*edge)))) is not None]
+        if len(groups) > 1:
+            deviations = deviations.maximum(torch.stack(groups).std(0) / len(groups) ** 0.5)
+        return tuple(torch.where(clear(z, deviations), z, 0.0).tolist())
+    return (0.0,) * data.dof
 
 
-def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...] | None:
-    """The zeros (n,) from all of these parts; None if the model cannot follow some part."""
+def _of_parts(
+    model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float
+) -> tuple[Tensor, Tensor] | None:
+    """The zeros (n,) of all of these parts, and their deviations; None if the model cannot follow some part."""
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
     problem.guess_from_states(states_of_pairs(model, data))
     theta = problem.parameters.get()
     x = problem.pack(theta, first_states(problem, theta, data))
     found = fitted(WithZeros(problem, shared=True, held=True), x)
-    if found is None:
-        return None
-    return tuple(torch.where(clear(found[0], deviations_of(found[1])), found[0], 0.0).tolist())
+    return None if found is None else (found[0], deviations_of(found[1]))
 
 
 def fitted(target: WithZeros, x: Tensor, start: Tensor | None = None) -> tuple[Tensor, Tensor] | None:

@@ -266,10 +266,29 @@ def test_zeros_of_its_own_are_taken_only_where_the_warm_up_suits_no_worse(monkey
     assert run().predict(pendulums(0.0, seed=7, recordings=1), warmup=60).zeros == ()
 
 
-@pytest.mark.parametrize(("most", "found"), [(16, 15.0), (9, 14.0), (2, 8.0), (1, 0.0)])
+def sixteen_parts():
+    """Sixteen parts of three samples, whose position is their number."""
+    return Trajectories.of(np.tile(np.arange(3.0), 16), np.repeat(np.arange(16.0), 3), (3,) * 16)
+
+
+@pytest.mark.parametrize(("most", "found"), [(16, 1.0), (9, 2.0), (2, 8.0), (1, 0.0)])
 def test_parts_that_are_not_followed_are_left_out(monkeypatch, most, found):
     # fails if one of sixteen parts that the model cannot follow hides the zeros of all, or if parts are not thinned
-    parts = Trajectories.of(np.tile(np.arange(3.0), 16), np.repeat(np.arange(16.0), 3), (3,) * 16)
-    last = lambda _, data, *__: None if len(data) > most else (float(data.q[-1]),)  # noqa: E731
-    monkeypatch.setattr(sensor_zeros_module, "_of_parts", last)
-    assert zeros_of_one(None, parts, 1.0, 1.0) == (found,)  # pyright: ignore
+    def apart(_, data, *__):
+        stride = data.q[3] - data.q[0] if len(data) > 1 else 0 * data.q[0]
+        return None if len(data) > most else (stride, 0 * stride)
+
+    monkeypatch.setattr(sensor_zeros_module, "_of_parts", apart)
+    monkeypatch.setattr(sensor_zeros_module, "GROUPS", 17)
+    assert zeros_of_one(None, sixteen_parts(), 1.0, 1.0) == (found,)  # pyright: ignore
+
+
+@pytest.mark.parametrize(("differ", "found"), [(0.01, 1.0), (0.1, 0.0)])
+def test_a_zero_is_as_sure_as_groups_of_parts_agree(monkeypatch, differ, found):
+    # fails if an error of the forces, which lasts as long as a warm-up, is a zero of 1 ± 0.001
+    def drawn(_, data, *__):
+        z = 1 + (differ * (data.q.mean(0) - 7.5) if len(data) < 16 else 0 * data.q[0])
+        return z, 0.001 * torch.ones_like(z)
+
+    monkeypatch.setattr(sensor_zeros_module, "_of_parts", drawn)
+    assert zeros_of_one(None, sixteen_parts(), 1.0, 1.0) == (found,)  # pyright: ignore
