@@ -219,8 +219,8 @@ READING = (
          "downwards, -Y of the centre's column too; again for the next body of a chain; none to leave positions "
          "as they are",
          action="append", metavar="X,Y"),
-    flag("--input-terms", "terms of inputs that act beside them, with commas: V^2, |V|, V', sat(V/2) or tanh(V/2) "
-         "of an input V, 2 being the level at which it saturates (default: those that the data ask for)",
+    flag("--input-terms", "terms of inputs that act beside them, with commas: V^2, |V| V, |V|, V', sat(V/2) or "
+         "tanh(V/2) of an input V, 2 being the level at which it saturates (default: those that the data ask for)",
          type=names, metavar="TERMS"),
     flag("--sensor-zeros", f"what the sensors read where the coordinates are 0, {EACH}",
          type=finite, nargs="+", metavar="X"),

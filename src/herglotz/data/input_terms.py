@@ -1,7 +1,7 @@
 """Further columns of u: inputs that act by their square, size or rate, or saturate, and periodic forces.
 
-The force between the plates of a capacitor grows as V², a motor pulls a one-sided brake by |i|, a moved base drives a
-mass by k r + c r′, and an amplifier gives no more than its level c, as sat(u/c) or, softly, tanh(u/c). The learned map
+The force between the plates of a capacitor grows as V², the thrust of a propeller as |n| n, a motor pulls a one-sided
+brake by |i|, a moved base drives a mass by k r + c r′, and an amplifier gives no more than its level c, as sat(u/c) or, softly, tanh(u/c). The learned map
 from inputs to forces is linear in all columns. A rate is the slope of a parabola through a value and its neighbours.
 
 A periodic force of known frequency and unknown amplitude and phase has the inputs cos νt and sin νt: f cos(νt + φ) = f
@@ -24,7 +24,10 @@ from herglotz.data.smoothing import slopes
 from herglotz.data.trajectories import INPUT_TERM, Trajectories
 from herglotz.errors import InputError, refuse
 
-FORMS = ("{}^2", "|{}|", "{}'")
+RATE = "{0}'"
+# Functions of an input by the form of its term; the rate is none.
+FUNCTIONS = {"{0}^2": torch.square, "|{0}| {0}": lambda x: x.abs() * x, "|{0}|": torch.abs}
+FORMS = (*FUNCTIONS, RATE)
 # Functions of an input over its level.
 SATURATIONS = {"sat": lambda x: x.clamp(-1, 1), "tanh": torch.tanh}
 SATURATED = re.compile(r"(sat|tanh)\((.+)/([^/]+)\)")
@@ -36,7 +39,7 @@ def input_terms_of(columns: Iterable[Sequence[str]]) -> tuple[str, ...]:
 
 
 def all_input_terms(data: Trajectories) -> tuple[str, ...]:
-    """The squares, sizes and rates of all recorded inputs; none if the recording has terms of inputs already."""
+    """The squares with and without sign, sizes and rates of all recorded inputs; none if the recording has terms of inputs already."""
     if data.u is None or input_terms_of(data.columns):
         return ()
     return tuple(form.format(name) for name, _ in data.input_labels for form in FORMS)
@@ -45,8 +48,9 @@ def all_input_terms(data: Trajectories) -> tuple[str, ...]:
 def with_input_terms(data: Trajectories, terms: Sequence[str]) -> Trajectories:
     """The recording with these terms of its inputs as further columns of u.
 
-    The terms of an input V are `V^2`, `|V|`, `V'`, `tanh(V/c)`, and `sat(V/c)`, which is V/c between -1 and 1 and ±1
-    beyond; the level c is a number in the unit of V. Raise InputError for any other term, and for an unknown input.
+    The terms of an input V are `V^2`, `|V| V`, `|V|`, `V'`, `tanh(V/c)`, and `sat(V/c)`, which is V/c between -1 and 1
+    and ±1 beyond; the level c is a number in the unit of V. Raise InputError for any other term, and for an unknown
+    input.
     """
     terms = tuple(term for term in terms if term not in input_terms_of(data.columns))
     if not terms:
@@ -55,7 +59,7 @@ def with_input_terms(data: Trajectories, terms: Sequence[str]) -> Trajectories:
     known = {form.format(name): (name, form) for name in labels for form in FORMS}
     known |= {term: (found[2], term) for term in terms if (found := saturation(term)) and found[2] in labels}
     inputs = f"the inputs are {', '.join(labels)}" if labels else "the data have no input: name one with --inputs NAMES"
-    remedy = f"write x^2, |x|, x', sat(x/2) or tanh(x/2) of an input x, 2 being its level > 0; {inputs}"
+    remedy = f"write x^2, |x| x, |x|, x', sat(x/2) or tanh(x/2) of an input x, 2 being its level > 0; {inputs}"
     for term in terms:
         refuse({f"{where}: {term!r} is no term of an input; {remedy}": term not in known})
     assert data.u is not None
@@ -79,18 +83,16 @@ def _column(data: Trajectories, u: Tensor, form: str) -> Tensor:
     """(N,) values of a term of an input (N,)."""
     if found := saturation(form):
         return SATURATIONS[found[0]](u / found[1])
-    if form != "{}'":
-        return u.square() if form == "{}^2" else u.abs()
-    return slopes(data, u)
+    return slopes(data, u) if form == RATE else FUNCTIONS[form](u)
 
 
 def _unit(unit: str, form: str, time_unit: str) -> str:
     """The unit of a term of an input in this unit."""
     if saturation(form):
         return ""
-    if form == "|{}|" or not unit:
+    if form == "|{0}|" or not unit:
         return unit
-    return f"{unit}^2" if form == "{}^2" else f"{unit}/{time_unit}"
+    return f"{unit}/{time_unit}" if form == RATE else f"{unit}^2"
 
 
 def waves(t: Tensor, frequencies: Sequence[float]) -> Tensor:

@@ -158,8 +158,8 @@ def load(
         ["x1,y1", "x2,y2"] of a chain, the second body on the first; "x,y,X,Y" with the centre in numbers or columns;
         "x,y,X,Y,r" keeps the distance r; "x,-y" where y grows downwards. Left out: as in `like`; () for none.
     input_terms
-        Further inputs made of the recorded inputs (`herglotz.data.input_terms`): "V^2", "|V|", "V'", "sat(V/2)",
-        "tanh(V/2)". Left out: as in `like`; () for none.
+        Further inputs made of the recorded inputs (`herglotz.data.input_terms`): "V^2", "|V| V", "|V|", "V'",
+        "sat(V/2)", "tanh(V/2)". Left out: as in `like`; () for none.
     unwrap
         Make angles continuous.
     show

@@ -23,15 +23,19 @@ def recording(tmp_path, name="train.csv", phase=0.0):
 
 def test_terms_are_columns_of_u(tmp_path):
     # fails if a column is of another input, or a rate is that of the step alone
-    data = load(recording(tmp_path), inputs=["volts", "base"], input_terms=["volts^2", "|volts|", "base'"], show=False)
+    data = load(
+        recording(tmp_path), inputs=["volts", "base"], show=False,
+        input_terms=["volts^2", "|volts|", "base'", "|volts| volts"],
+    )  # fmt: skip
     assert data.u is not None
     assert data.input_labels == (
-        ("volts", "V"), ("base", "m"), ("volts^2", "V^2"), ("|volts|", "V"), ("base'", "m/s"),
+        ("volts", "V"), ("base", "m"), ("volts^2", "V^2"), ("|volts|", "V"), ("base'", "m/s"), ("|volts| volts", "V^2"),
     )  # fmt: skip
     volts = torch.sin(3 * T)
     assert torch.allclose(data.u[:, 2], volts**2)
     assert torch.allclose(data.u[:, 3], volts.abs())
     assert torch.allclose(data.u[1:-1, 4], 0.2 * T[1:-1], atol=1e-12)
+    assert torch.allclose(data.u[:, 5], volts.abs() * volts)
     assert "input term" in data.table()
 
 
@@ -58,7 +62,7 @@ def test_arrays_have_terms_too(tmp_path):
     # fails if terms need the names of a table, one is not offered, or a table that was written brings them twice
     q = torch.cos(T).numpy()
     plain = as_trajectories(q, time=T.numpy(), inputs=torch.sin(T).numpy())
-    assert sorted(all_input_terms(plain)) == ["u'", "u^2", "|u|"]
+    assert sorted(all_input_terms(plain)) == ["u'", "u^2", "|u|", "|u| u"]
     data = as_trajectories(q, time=T.numpy(), inputs=torch.sin(T).numpy(), input_terms=["u^2"])
     assert data.input_labels == (("u", ""), ("u^2", ""))
     assert all_input_terms(data) == ()
@@ -82,7 +86,7 @@ def test_inputs_saturate_at_a_level():
 @pytest.mark.parametrize("term", ["volts^3", "speed'", "volts", "sat(volts)", "sat(volts/0)", "tanh(speed/2)"])
 def test_a_term_of_no_input_is_refused(tmp_path, term):
     # fails if a word that is misspelt drops a term silently
-    forms = r"x\^2, \|x\|, x', sat\(x/2\) or tanh\(x/2\) of an input x, 2 being its level"
+    forms = r"x\^2, \|x\| x, \|x\|, x', sat\(x/2\) or tanh\(x/2\) of an input x, 2 being its level"
     with pytest.raises(InputError, match=rf"is no term of an input; write {forms} > 0; the inputs are"):
         load(recording(tmp_path), inputs=["volts", "base"], input_terms=[term], show=False)
 

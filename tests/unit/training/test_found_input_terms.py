@@ -69,7 +69,8 @@ def sway(s):
     return np.sin(2.3 * s) + 0.6 * np.sin(3.9 * s + 1)
 
 
-CASES = {"u'": lambda u, rate: 2 * u + 1.5 * rate, "u^2": lambda u, _: 3 * u * u, "|u|": lambda u, _: 3 * abs(u)}
+CASES = {"u'": lambda u, rate: 2 * u + 1.5 * rate, "u^2": lambda u, _: 3 * u * u, "|u|": lambda u, _: 3 * abs(u),
+         "|u| u": lambda u, _: 3 * abs(u) * u}  # fmt: skip
 
 
 @cache
@@ -79,7 +80,7 @@ def run_of(term):
 
 
 # That |u| is a column like u^2 is shown by test_input_terms.py.
-@pytest.mark.parametrize("term", ["u'", "u^2", pytest.param("|u|", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("term", ["u'", "u^2", "|u| u", pytest.param("|u|", marks=pytest.mark.slow)])
 def test_what_an_input_acts_by_is_found(term):
     # fails if a term is not offered, or columns that nothing asks for stay
     run = run_of(term)
