@@ -35,7 +35,7 @@ from herglotz.models.drag import input_forces
 from herglotz.models.terms import LinearDamping
 from herglotz.training.equation_words import Joint, Numbers
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.following import HALF, unexplained
+from herglotz.training.following import HALF, constant, unexplained
 from herglotz.training.free_run import continued
 from herglotz.training.problems.grid import segment_grid, step_inputs
 from herglotz.training.problems.shooting import ShootingProblem
@@ -128,10 +128,25 @@ def _without(names: list[str]) -> str:
 
 
 def caveat_of_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor) -> str:
-    """What the effect of set points, or of inputs that follow from the state, rests on, in a sentence; "" for others.
+    """What the effect of inputs rests on that are set points, constant, or follow from the state, in sentences.
 
-    Set points follow from nothing; the motion follows them.
+    "" for other inputs. Set points follow from nothing; the motion follows them.
     """
+    return ". ".join(filter(None, (_caveat_of_changing_inputs(model, data, states), _caveat_of_constants(model, data))))
+
+
+def _caveat_of_constants(model: ContactLagrangian, data: Trajectories) -> str:
+    """That the effect of inputs without a change is no more than a constant force, in a sentence; "" for none."""
+    if data.u is None:
+        return ""
+    still = constant(data.u).tolist()
+    names = [data.input_labels[k][0] for k in acting_inputs(model) if still[k]]
+    never, own = ("never changes", "its effect") if len(names) == 1 else ("never change", "their effect")
+    told = f"no data tell {own} from a constant force. Where that matters, record other values"
+    return f"{', '.join(names)} {never}: {told}" if names else ""
+
+
+def _caveat_of_changing_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor) -> str:
     if names := acting_set_points(model, data):
         alone = f"; for the law of the machine alone, by the forces that were recorded, try {_without(names)}"
         return f"{_through(names)} a part of the equation{alone if _has_recorded_effort(data) else ''}"

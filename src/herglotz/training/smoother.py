@@ -90,7 +90,7 @@ def smoothed_states(problem: SmoothingProblem) -> tuple[Tensor, float] | None:
     """All unknowns with smoothed states and a fixed model, and ½|r|²; None if a step near the data fails."""
     x = smoothing_start(problem)
     states = StatesOnly(problem, x[: problem.P])
-    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
+    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-6, patience=1, damping=DAMPING)
     return None if result.reason == "not_finite" else (states.full(result.x), result.cost)
 
 

@@ -3,6 +3,7 @@
 import pytest
 
 from herglotz.data import load
+from herglotz.data.column_roles import is_set_point
 from herglotz.data.csv_columns import assign
 from herglotz.errors import InputError
 
@@ -366,3 +367,12 @@ def test_a_readme_beside_recordings(tmp_path, capsys):
     (tmp_path / "d.csv").write_text("t[s],x[m]\n0,1\n1,two\n2,3\n3,4\n")
     with pytest.raises(InputError, match=r"d.csv, row 3, .*; or take d.csv out of the folder"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [("V_cmd", False), ("I_ref", False), ("u_cmd", False), ("v_cmd", True), ("q_cmd", True), ("x_soll", True)],
+)
+def test_a_commanded_voltage_is_no_set_point(name, wanted):
+    # fails if the verdict on a motor that follows its voltage names --drop V_cmd
+    assert is_set_point(name, "") is wanted

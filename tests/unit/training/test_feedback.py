@@ -171,8 +171,8 @@ def test_a_set_point_has_no_force_of_its_own():
     config = ModelConfig(
         (False,), "forced", one, one, (9.0,), (0.0,), potential_width=0, inputs=2, input_map=(9.0, 0.0), rate=0.1
     )
-    model, u = ContactLagrangian(config), torch.zeros(20, 2, dtype=torch.float64)
-    data = Trajectories.of(torch.arange(20, dtype=torch.float64), u[:, :1], u=u)
+    model, u = ContactLagrangian(config), torch.arange(40, dtype=torch.float64).reshape(20, 2)
+    data = Trajectories.of(torch.arange(20, dtype=torch.float64), 0 * u[:, :1], u=u)
     goal, states = ("goal x", "input", "m"), torch.zeros(20, 3, dtype=torch.float64)
     forced = replace(data, columns=(goal, ("force", "input", "N")))
     assert reason_of_set_points(model, forced) == (
@@ -192,6 +192,25 @@ def test_a_set_point_has_no_force_of_its_own():
     # fails if a model without inputs is asked for its map: an internal error where friction alone is learned
     free = ContactLagrangian(replace(config, inputs=0, input_map=()))
     assert reason_of_set_points(free, replace(data, u=None, columns=())) == ""
+
+
+def test_an_input_that_never_changes_is_a_constant_force():
+    # fails if its gain stands in the verdict as if it were measured, or if it "follows from positions and velocities"
+    one = (1.0,)
+    config = ModelConfig((False,), "forced", one, one, (9.0,), (0.0,), potential_width=0, inputs=2, input_map=(9.0, 1.0))
+    model, make = ContactLagrangian(config), torch.Generator().manual_seed(0)
+    states = torch.randn(20, 3, generator=make, dtype=torch.float64)
+    u = torch.randn(20, 2, generator=make, dtype=torch.float64)
+    u[:, 0] = 2.0
+    data = Trajectories.of(torch.arange(20, dtype=torch.float64), states[:, :1], u=u)
+    data = replace(data, columns=(("load", "input", "N"), ("force", "input", "N")))
+    words = "load never changes: no data tell its effect from a constant force. Where that matters, record other values"
+    assert caveat_of_inputs(model, data, states) == words
+    assert unexplained(data, states) == pytest.approx(unexplained(replace(data, u=u[:, 1:]), states))
+    assert unexplained(replace(data, u=u[:, :1]), states) == math.inf
+    # an input that does not act has no effect to be told
+    idle = ContactLagrangian(replace(config, input_map=(0.0, 1.0)))
+    assert caveat_of_inputs(idle, data, states) == ""
 
 
 def test_a_servo_that_is_met_fits_by_its_set_point():
