@@ -450,7 +450,8 @@ class Fitter:
         scales = {} if before is None else before.likeliest_scales
         problem = every.of(names, sigma, self.prior(names, scales))
         names = problem.parameters.numbers
-        theta = self.data.q.new_tensor([values.get(name, self.start[name]) for name in names])
+        first = self.start | {RATE: self.base.rate} | values
+        theta = self.data.q.new_tensor([first[name] for name in names])
         if before is None:
             states = first_states(problem, theta, self.smooth)
         elif states is None:
