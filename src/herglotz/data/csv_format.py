@@ -121,7 +121,25 @@ def _without_titles(rows: Lines) -> tuple[Lines, list[str]]:
     if at == 0 or not _is_header(rows[at : at + 3]):
         return rows, []
     plural = "s" if at > 1 else ""
-    return rows[at:], [f"{at} line{plural} above the header, which is row {rows[at][0]}, left out"]
+    notes = [f"{at} line{plural} above the header, which is row {rows[at][0]}, left out"]
+    if labelled := _with_labels(*rows[at - 1 : at + 2]):
+        return [labelled, *rows[at + 1 :]], [f"row {rows[at - 1][0]} names the bodies of the columns below"]
+    return rows[at:], notes
+
+
+def _with_labels(above: tuple[int, str], header: tuple[int, str], below: tuple[int, str]) -> tuple[int, str] | None:
+    """The header with the labels of the line above it, mass_A_x and mass_B_x; None if these tell no columns apart.
+
+    Programs that track bodies in a video write the name of a body above the first of its columns x and y.
+    """
+    separator = _separator(header[1], below[1]) or ","
+    names, labels = (cells_of(line, separator) for _, line in (header, above))
+    label, found = "", []
+    for k, name in enumerate(names):
+        label = labels[k] if k < len(labels) and labels[k] else label
+        found.append(f"{label}_{name}".replace(" ", "_") if label and names.count(name) > 1 else name)
+    several = len(set(found)) == len(found) > len(set(names))
+    return (header[0], separator.join(found)) if several else None
 
 
 def _without_preamble(path: Path, written: Lines) -> tuple[Lines, list[str]]:
@@ -221,7 +239,8 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
     `name in unit`, `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says
     where the end of a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units
-    may stand in a row of their own below the header. Other lines that start with # and blank lines are skipped, except
+    may stand in a row of their own below the header. Names of bodies in the line above it stand before the names of
+    columns that come twice: `mass_A_x`, `mass_B_x`. Other lines that start with # and blank lines are skipped, except
     for these comments: `# hold: zero` (or `first`, `smooth`) is the hold of the inputs between samples,
     `# delay: 0.004` and `# lag: 0.02` are their delay and lag in the file's unit of time, and `# zero: 0.02 -0.1` and
     `# scale: 1 0.5` make q = scale · (reading − zero) of the coordinates in order (`herglotz.data.sensors`).

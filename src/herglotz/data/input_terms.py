@@ -1,8 +1,9 @@
 """Further columns of u: inputs that act by their square, size or rate, or saturate, and periodic forces.
 
 The force between the plates of a capacitor grows as V², the thrust of a propeller as |n| n, a motor pulls a one-sided
-brake by |i|, a moved base drives a mass by k r + c r′, and an amplifier gives no more than its level c, as sat(u/c) or, softly, tanh(u/c). The learned map
-from inputs to forces is linear in all columns. A rate is the slope of a parabola through a value and its neighbours.
+brake by |i|, a moved base drives a mass by k r + c r′, and an amplifier gives no more than its level c, as sat(u/c) or,
+softly, tanh(u/c). The learned map from inputs to forces is linear in all columns. A rate is the slope of a parabola
+through a value and its neighbours.
 
 A periodic force of known frequency and unknown amplitude and phase has the inputs cos νt and sin νt: f cos(νt + φ) = f
 cos φ · cos νt − f sin φ · sin νt is linear in two inputs, so that the learned map from inputs to forces is the
@@ -39,7 +40,10 @@ def input_terms_of(columns: Iterable[Sequence[str]]) -> tuple[str, ...]:
 
 
 def all_input_terms(data: Trajectories) -> tuple[str, ...]:
-    """The squares with and without sign, sizes and rates of all recorded inputs; none if the recording has terms of inputs already."""
+    """The squares, with and without sign, sizes and rates of all recorded inputs.
+
+    None if the recording has terms of inputs already.
+    """
     if data.u is None or input_terms_of(data.columns):
         return ()
     return tuple(form.format(name) for name, _ in data.input_labels for form in FORMS)

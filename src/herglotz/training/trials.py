@@ -199,15 +199,13 @@ class Trial:
         def size(error: Tensor) -> Tensor:
             return (error / spread).square().sum((-2, -1)).div(n).sqrt().nan_to_num(torch.inf)
 
+        slopes, ends = problem.slopes_by_start(self.theta, self.path)
         # Growth by a factor G in one segment is growth by about G² in two, and slower growth is less.
-        slopes = problem.slopes_at_samples(self.theta, self.path)[..., problem.P : problem.P + n]
-        if float(size(slopes @ noise).max()) ** 2 < float(size(noise)):
+        if float(size(slopes[..., :n] @ noise).max()) ** 2 < float(size(noise)):
             return False
-        moved = problem.sensitivities(self.theta, self.path, held=True).detach()  # (S, K + 1, d, d)
         first = torch.cat([noise, noise.new_zeros(d - n, n)]).expand(grid.segments, d, n)
-        ends = moved[torch.arange(grid.segments), grid.end] @ first
-        first = torch.where(grid.joined[:, None, None], ends.roll(1, 0), first)
-        return bool((size(grid.at_samples((moved @ first[:, None])[..., :n, :])) >= 1).any())
+        first = torch.where(grid.joined[:, None, None], (ends @ first).roll(1, 0), first)
+        return bool((size(slopes @ first[grid.segment]) >= 1).any())
 
     @cached_property
     def lacks_nothing(self) -> bool:

@@ -206,3 +206,23 @@ def test_lines_above_the_header(tmp_path, kind):
     count = title.count("\n")
     note = f"{count} line{'s' if count > 1 else ''} above the header, which is row {count + 1}, left out"
     assert note in data.notes
+
+
+BODIES = ("#multi:\n\tmass A\t\tmass_B\t\nt\tx\ty\tx\ty\n", ",mass A,,mass_B,\nt,x,y,x,y\n")
+
+
+@pytest.mark.parametrize("head", BODIES)
+def test_bodies_of_a_video_have_the_names_above_their_columns(tmp_path, head):
+    # fails if the positions of two bodies are columns that come twice, or if one body has the name of the other
+    rows = [(0.1 * k, k, k**2, 2 + k, 3 * k) for k in range(9)]
+    text = head + "".join(("\t" if "\t" in head else ",").join(map(str, row)) + "\n" for row in rows)
+    data = load(written(tmp_path, text), show=False)
+    assert data.names == ("mass_A_x", "mass_A_y", "mass_B_x", "mass_B_y")
+    assert data.q[2].tolist() == [2, 4, 4, 6]
+    assert any("names the bodies of the columns below" in note for note in data.notes)
+
+
+def test_names_that_come_twice_below_one_title_are_refused(tmp_path):
+    # fails if a title of the whole table makes two names of one
+    with pytest.raises(InputError, match="'x' comes twice"):
+        load(written(tmp_path, "my pendulum\nt,x,x\n" + "".join(f"{k},{k},{2 * k}\n" for k in range(9))), show=False)

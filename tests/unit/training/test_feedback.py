@@ -197,7 +197,7 @@ def test_a_set_point_has_no_force_of_its_own():
 def test_an_input_that_never_changes_is_a_constant_force():
     # fails if its gain stands in the verdict as if it were measured, or if it "follows from positions and velocities"
     one = (1.0,)
-    config = ModelConfig((False,), "forced", one, one, (9.0,), (0.0,), potential_width=0, inputs=2, input_map=(9.0, 1.0))
+    config = ModelConfig((False,), "forced", one, one, (9.0,), (0.0,), potential_width=0, inputs=2, input_map=(9.0, 1))
     model, make = ContactLagrangian(config), torch.Generator().manual_seed(0)
     states = torch.randn(20, 3, generator=make, dtype=torch.float64)
     u = torch.randn(20, 2, generator=make, dtype=torch.float64)

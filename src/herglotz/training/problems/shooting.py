@@ -404,6 +404,17 @@ class ShootingProblem(StatesProblem):
         self.compiled.run(theta, path.x[:, 0], plain, Sums.zeros(self.P, self.grid.segments, self.d, theta), rows)
         return rows
 
+    def slopes_by_start(self, theta: Tensor, path: Path) -> tuple[Tensor, Tensor]:
+        """Derivatives by the start of the segment, of positions at samples, (N, n, d), and of its end, (S, d, d)."""
+        grid, S = self.grid, self.grid.segments
+        if self.compiled is None:
+            moved = self.sensitivities(theta, path, held=True).detach()  # (S, K + 1, d, d)
+            return moved.flatten(0, 1)[grid.node][:, : self.n], moved[torch.arange(S, device=theta.device), grid.end]
+        plain, sums = Observed(self.data.q, torch.ones_like(self.data.q), 0.0), Sums.zeros(0, S, self.d, theta)
+        rows = self.data.q.new_zeros(*self.data.q.shape, self.d)
+        self.compiled.run(theta, path.x[:, 0], plain, sums, rows)
+        return rows, sums.slopes
+
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; if `held` by the start alone."""
         (S, K), d, L_d = self.grid.h.shape, self.d, self.parameters.at(theta, self.u)
