@@ -41,9 +41,9 @@ leaves the range of positions and momenta that the model was fitted to: which, h
 --out FILE writes the predicted positions and velocities (and momenta with --momenta), and FILE.png beside it: data,
 free run and their difference.
 Where the recordings of the fit differ in what their sensors read at 0, those zeros that suit the first samples best
-are taken off this recording; --sensor-zeros says it instead, beside the model's own.
-With --windows W --horizon T, W windows spread over the recording are scored instead, each K samples and then a free
-run over the time T: for motions that no model follows for long.
+are taken off this recording, and so are drifts of the zeros that the fit found; --sensor-zeros says zeros instead,
+beside the model's own, that do not drift. With --windows W --horizon T, W windows spread over the recording are
+scored instead, each K samples and then a free run over the time T: for motions that no model follows for long.
 
 examples:
   herglotz predict runs/pendulum another.csv
@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
         _report(found, arguments, best)
         if written:
             print(f"Written: {', '.join(map(str, written))}")
-    _tell_of_limits(found, result)
+    _tell_of_limits(found, result, drifting=arguments.sensor_zeros is None)
     if best is not None and (count := longer_warmup(found, best)) is not None:
         why = f"the start that {found.warmup} samples tell misses, and not the model"
         say(f"herglotz: note: {why}; try --warmup {count}", sys.stderr)
@@ -118,14 +118,15 @@ def _tell_of_names(names: tuple[str, ...], known: tuple[str, ...]) -> None:
         say(f"herglotz: note: the run has no coordinate {', '.join(others)}: left aside", sys.stderr)
 
 
-def _tell_of_limits(found: Prediction, result: Run) -> None:
+def _tell_of_limits(found: Prediction, result: Run, *, drifting: bool) -> None:
     """Say on stderr what the errors assume or leave out."""
     from herglotz.training.recorded_range import warning
 
-    if drifts := (result.metrics.get("plan") or {}).get("drifts"):
+    if drifting and (drifts := (result.metrics.get("plan") or {}).get("drifts")):
         names, time = zip(found.data.names, found.data.units, strict=True), found.data.time_unit
         rates = ", ".join(f"{name} {x:.4g} {unit}/{time}" for (name, unit), x in zip(names, drifts, strict=True))
-        say(f"herglotz: note: its sensors are taken to drift as those of the fit did: {rates}", sys.stderr)
+        still = f"with --sensor-zeros {' '.join('0' * len(drifts))} they stand still"
+        say(f"herglotz: note: its sensors are taken to drift as those of the fit did: {rates}; {still}", sys.stderr)
     if found.failed_steps > 0:
         share = f"{100 * found.failed_steps:.3g} % of the predicted samples were not reached: a step failed"
         say(f"herglotz: note: {share}; the RMS is over the others", sys.stderr)

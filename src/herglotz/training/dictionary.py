@@ -114,7 +114,7 @@ def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
 def drag_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
     """Friction beside viscous and dry friction; dampers between lengths are here, those between joints in `coupled`.
 
-    Of several coordinates v² has no friction, because masses that depend on the position have such forces.
+    v² is friction of a single coordinate alone: masses of several that depend on the position have such forces.
     """
     drag = [text for i in range(1, len(angles) + 1) for text in (f"|v{i}| v{i}", f"|v{i}|")]
     drag += ["v1^2"] if len(angles) == 1 else []

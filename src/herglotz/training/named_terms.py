@@ -84,9 +84,9 @@ def candidates(
     # The length |v| of a velocity needs one unit.
     one_unit = len(set(data.units)) == 1
     gone = set() if one_unit else {AIR}
-    # Over a motion one way |v| and v are one force, and v² and |v| v.
-    for i in (i for i in range(data.dof) if moves_one_way(data, i)):
-        gone |= {f"|v{i + 1}|", f"v{i + 1}^2"}
+    # Over a motion one way |v| and v are one force, and so are v² and |v| v.
+    one_way = [i for i in range(data.dof) if moves_one_way(data, i)]
+    gone |= {form.format(i + 1) for i in one_way for form in ("|v{}|", "v{}^2")}
     drag = tuple(text for text in drag_of(angles) if text not in gone)
     features, drag = (in_proportion(texts, ratios or {}) for texts in (features, drag))
     return NamedTerms((*features, *special(data)), drag, dry=True)

@@ -157,7 +157,7 @@ def predict(
         Score this many windows, spread evenly over the recording, instead of one free run to the end of each
         trajectory. A window has K samples of warm-up and a free run over the time `horizon`.
     same_zeros
-        True: the sensors read 0 where the model's coordinates are 0. False: if recordings of the fit differ in their
+        True: the sensors read 0 where the model's coordinates are 0, and do not drift. False: if recordings of the fit differ in their
         zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
 
     Returns
@@ -175,7 +175,8 @@ def predict(
             warmup is not None and (type(warmup) is not int or warmup < 3),
     })  # fmt: skip
     data = of_the_run(run, data).unwrapped().to(dtype=next(run.model.parameters()).dtype, device="cpu")
-    data = measured(data, drifts=(run.metrics.get("plan") or {}).get("drifts") or ())
+    drifts = () if same_zeros else (run.metrics.get("plan") or {}).get("drifts") or ()
+    data = measured(data, drifts=drifts)
     low, high = run.h_range
     every = max(1, int(high / data.typical_step + 1e-6)) if data.typical_step < low else 1
     if every > 1:

@@ -197,6 +197,8 @@ def test_a_sensor_that_drifts_is_found_out():
     other = replace(pendulums(0.0, seed=7, recordings=1), source="other")
     other = replace(other, q=other.q + slow * since_start(other)[:, None])
     assert (found.predict(other).rms or np.inf) < 1.5 * NOISE
+    still = replace(pendulums(0.0, seed=7, recordings=1), source="still")
+    assert (found.predict(still, same_zeros=True).rms or np.inf) < 1.5 * NOISE < 2 * (found.predict(still).rms or 0)
     unasked: Any = SimpleNamespace(config=FitConfig(find_zeros=False))
     assert drifts(unasked) is None
 
