@@ -157,8 +157,9 @@ def predict(
         Score this many windows, spread evenly over the recording, instead of one free run to the end of each
         trajectory. A window has K samples of warm-up and a free run over the time `horizon`.
     same_zeros
-        True: the sensors read 0 where the model's coordinates are 0, and do not drift. False: if recordings of the fit differ in their
-        zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data.
+        True: the sensors read 0 where the model's coordinates are 0, and do not drift. False: if recordings of the fit
+        differ in their zeros, the set that fits the warm-ups best is subtracted from all trajectories of the data; and
+        so is the drift that the fit found.
 
     Returns
     -------
