@@ -14,10 +14,8 @@ from herglotz.training.functions import Band
 from herglotz.training.named_terms import own_terms
 from herglotz.training.parameter_vector import ParameterVector
 
-# Damping with the mass, γ.
-RATE = "damping.rate"
 # Parameters of every model.
-ALWAYS = ("kinetic.log_diagonal", "kinetic.base.log_diagonal")
+ALWAYS = ("kinetic.log_diagonal", "kinetic.base.log_diagonal", "damping.rate")
 # Amplitudes with their shape parameters, which have no effect while the amplitude is 0.
 SHAPES = {"friction.coulomb": "friction.log_smooth", "friction.breakaway": "friction.log_stribeck"}
 # Breakaway is the excess over Coulomb friction, and means nothing without Coulomb friction.
@@ -29,7 +27,7 @@ ZEROS = "friction.input_zero"
 # Constant forces at rest, for which a zero of the sensor can stand.
 TILT = "potential.tilt"
 # Parameters of the simplest model, beside `ALWAYS`.
-SIMPLE = ("potential.stiffness", TILT, INPUTS, RATE)
+SIMPLE = ("potential.stiffness", TILT, INPUTS)
 
 
 class Offer(NamedTuple):
@@ -70,7 +68,7 @@ def offers_of(
             continue
         stem = re.sub(r"\[\d+\]", "", number)
         # Beyond the recorded range waves vanish, and springs and tilts bound the motion.
-        if stem in ALWAYS or (stem == RATE and n == 1) or (bands and (stem in SIMPLE[:2] or key in springs)):
+        if stem in ALWAYS or (bands and (stem in SIMPLE[:2] or key in springs)):
             always.append(number)
         elif stem not in no_offers:
             found.append(_offer(number, key, stem, numbers))

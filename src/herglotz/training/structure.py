@@ -38,7 +38,6 @@ from herglotz.training.found_model import settings as settings_of_trial
 from herglotz.training.kernel import MAX_PARAMETERS
 from herglotz.training.linear_start import SHARED, LinearFit
 from herglotz.training.named_terms import MOVING, by_term, distances, holders, places, started, values_of
-from herglotz.training.offers import RATE
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
@@ -310,8 +309,7 @@ def _of_trial(
 def _told(found: Trial, data: Trajectories) -> str:
     """The terms of a model, and by how much they miss the data."""
     noise = precision(data)
-    always = ("mass", "damping") if RATE in found.fitter.always else ("mass",)
-    named = listed((*always, *found.names))
+    named = listed(("mass", "damping", *found.names))
     miss, least = (size(x, common_unit(data.units), digits=2) for x in (found.rms, noise))
     least = least if math.isfinite(noise) else "unknown"
     words = f"{named} miss the data by {miss}, whose precision is {least}"

@@ -37,7 +37,7 @@ from herglotz.training.named_terms import (
     started,
     turns_one_way,
 )
-from herglotz.training.offers import ALWAYS, RATE, TILT, offers_of, without_offers
+from herglotz.training.offers import ALWAYS, TILT, offers_of, without_offers
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import Grids, segment_lengths
 from herglotz.training.problems.prior import Gaussian, prior_of
@@ -396,7 +396,7 @@ class Fitter:
         prior, bands = prior_of(self.model, self.base, None, wide_rates=False), self.variant.functions
         names = [numbers[int(i)] for i in prior.index]
         weights = {name: spread**-2 for name, spread in zip(names, prior.spread.tolist(), strict=True)}
-        powers = [self.keys[name] for name in self.always if bands and not name.startswith((*ALWAYS, RATE))]
+        powers = [self.keys[name] for name in self.always if bands and not name.startswith(ALWAYS)]
         spreads = prior_spreads(bands, self.base, self.data.balance, powers)
         centred = {self.place[key]: spread**-2 for key, spread in spreads.items()}
         return weights | centred, centred
@@ -448,8 +448,7 @@ class Fitter:
         scales = {} if before is None else before.likeliest_scales
         problem = every.of(names, sigma, self.prior(names, scales))
         names = problem.parameters.numbers
-        first = self.start | {RATE: self.base.rate} | values
-        theta = self.data.q.new_tensor([first[name] for name in names])
+        theta = self.data.q.new_tensor([values.get(name, self.start[name]) for name in names])
         if before is None:
             states = first_states(problem, theta, self.smooth)
         elif states is None:

@@ -180,24 +180,6 @@ def test_a_pendulum_on_a_spring_is_found_in_noise():
     assert found.at_the_noise
 
 
-def test_bearings_with_friction_of_their_own_take_the_place_of_the_damping_rate():
-    # fails if every model of several coordinates has γ: as −γ s brakes with the whole mass, other terms made up for it
-    def acceleration(x, a, v, w):
-        # a cart on a spring and its pole, 0.7 m long, each with friction in its bearing
-        pole, length = 0.4, 0.7
-        of_cart = -1.2 * v - 6.0 * x + pole * length * a.sin() * w**2
-        of_pole = -0.08 * w - pole * length * 9.81 * a.sin()
-        mass, between, inertia = 1 + pole, pole * length * a.cos(), pole * length**2
-        det = mass * inertia - between**2
-        return (inertia * of_cart - between * of_pole) / det, (mass * of_pole - between * of_cart) / det
-
-    starts = torch.tensor([[0.3, 2.0, 0.0, 0.0], [-0.2, -1.2, 0.5, 3.0]], dtype=torch.float64)
-    found = there(searched(rolled(acceleration, starts, 150, 0.03, 1e-3)).run())
-    springs = {f"potential.stiffness[{i}]" for i in range(2)}
-    assert found.taken == {"cos(q2) v1 v2", *springs, *(f"friction.viscous[{i}]" for i in range(2))}
-    assert found.at_the_noise
-
-
 def test_a_fit_is_told_how_long_segments_the_search_followed(duffing, monkeypatch):
     # fails if the final fit of a motion that no model follows for long tries whole trajectories
     search, _ = duffing
