@@ -26,7 +26,8 @@ print(*Path("video.csv").read_text().splitlines()[:4], sep="\n")
 # %% [markdown]
 # `polar="x,y"` makes one angle of the two columns: 0 where the bob hangs, growing towards +x. Centre and radius of the
 # circle are found by least squares. In pictures whose y grows downwards it is `polar="x,-y"`; a chain of bodies has one
-# pair each, `polar=["x1,y1", "x2,y2"]`. If the length changes, a warning says so, and `polar="x,y,X,Y,r"` with the
+# pair each, `polar=["x1,y1", "x2,y2"]`. Columns of several bodies that are all called x and y get the names in the line
+# above them, `mass_A_x`, `mass_B_x`. If the length changes, a warning says so, and `polar="x,y,X,Y,r"` with the
 # centre keeps it as a coordinate r.
 
 # %%
