@@ -72,7 +72,7 @@ RATE = re.compile(
 # Letters of velocities and accelerations, unless the unit is that of a position.
 LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")
 # Symbols of voltages, currents, forces and control signals, which may be commanded: V_cmd. v_cmd is a speed.
-EFFORT = re.compile(r"[VUIFMui][ _-].+")
+EFFORT_SYMBOL = re.compile(r"[VUIFMui][ _-].+")
 # A desired value, or a derivative: q_d.
 DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")
 # Usual names of coordinates.
@@ -246,7 +246,7 @@ def is_effort(words: frozenset[str], unit: str) -> bool:
 def is_set_point(name: str, unit: str) -> bool:
     """Whether an input is the set point of a controller, and not a force, voltage or current that is commanded."""
     words = words_of(name)
-    return is_goal(words) and not is_effort(words, unit) and not (kind_of(unit) == "" and EFFORT.fullmatch(name))
+    return is_goal(words) and not is_effort(words, unit) and not (kind_of(unit) == "" and EFFORT_SYMBOL.fullmatch(name))
 
 
 def is_recorded_effort(name: str, unit: str) -> bool:

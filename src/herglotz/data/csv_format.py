@@ -120,11 +120,13 @@ def _without_titles(rows: Lines) -> tuple[Lines, list[str]]:
     at = next((k for k, (_, line) in first if any(_has_time(line, mark) for mark in SEPARATORS)), 0)
     if at == 0 or not _is_header(rows[at : at + 3]):
         return rows, []
-    plural = "s" if at > 1 else ""
-    notes = [f"{at} line{plural} above the header, which is row {rows[at][0]}, left out"]
-    if labelled := _with_labels(*rows[at - 1 : at + 2]):
-        return [labelled, *rows[at + 1 :]], [f"row {rows[at - 1][0]} names the bodies of the columns below"]
-    return rows[at:], notes
+    labelled = _with_labels(*rows[at - 1 : at + 2])
+    count = at - (labelled is not None)
+    plural = "s" if count > 1 else ""
+    notes = [f"{count} line{plural} above the header, which is row {rows[at][0]}, left out"] if count else []
+    if labelled is not None:
+        notes.append(f"row {rows[at - 1][0]} names the bodies of the columns below")
+    return [labelled or rows[at], *rows[at + 1 :]], notes
 
 
 def _with_labels(above: tuple[int, str], header: tuple[int, str], below: tuple[int, str]) -> tuple[int, str] | None:

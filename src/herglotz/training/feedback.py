@@ -142,8 +142,8 @@ def _caveat_of_constants(model: ContactLagrangian, data: Trajectories) -> str:
     still = constant(data.u).tolist()
     names = [data.input_labels[k][0] for k in acting_inputs(model) if still[k]]
     never, own = ("never changes", "its effect") if len(names) == 1 else ("never change", "their effect")
-    told = f"no data tell {own} from a constant force. Where that matters, record other values"
-    return f"{', '.join(names)} {never}: {told}" if names else ""
+    told = f"which do not tell {own} from a constant force. Where that matters, record other values"
+    return f"{', '.join(names)} {never} in these data, {told}" if names else ""
 
 
 def _caveat_of_changing_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor) -> str:

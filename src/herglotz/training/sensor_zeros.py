@@ -21,6 +21,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.sensors import measured, since_start
 from herglotz.models import ContactLagrangian
+from herglotz.training.cross_validation import FOLDS
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.robust import FREEDOM
@@ -37,8 +38,6 @@ CENTRE = "alike in all recordings, so that the terms of the model are about them
 SIGNIFICANT = 5.0
 # Strides in the parts of a recording whose zeros are fitted: all parts, or every m-th if some cannot be followed.
 STRIDES = (1, 2, 4, 8)
-# Groups of successive parts whose zeros are compared.
-GROUPS = 6
 
 
 def reference_of(data: Trajectories) -> int:
@@ -70,7 +69,7 @@ def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max
         if (found := of(parts)) is None:
             continue
         z, deviations = found
-        edges = torch.linspace(0, len(parts), GROUPS + 1).long().tolist() if len(parts) >= GROUPS else []
+        edges = torch.linspace(0, len(parts), FOLDS + 1).long().tolist() if len(parts) >= FOLDS else []
         groups = [own[0] for edge in pairwise(edges) if (own := of(parts.select(range(*edge)))) is not None]
         if len(groups) > 1:
             deviations = deviations.maximum(torch.stack(groups).std(0) / len(groups) ** 0.5)

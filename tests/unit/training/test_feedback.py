@@ -204,8 +204,10 @@ def test_an_input_that_never_changes_is_a_constant_force():
     u[:, 0] = 2.0
     data = Trajectories.of(torch.arange(20, dtype=torch.float64), states[:, :1], u=u)
     data = replace(data, columns=(("load", "input", "N"), ("force", "input", "N")))
-    words = "load never changes: no data tell its effect from a constant force. Where that matters, record other values"
-    assert caveat_of_inputs(model, data, states) == words
+    assert caveat_of_inputs(model, data, states) == (
+        "load never changes in these data, which do not tell its effect from a constant force. Where that matters, "
+        "record other values"
+    )
     assert unexplained(data, states) == pytest.approx(unexplained(replace(data, u=u[:, 1:]), states))
     assert unexplained(replace(data, u=u[:, :1]), states) == math.inf
     # an input that does not act has no effect to be told

@@ -281,7 +281,7 @@ def test_parts_that_are_not_followed_are_left_out(monkeypatch, most, found):
         return None if len(data) > most else (stride, 0 * stride)
 
     monkeypatch.setattr(sensor_zeros_module, "_of_parts", apart)
-    monkeypatch.setattr(sensor_zeros_module, "GROUPS", 17)
+    monkeypatch.setattr(sensor_zeros_module, "FOLDS", 17)
     assert zeros_of_one(None, sixteen_parts(), 1.0, 1.0) == (found,)  # pyright: ignore
 
 

@@ -399,10 +399,7 @@ class ShootingProblem(StatesProblem):
         """Derivatives of positions at samples by the parameters and by the start of the segment, (N, n, P + d)."""
         if self.compiled is None:
             return self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
-        plain = Observed(self.data.q, torch.ones_like(self.data.q), 0.0)
-        rows = self.data.q.new_zeros(*self.data.q.shape, self.P + self.d)
-        self.compiled.run(theta, path.x[:, 0], plain, Sums.zeros(self.P, self.grid.segments, self.d, theta), rows)
-        return rows
+        return self._swept(self.compiled, theta, path, self.P)[0]
 
     def slopes_by_start(self, theta: Tensor, path: Path) -> tuple[Tensor, Tensor]:
         """Derivatives by the start of the segment, of positions at samples, (N, n, d), and of its end, (S, d, d)."""
@@ -410,9 +407,14 @@ class ShootingProblem(StatesProblem):
         if self.compiled is None:
             moved = self.sensitivities(theta, path, held=True).detach()  # (S, K + 1, d, d)
             return moved.flatten(0, 1)[grid.node][:, : self.n], moved[torch.arange(S, device=theta.device), grid.end]
-        plain, sums = Observed(self.data.q, torch.ones_like(self.data.q), 0.0), Sums.zeros(0, S, self.d, theta)
-        rows = self.data.q.new_zeros(*self.data.q.shape, self.d)
-        self.compiled.run(theta, path.x[:, 0], plain, sums, rows)
+        return self._swept(self.compiled, theta, path, 0)
+
+    def _swept(self, flow: CompiledFlow, theta: Tensor, path: Path, free: int) -> tuple[Tensor, Tensor]:
+        """Derivatives by `free` parameters and the start, of positions at samples and of the ends of segments."""
+        plain = Observed(self.data.q, torch.ones_like(self.data.q), 0.0)
+        sums = Sums.zeros(free, self.grid.segments, self.d, theta)
+        rows = self.data.q.new_zeros(*self.data.q.shape, free + self.d)
+        flow.run(theta, path.x[:, 0], plain, sums, rows)
         return rows, sums.slopes
 
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
