@@ -128,15 +128,12 @@ def _without(names: list[str]) -> str:
 
 
 def caveat_of_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor) -> str:
-    """What the effect of inputs rests on that are set points, constant, or follow from the state, in sentences.
-
-    "" for other inputs. Set points follow from nothing; the motion follows them.
-    """
+    """What the data do not tell of the effects of inputs, in sentences; "" if they tell all."""
     return ". ".join(filter(None, (_caveat_of_changing_inputs(model, data, states), _caveat_of_constants(model, data))))
 
 
 def _caveat_of_constants(model: ContactLagrangian, data: Trajectories) -> str:
-    """That the effect of inputs without a change is no more than a constant force, in a sentence; "" for none."""
+    """That the data do not tell the effect of inputs that never change from a constant force; "" for no such input."""
     if data.u is None:
         return ""
     still = constant(data.u).tolist()
@@ -147,6 +144,10 @@ def _caveat_of_constants(model: ContactLagrangian, data: Trajectories) -> str:
 
 
 def _caveat_of_changing_inputs(model: ContactLagrangian, data: Trajectories, states: Tensor) -> str:
+    """What the effect of set points, or of inputs that follow from the state, rests on, in a sentence; "" for others.
+
+    Set points follow from nothing; the motion follows them.
+    """
     if names := acting_set_points(model, data):
         alone = f"; for the law of the machine alone, by the forces that were recorded, try {_without(names)}"
         return f"{_through(names)} a part of the equation{alone if _has_recorded_effort(data) else ''}"
