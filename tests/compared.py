@@ -1,5 +1,7 @@
 """How tests of several rooms write numbers and compare them."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -28,3 +30,19 @@ def assert_gradient(problem, x, rel, make):
         d = torch.randn(len(x), generator=make, dtype=x.dtype)
         slope = (float(problem.cost(x + 1e-6 * d)) - float(problem.cost(x - 1e-6 * d))) / 2e-6
         assert float(b @ d) == pytest.approx(slope, rel=rel, abs=1e-6 * float(cost))
+
+
+def dense(A: Any) -> torch.Tensor:
+    """JᵀJ as a tensor, from a tensor or from an `Arrowhead`."""
+    if isinstance(A, torch.Tensor):
+        return A
+    P, (S, d) = len(A.corner), A.border.shape[:2]
+    full = A.corner.new_zeros(P + S * d, P + S * d)
+    full[:P, :P] = A.corner
+    full[P:, :P] = A.border.flatten(0, 1)
+    full[:P, P:] = full[P:, :P].T
+    T, k = full[P:, P:].unflatten(0, (S, d)).unflatten(2, (S, d)), torch.arange(S)  # (S, d, S, d)
+    T[k, :, k] = A.blocks
+    T[k[:-1], :, k[1:]] = A.upper[:-1]
+    T[k[1:], :, k[:-1]] = A.upper[:-1].mT
+    return full

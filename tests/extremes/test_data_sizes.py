@@ -1,13 +1,14 @@
 """From one triple to a million samples, and the files that nobody wants."""
 
+import os
 import time
-from dataclasses import replace
 
 import pytest
 import torch
 
 import herglotz
 from herglotz import FitConfig, Trajectories
+from herglotz.data.noise import part_of
 from herglotz.errors import InputError
 from herglotz.training.baseline import estimate_baseline
 from herglotz.verify import verify
@@ -114,16 +115,34 @@ def test_a_million_samples():
     assert base.stiffness[0] == pytest.approx(STIFFNESS, rel=1e-6)
 
 
-def test_a_million_samples_are_fitted_thinned_or_not_at_all():
-    # fails if `fit` starts what ends in a killed process, or its advice does not help
-    data = Trajectories.of(*motion(torch.arange(1_000_000) * 1e-3))
+@pytest.mark.slow
+def test_a_million_samples_are_fitted():
+    # fails if the time or the memory of a fit grows faster than the number of samples (measured: 52 s and 1.7 GB)
+    t, q = motion(torch.arange(1_000_000) * 1e-3)
+    q += 1e-3 * torch.randn(len(q), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     begin = time.process_time()
-    with pytest.raises(InputError, match=r"667000 samples to fit, at most 300000 .*--every 3,"):
-        herglotz.fit(data)
-    t, q = torch.arange(100, dtype=torch.float64).repeat(4000), data.q[:400_000]
-    many = replace(data, t=t, q=q, observed=None, lengths=(100,) * 4000)
-    with pytest.raises(InputError, match=r"--every 2,"):  # many short trajectories are as many states
-        herglotz.fit(many, FitConfig(train_fraction=1.0))
-    assert time.process_time() - begin < 20
-    run = herglotz.fit(data.thinned(2000), FitConfig(iterations=5))
+    run = herglotz.fit(Trajectories.of(t, q))
+    assert time.process_time() - begin < 120
+    assert run.metrics["verdict"].startswith("fits to the noise")
+    assert run.metrics["rate"] == pytest.approx(RATE, rel=1e-2)
+
+
+def test_what_no_memory_is_there_for_is_refused(monkeypatch):
+    # fails if `fit` starts what ends in a killed process, or its advice does not help
+    data = Trajectories.of(*motion(torch.arange(1000) * 0.05))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "sysconf", lambda _: 1000)  # pages, and bytes of each
+        with pytest.raises(InputError, match=r"667 samples takes about 0.00267 GB .* has 0.001; .*--every 3,"):
+            herglotz.fit(data)
+    run = herglotz.fit(data.thinned(3), FitConfig(iterations=5))
     assert run.metrics["train_rms"] < 1e-3 * run.metrics["spread"]
+
+
+def test_of_many_short_recordings_some_are_searched():
+    # fails if every second sample is left out until recordings have fewer samples than a polynomial needs: an internal
+    # error was raised, and 4000 recordings of 100 samples are 400 000 samples
+    t = torch.arange(67, dtype=torch.float64).repeat(4000)
+    noise = 1e-3 * torch.randn(len(t), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    part = part_of(Trajectories.of(t, (0.1 * t).sin() + noise, (67,) * 4000), 2000)
+    assert min(part.lengths) >= 9
+    assert 1000 < part.samples < 4000

@@ -15,7 +15,7 @@ from herglotz.data.checks import offsets_of
 from herglotz.data.gaps import complete
 from herglotz.data.splits import MIN_SHOWING_NOISE
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.windows import powers, pseudo_inverses
+from herglotz.data.windows import powers, pseudo_inverses, rounding
 
 # A polynomial of this degree is fitted to so many samples in a row.
 SAMPLES, DEGREE = MIN_SHOWING_NOISE, 5
@@ -75,10 +75,11 @@ def _of_readings(t: Tensor, q: Tensor, lengths: Sequence[int], degrees: Sequence
     stride = -(-len(rows) // MAX_WINDOWS)
     rows, of = rows[::stride].to(t.device)[:, None] + torch.arange(SAMPLES, device=t.device), of[::stride]
     t, q = t[rows].double().cpu(), q[rows].double().cpu()
-    x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
+    span = t[:, -1:] - t[:, :1]
+    x = 2 * (t - t[:, :1]) / span - 1
     squares = []
     for degree in degrees:
-        inverses = pseudo_inverses(x, degree)
+        inverses = pseudo_inverses(x, degree, rounding(t, span / 2))
         squares.append((q - powers(x[: len(inverses)], degree) @ (inverses @ q)).square())
     agree = torch.stack([torch.stack([_agree(own, of) for own in square.mean(1).T], 1) for square in squares])
     # Coarse motion is rough at low degrees alone, noise at all of them. One degree does not tell them apart.
@@ -140,7 +141,9 @@ def part_of(data: Trajectories, most: int) -> Trajectories:
     Samples that lack positions are left out first: every m-th row may miss all rows of a slower sensor.
     """
     few = data if data.samples < 2 * most else complete(data)
-    while few.samples >= 2 * most and min(few.lengths) >= 2 * most / len(few) and not coarse(half := few.thinned(2)):
+    # Of many short recordings a few say more than some samples of each.
+    least = 2 * max(most / len(data), SAMPLES)
+    while few.samples >= 2 * most and min(few.lengths) >= least and not coarse(half := few.thinned(2)):
         few = half
     liveliest = few.liveliest(most)
     return liveliest if liveliest.samples < few.samples / 2 else few
@@ -227,9 +230,10 @@ def _worst(t: Tensor, q: Tensor, size: Tensor, run: int) -> Tensor:
     place = torch.arange(window, device=t.device)
     inside = (place >= BESIDE) & (place < BESIDE + run)
     x = times - times[:, BESIDE : BESIDE + 1]
-    x = x / x.abs().amax(1, keepdim=True)
-    c = pseudo_inverses(x[:, ~inside], SPIKE_DEGREE) @ values[:, ~inside]
-    r = powers(x, SPIKE_DEGREE) @ c - values
+    half = x.abs().amax(1, keepdim=True)
+    x = x / half
+    inverses = pseudo_inverses(x[:, ~inside], SPIKE_DEGREE, rounding(t, half))
+    r = powers(x[: len(inverses)], SPIKE_DEGREE) @ (inverses @ values[:, ~inside]) - values
     miss = r[:, inside].abs().amin(1)  # (W, n): the smallest departure in the run
     local = (r[:, ~inside].square().sum(1) / (2 * BESIDE - SPIKE_DEGREE - 1)).sqrt()
     noise = 1.4826 * r[:, inside].abs().amax(1).median(0).values

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.windows import Triples, powers, pseudo_inverses
+from herglotz.data.windows import Triples, powers, pseudo_inverses, rounding
 
 # Even: at the middle of a window an odd power adds nothing to position and acceleration.
 DEGREES = (4, 6)
@@ -25,6 +25,8 @@ MAX_RESIDUAL_RATIO = 1.2
 SHORT_STEP = 0.02
 # Windows by which width and degree are chosen: more do not change the choice.
 MAX_WINDOWS = 2000
+# Windows that are computed at once, so that memory does not grow with their width.
+CHUNK = 2**14
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class LocalPolynomials:
     coefficients: Tensor  # (N, degree + 1, n)
     half: Tensor  # (N,)
     centred: Tensor  # (N,) bool
-    rows: Tensor  # (N, width) samples of the window
+    start: Tensor  # (N,) first sample of the window
 
     def at(self, x: Tensor | float) -> Tensor:
         """Positions at x of every window, (N, n)."""
@@ -58,11 +60,14 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     if (best := _best_window(data.t, data.q, data.lengths)) is None:
         return None
     width, degree = best
-    rows = _windows(data, width)
-    half, x = _times(data, rows)
-    coefficients = pseudo_inverses(x, degree) @ data.q[rows].double()
-    middle = rows[:, width // 2] == torch.arange(data.samples)
-    return LocalPolynomials(width, coefficients, half, middle, rows)
+    start, sample, each = _starts(data, width), torch.arange(data.samples), torch.arange(width)
+    halves, coefficients = [], []
+    for own, first in zip(sample.split(CHUNK), start.split(CHUNK), strict=True):
+        rows = first[:, None] + each
+        half, x = _times(data, rows, own)
+        halves.append(half)
+        coefficients.append(pseudo_inverses(x, degree, rounding(data.t[rows], half)) @ data.q[rows].double())
+    return LocalPolynomials(width, torch.cat(coefficients), torch.cat(halves), start + width // 2 == sample, start)
 
 
 # A search asks again for the same positions with other inputs. A tensor is the same only if the object is.
@@ -97,7 +102,7 @@ def smooth_triples(data: Trajectories, local: LocalPolynomials) -> tuple[Triples
     h = SHORT_STEP * local.half[rows]
     u = None
     if data.u is not None:
-        window = local.rows[rows]
+        window = local.start[rows, None] + torch.arange(local.width)
         t = data.t[window].double()
         middle = (t[:, 1:] + t[:, :-1]) / 2 - data.t[rows].double()[:, None]
         weight = (1 - (middle / local.half[rows][:, None]).square()).clamp_min(0).square() * t.diff(dim=1)
@@ -117,26 +122,24 @@ def _quality(data: Trajectories, width: int, degree: int) -> tuple[float, float]
     middle = torch.cat(ends)
     middle = middle[:: -(-len(middle) // MAX_WINDOWS)]
     rows = middle[:, None] + torch.arange(width) - width // 2
-    half, x = _times(data, rows)
+    half, x = _times(data, rows, middle)
     q = data.q[rows].double()
-    inverse = pseudo_inverses(x, degree)
+    inverse = pseudo_inverses(x, degree, rounding(data.t[rows], half))
     left = (q - powers(x[: len(inverse)], degree) @ (inverse @ q)).square().mean() * width / (width - degree - 1)
     gain = (2 * inverse[:, 2] / half[:, None].square()).square().sum(1).mean()
     return float(left), float(gain)
 
 
-def _windows(data: Trajectories, width: int) -> Tensor:
-    """The samples (N, width) around each sample; windows are shifted inwards at the ends of a trajectory."""
-    parts = []
-    for first, length in zip(data.offsets, data.lengths, strict=True):
-        start = (torch.arange(length) - width // 2).clamp(0, length - width)
-        parts.append(first + start[:, None] + torch.arange(width))
-    return torch.cat(parts)
+def _starts(data: Trajectories, width: int) -> Tensor:
+    """The first sample (N,) of the window around each sample, which is shifted inwards at the ends of a trajectory."""
+    return torch.cat([
+        first + (torch.arange(length) - width // 2).clamp(0, length - width)
+        for first, length in zip(data.offsets, data.lengths, strict=True)
+    ])  # fmt: skip
 
 
-def _times(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Half the span of each window (N,), and its times around that of its sample, over that (N, width)."""
+def _times(data: Trajectories, rows: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
+    """Half the span of the windows `rows` (K, width), and their times around those of the samples `own`, over that."""
     t = data.t[rows].double()
-    own = data.t.double()[torch.arange(data.samples)] if len(rows) == data.samples else t[:, rows.shape[1] // 2]
     half = (t[:, -1] - t[:, 0]) / 2
-    return half, (t - own[:, None]) / half[:, None]
+    return half, (t - data.t[own].double()[:, None]) / half[:, None]

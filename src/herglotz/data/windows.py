@@ -126,22 +126,25 @@ def _divided_turns(q: Tensor, trajectory: Tensor) -> Tensor:
 ROUNDED = 1e-11
 
 
+def rounding(t: Tensor, half: Tensor) -> float:
+    """The rounding of the times t of a clock in windows that span 2 `half`, over `half`; at least `ROUNDED`."""
+    return max(ROUNDED, 4 * torch.finfo(torch.float64).eps * float(t.abs().max() / half.min()))
+
+
 def powers(x: Tensor, degree: int) -> Tensor:
     """1, x, x² … of the times of windows, (N, w) → (N, w, degree + 1)."""
     return torch.stack([x**k for k in range(degree + 1)], -1)
 
 
-def pseudo_inverses(x: Tensor, degree: int) -> Tensor:
+def pseudo_inverses(x: Tensor, degree: int, rounded: float = ROUNDED) -> Tensor:
     """What turns values at times x (N, w), about 1 in size, into the coefficients of `powers`, (N, degree + 1, w).
 
-    Most windows of even steps have the times of the middle one, and share its matrix; (1, degree + 1, w) if all do.
+    Windows of even steps, whose times differ by less than `rounded`, share a matrix; (1, degree + 1, w) if all do.
     """
-    middle = x[len(x) // 2]
-    others = (x - middle).abs().amax(1) > ROUNDED
-    Q, R = torch.linalg.qr(powers(torch.cat([middle[None], x[others]]), degree))
+    _, of = torch.unique((x[:, 0] / rounded).round(), return_inverse=True)
+    first = of.new_full((int(of.max()) + 1,), len(x)).scatter_reduce(0, of, torch.arange(len(x)).to(of), "amin")
+    alone = ((x - x[first[of]]).abs().amax(1) > rounded).nonzero()[:, 0]
+    Q, R = torch.linalg.qr(powers(x[torch.cat([first, alone])], degree))
     inverses = torch.linalg.solve_triangular(R, Q.mT, upper=True)
-    if len(inverses) == 1:
-        return inverses
-    every = inverses[:1].repeat(len(x), 1, 1)
-    every[others] = inverses[1:]
-    return every
+    of[alone] = torch.arange(len(first), len(inverses)).to(of)
+    return inverses if len(inverses) == 1 else inverses[of]

@@ -9,9 +9,9 @@ Eliminating the states, (C − Bᵀ T⁻¹ B) δθ = b_θ − Bᵀ T⁻¹ b_x, t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +23,8 @@ from herglotz.training.pruning import inverse_of
 
 # (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None if T is not positive definite
 Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
+# Added to the diagonal of states that samples may not determine, relative to the diagonal.
+RIDGE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -49,26 +51,13 @@ class Arrowhead:
         """Its diagonal."""
         return torch.cat([self.corner.diagonal(), self.blocks.diagonal(dim1=-2, dim2=-1).flatten()])
 
-    def dense(self) -> Tensor:
-        """The matrix as a tensor, (P + S·d, P + S·d)."""
-        P, (S, d) = len(self.corner), self.border.shape[:2]
-        A = self.corner.new_zeros(P + S * d, P + S * d)
-        A[:P, :P] = self.corner
-        A[P:, :P] = self.border.flatten(0, 1)
-        A[:P, P:] = A[P:, :P].T
-        T, k = A[P:, P:].unflatten(0, (S, d)).unflatten(2, (S, d)), torch.arange(S)  # (S, d, S, d)
-        T[k, :, k] = self.blocks
-        T[k[:-1], :, k[1:]] = self.upper[:-1]
-        T[k[1:], :, k[:-1]] = self.upper[:-1].mT
-        return A
-
     def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
         """(matrix + diag(damping))⁻¹ b; None if some process finds no finite solution."""
-        step = self._solved(b.double(), damping.double())
+        step = self.solved(b.double(), damping.double())
         return of_first(step.to(b))[0] if everywhere(step is not None) and step is not None else None
 
-    def _solved(self, b: Tensor, damping: Tensor) -> Tensor | None:
-        """The solution by eliminating the states first, in float64."""
+    def solved(self, b: Tensor, damping: Tensor) -> Tensor | None:
+        """(matrix + diag(damping))⁻¹ b by eliminating the states first, in float64; None if that is not finite."""
         P, (S, d) = len(self.corner), self.border.shape[:2]
         if (found := self._reduced(b[P:].reshape(S, d, 1), damping)) is None:
             return None
@@ -100,6 +89,42 @@ class Arrowhead:
         found = self._reduced(zero.new_zeros(S, d, 0), zero)
         return inverse_of(found[0]) if found is not None and bool(torch.isfinite(found[0]).all()) else None
 
+    def onto(self, segments: Sequence[int]) -> Tensor | None:
+        """The Schur complement (P + k·d, P + k·d) on the parameters and the states of k segments, in float64.
+
+        It is what is left of the matrix when all other states are eliminated; None if that is not finite.
+        """
+        P, (S, d), k = len(self.corner), self.border.shape[:2], len(segments)
+        border, blocks, upper = (x.double().clone() for x in (self.border, self.blocks, self.upper))
+        corner = self.corner.new_zeros(P + k * d, P + k * d, dtype=torch.float64)
+        corner[:P, :P] = self.corner
+        border = torch.cat([border, border.new_zeros(S, d, k * d)], -1)
+        for j, segment in enumerate(segments):
+            own = slice(P + j * d, P + (j + 1) * d)
+            corner[own, own], corner[own, : own.start] = blocks[segment], border[segment, :, : own.start]
+            corner[: own.start, own] = corner[own, : own.start].T
+            if segment:
+                border[segment - 1, :, own], upper[segment - 1] = upper[segment - 1], 0.0
+            if segment + 1 < S:
+                border[segment + 1, :, own] = upper[segment].mT
+            border[segment], upper[segment], blocks[segment] = 0.0, 0.0, torch.eye(d).to(blocks)
+        rest = Arrowhead(corner, border, blocks, upper, self.eliminate)
+        damping = corner.new_zeros(len(corner) + S * d)
+        damping[len(corner) :] = RIDGE * rest.diagonal()[len(corner) :] + torch.finfo(corner.dtype).tiny ** 0.5
+        found = rest._reduced(corner.new_zeros(S, d, 0), damping)
+        return None if found is None or not bool(torch.isfinite(found[0]).all()) else found[0]
+
+    def without(self, J: Tensor, r: Tensor, segment: Tensor) -> tuple[Arrowhead, Tensor]:
+        """The matrix without the rows J (N, n, P + d) of some samples, and Jᵀr of these, in float64.
+
+        `segment` (N,) are the segments of the samples, in order.
+        """
+        P, (S, d) = len(self.corner), self.border.shape[:2]
+        own = Sums.zeros(P, S, d, J.double())
+        own.add_rows(J.double(), r.double(), segment)
+        left = (self.corner - own.corner, self.border - own.border, self.blocks - own.blocks, self.upper.double())
+        return Arrowhead(*left, self.eliminate), torch.cat([own.by_theta, own.by_state.flatten()])
+
 
 def eliminated(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
     """T⁻¹ columns, (..., K, d, R), of each of several chains of K states; None if the result is not finite."""
@@ -110,11 +135,6 @@ def eliminated(diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | Non
 def tridiagonal(diagonal: Tensor, upper: Tensor) -> Blocks:
     """The blocks of the symmetric matrix T of chains of K states, (..., K, d, d) each."""
     return diagonal, upper, torch.cat([torch.zeros_like(upper[..., :1, :, :]), upper[..., :-1, :, :].mT], -3)
-
-
-def dense(A: Tensor | Any) -> Tensor:
-    """JᵀJ as a tensor, from a tensor or from an object with `dense`."""
-    return A if isinstance(A, Tensor) else A.dense()
 
 
 class Sums(NamedTuple):
@@ -140,17 +160,21 @@ class Sums(NamedTuple):
 
         This sets `slopes` too.
         """
-        P, n = len(self.corner), r.shape[1]
-        rows, segment = Z.flatten(0, 1)[grid.node][:, :n] * by[..., None], grid.segment
-        for k in range(grid.segments):
-            own, right = rows[segment == k].flatten(0, 1), r[segment == k].flatten()
-            by_theta, by_state = own[:, :P], own[:, P:]
+        self.add_rows(Z.flatten(0, 1)[grid.node][:, : r.shape[1]] * by[..., None], r, grid.segment)
+        self.slopes.copy_(Z[torch.arange(grid.segments, device=Z.device), grid.end])
+
+    def add_rows(self, rows: Tensor, r: Tensor, segment: Tensor) -> None:
+        """Add the rows (N, n, P + d) of samples with residuals r (N, n), in the order of their segments (N,)."""
+        P = len(self.corner)
+        there, counts = torch.unique_consecutive(segment, return_counts=True)
+        parts = zip(there.tolist(), rows.split(counts.tolist()), r.split(counts.tolist()), strict=True)
+        for k, own, right in parts:
+            by_theta, by_state = own.flatten(0, 1)[:, :P], own.flatten(0, 1)[:, P:]
             self.corner.addmm_(by_theta.T, by_theta)
-            self.by_theta.addmv_(by_theta.T, right)
+            self.by_theta.addmv_(by_theta.T, right.flatten())
             self.border[k] += by_state.T @ by_theta
             self.blocks[k] += by_state.T @ by_state
-            self.by_state[k] += by_state.T @ right
-        self.slopes.copy_(Z[torch.arange(grid.segments, device=Z.device), grid.end])
+            self.by_state[k] += by_state.T @ right.flatten()
 
     def add_joints(self, to: Tensor, by: Tensor, r: Tensor, own: Tensor | None = None) -> Tensor:
         """Add the rows by · ∂(end of the segment before − start) of the segments `to`, with residuals r, (J, d) each.

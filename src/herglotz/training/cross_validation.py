@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.training.arrowhead import Arrowhead, dense
+from herglotz.training.arrowhead import RIDGE, Arrowhead
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
@@ -26,7 +26,7 @@ def held_out_errors(
     problem: ShootingProblem,
     path: Path,
     theta: Tensor,  # (P,)
-    A: Tensor | Arrowhead,  # (unknowns, unknowns) JᵀJ at the fit, prior included
+    A: Arrowhead,  # JᵀJ at the fit, prior included
 ) -> Tensor:
     """Return the RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
 
@@ -35,69 +35,61 @@ def held_out_errors(
     residuals of a deterministic model are correlated over long times: neighbours of a single left-out sample would
     foretell the sample. Starts whose deviation is far smaller than σ are never left out: a free run begins there.
     """
-    r, G = _whitened(*data_rows(problem, path, theta), dense(A))
+    r, J = data_rows(problem, path, theta)
     # The higher precision of known starts counts in r and J, and not in errors in units of q.
-    better = problem.better.flatten().to(r)
-    errors = left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
-    return errors * problem.sigma
+    better = problem.better.to(r)
+    left_out = lambda rows: _left_out(A, J, r, problem.grid.segment, rows) / better[rows]  # noqa: E731
+    return left_out_errors(r, problem.data, left_out, better > SURE) * problem.sigma
 
 
-def foretold_errors(problem: ShootingProblem, path: Path, theta: Tensor, A: Tensor) -> Tensor:
+def foretold_errors(problem: ShootingProblem, path: Path, theta: Tensor, A: Arrowhead) -> Tensor:
     """`held_out_errors` over their expectation: (FOLDS,), 1 where residuals are white noise of σ.
 
     With H = J_B A⁻¹ J_Bᵀ a fit without the rows B misses them by e = (I − H)⁻¹ r_B. If the model is true, e has the
     covariance (I − H)⁻¹, and the result is the root of eᵀ(I − H) e / |B|. With many parameters left-out blocks
     have large errors, because each block alone determines some parameters.
     """
-    # The prior's weights of waves differ by many orders of magnitude.
-    size = A.diagonal().sqrt()
     r, J = data_rows(problem, path, theta)
-    r, G = _whitened(r, J.double() / size, A / size[:, None] / size)
-    each = lambda rows: (r[rows] @ _left_out(G[rows], r[rows]) / rows.sum()).sqrt()[None]  # noqa: E731
-    return left_out_errors(r, problem.data, each, problem.better.flatten() > SURE)
 
+    def each(rows: Tensor) -> Tensor:
+        return (r[rows] @ _left_out(A, J, r, problem.grid.segment, rows) / rows.sum()).sqrt()[None]
 
-def _whitened(r: Tensor, J: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
-    """Data residuals (N·n,), and G (N·n, K) with G Gᵀ = J A⁻¹ Jᵀ, float64."""
-    values, vectors = torch.linalg.eigh(A.double())
-    known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
-    return r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())
+    return left_out_errors(r, problem.data, each, problem.better > SURE)
 
 
 def data_rows(problem: ShootingProblem, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Data residuals and their Jacobian, (N·n,) and (N·n, unknowns), over σ and in the order of the samples.
+    """Residuals of the samples (N, n) and their derivatives (N, n, P + d), over σ, in float64.
 
-    Both carry the square roots of the weights: those of a robust loss, those of known starts, and 0 for
-    samples that are not used.
+    The derivatives are by the parameters and by the start of the segment. Both carry the square roots of the weights:
+    those of a robust loss, those of known starts, and 0 for samples that are not used.
     """
     r = problem.misfit(path) / problem.sigma
     by = problem.weight * problem.root_weights(problem.weight * r)
-    Z = problem.slopes_at_samples(theta, path) * (by / problem.deviations)[..., None]
-    segment = problem.grid.segment
-    J = Z.new_zeros(len(Z), problem.n, problem.P + problem.grid.segments * problem.d)
-    J[..., : problem.P] = Z[..., : problem.P]
-    for i in range(problem.d):
-        J[torch.arange(len(Z)), :, problem.P + segment * problem.d + i] = Z[..., problem.P + i]
-    return (by * r).flatten(), J.flatten(0, 1)
+    J = problem.slopes_at_samples(theta, path) * (by / problem.deviations)[..., None]
+    return (by * r).double(), J.double()
 
 
-def _left_out(G: Tensor, r: Tensor) -> Tensor:
-    """(I − G Gᵀ)⁻¹ r, which is r + G (I − Gᵀ G)⁻¹ Gᵀ r as well, by the smaller of both matrices."""
-    if G.shape[0] <= G.shape[1]:
-        return without_rows(G @ G.T, r)
-    return r + G @ without_rows(G.T @ G, G.T @ r)
+def _left_out(A: Arrowhead, J: Tensor, r: Tensor, segment: Tensor, rows: Tensor) -> Tensor:
+    """The residuals of the rows B, (N, n) bool, of a fit without them; inf where that is not determined.
 
-
-def without_rows(H: Tensor, r: Tensor) -> Tensor:
-    """(I − H)⁻¹ r."""
-    return torch.linalg.solve_ex(torch.eye(len(H), dtype=H.dtype, device=H.device) - H, r)[0]
+    (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B = r_B + J_B (A − J_Bᵀ J_B)⁻¹ J_Bᵀ r_B, whose matrix has the shape of A.
+    """
+    at = rows.any(1).nonzero()[:, 0]
+    own, missed, of = J[at] * rows[at][..., None], r[at] * rows[at], segment[at]
+    rest, b = A.without(own, missed, of)
+    damping, P = RIDGE * A.diagonal().double(), len(A.corner)
+    x = rest.solved(b, damping + torch.finfo(b.dtype).tiny ** 0.5)
+    if x is None:
+        return torch.full_like(r[rows], torch.inf)
+    moved = torch.cat([x[:P].expand(len(at), P), x[P:].reshape(-1, A.border.shape[1])[of]], -1)
+    return (missed + (own @ moved[..., None])[..., 0])[rows[at]]
 
 
 def left_out_errors(
-    r: Tensor,  # (N·n,) residuals of the data, in the order of the samples
+    r: Tensor,  # (N, n) residuals of the data, in the order of the samples
     data: Trajectories,
-    left_out: Callable[[Tensor], Tensor],  # (N·n,) bool, some rows → their residuals without them
-    stay: Tensor | None = None,  # (N·n,) bool, rows that are in no fold
+    left_out: Callable[[Tensor], Tensor],  # (N, n) bool, some rows → their residuals without them
+    stay: Tensor | None = None,  # (N, n) bool, rows that are in no fold
 ) -> Tensor:
     """RMS of r in each fold if its rows had been left out, (FOLDS,).
 
@@ -107,7 +99,7 @@ def left_out_errors(
     if data.u is not None:
         for part in parts:
             part[: min(STAY, len(part) // (2 * FOLDS))] = -1
-    fold = torch.cat(parts).repeat_interleave(data.dof).to(r.device)
+    fold = torch.cat(parts)[:, None].expand(r.shape).to(r.device)
     fold = fold if stay is None else fold.masked_fill(stay, -1)
     errors = torch.stack([left_out(fold == k).square().mean().sqrt() for k in range(FOLDS)]).nan_to_num(nan=torch.inf)
     # All rows of a fold may stay where trajectories are short.

@@ -28,7 +28,6 @@ from herglotz.models import ContactLagrangian
 from herglotz.models.config import POWERS
 from herglotz.models.drag import input_forces
 from herglotz.progress import beat
-from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
 from herglotz.training.following import HALF, unexplained
 from herglotz.training.free_run import continued
@@ -129,17 +128,18 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
         ahead.guess_from_states(guess)
         path = ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))
     beat()
-    if ahead is None or path is None:
+    if ahead is None or path is None or (told := A.onto(runs.segments)) is None:
         return Foresight(math.inf, math.sqrt(2), math.inf, math.inf, 0.0, "", runs.horizon, False)
-    spread = task.data.q.std(0, correction=0).clamp_min(1e-300)
-    A, Z = dense(A).double(), ahead.slopes_at_samples(theta, path).double()
+    spread, Z = task.data.q.std(0, correction=0).clamp_min(1e-300), ahead.slopes_at_samples(theta, path).double()
     q = ahead.grid.at_samples(path.x[..., : problem.n])
     inside = ((q >= low) & (q <= high)).all(-1)
     # Under a controller the unseen part is more of the same: no rest of the inputs tells what they do.
     free = seen.data.u is None or unexplained(seen.data, states) >= HALF
-    told = A + _of_unseen(Z, q, problem, runs, seen.data) if free else A
+    if free:
+        told += _of_unseen(Z, q, problem, runs, seen.data)
     apart = _apart(seen.data, task.data, spread)
-    return _summary(A, told, Z / spread[:, None], problem, runs, absent, inside, apart)
+    starts = inverse_of(A.blocks[runs.segments].double())
+    return _summary(starts, told, Z / spread[:, None], problem, runs, absent, inside, apart)
 
 
 @dataclass(frozen=True)
@@ -278,40 +278,39 @@ def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> Named
 
 
 def _of_unseen(Z: Tensor, q: Tensor, problem: ShootingProblem, runs: _Ahead, data: Trajectories) -> Tensor:
-    """JᵀJ of the unseen samples of `data` in free runs, at q with sensitivities Z (N, n, P + d).
+    """JᵀJ, by θ and the starts of the runs, of the unseen samples of `data` at q with sensitivities Z (N, n, P + d).
 
     All samples count of a run that meets them to the noise. A run that misses more counts as one reading of this error:
     a force that is missing may make all of it.
     """
-    found = Z.new_zeros(2 * [problem.P + problem.grid.segments * problem.d])
+    found = Z.new_zeros(2 * [problem.P + len(runs.segments) * problem.d])
     every = torch.arange(len(q), device=q.device).split(list(runs.data.lengths))
-    for segment, rows in zip(runs.segments, every, strict=True):
+    for run, rows in enumerate(every):
         rows = rows[runs.unseen[rows]]
         at = runs.rows[rows]
         there = torch.ones_like(q[rows]) if data.observed is None else data.observed[at]
         r = there * (q[rows] - data.q[at]) / problem.deviations
         J, missed = (Z[rows] * (there / problem.deviations)[..., None]).flatten(0, 1), float(r.square().sum())
-        own = problem.places(segment)
+        own = problem.places(run)
         found[own[:, None], own] += J.T @ J / (1.0 if missed <= AT_THE_NOISE**2 * float(there.sum()) else missed)
     return found
 
 
 def _summary(
-    A: Tensor, told: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]],
+    starts: Tensor, told: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]],
     inside: Tensor, apart: float,
 ) -> Foresight:  # fmt: skip
-    """The variances of free runs from their sensitivities Z (N, n, P + d) over the spread, and JᵀJ of all unknowns.
+    """The variances of free runs from their sensitivities Z (N, n, P + d) over the spread.
 
-    A is JᵀJ of the training part, `told` that with the unseen samples. Only samples `inside` the recorded range, (N,)
-    bool, count. `apart` is that of `Foresight`.
+    `starts` (runs, d, d) are the covariances of the starts alone, and `told` is JᵀJ by θ and all starts of runs. Only
+    samples `inside` the recorded range, (N,) bool, count. `apart` is that of `Foresight`.
     """
     P = problem.P
     names = [name for name, at in absent.items() for _ in at]
     C, follow = _open(told, absent, problem)
     start, parameters, hidden = [], [], []
-    for segment, z in zip(runs.segments, Z.split(list(runs.data.lengths)), strict=True):
-        own = problem.places(segment)
-        state = inverse_of(A[own[P:]][:, own[P:]])
+    for run, (state, z) in enumerate(zip(starts, Z.split(list(runs.data.lengths)), strict=True)):
+        own = problem.places(run)
         start.append(((z[..., P:] @ state) * z[..., P:]).sum(-1).mean(-1))
         parameters.append(((z @ C[own][:, own]) * z).sum(-1).mean(-1))
         hidden.append((z @ follow[own]).square().mean(1))

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from herglotz.data import Trajectories
+from herglotz.training.arrowhead import RIDGE
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
@@ -21,8 +22,8 @@ from herglotz.training.solvers.lifted_newton import Path
 BLOCKS = 10
 # Leading samples of a trajectory, at most a tenth of it, that are never left out, because they determine its start.
 STAY = 20
-# Added to curvatures with a unit diagonal, which may be singular.
-RIDGE = 1e-12
+# Samples whose products with large matrices are computed at once.
+SAMPLES_AT_ONCE = 2**14
 
 
 class HeldOut:
@@ -43,17 +44,14 @@ class HeldOut:
         waves: Tensor | None = None,  # (P,)
     ):
         self.block, self.sigma, P = blocks(problem.data).to(theta.device), problem.sigma, problem.P
+        self.runs = runs_of(self.block)
         self.complete = problem.data.complete
         zero = torch.zeros_like(theta)
         self.leaving, self.waves = (zero if x is None else x for x in (leaving, waves))
-        r = problem.misfit(path) / problem.sigma
-        by = (problem.weight * problem.root_weights(problem.weight * r))[..., None]
-        slopes = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
-        # (N, n, P + 1 + d) of numbers, residual, start
-        rows = torch.cat([slopes[..., :P], r[..., None], slopes[..., P:]], -1)
+        rows, by = _rows_of(problem, path, theta)
         segment = problem.grid.segment
         piece, of = torch.unique_consecutive(torch.stack([segment, self.block], 1), dim=0, return_inverse=True)
-        weighted = rows * by
+        weighted = rows * by[..., None]
         own = _by_start(weighted, of, len(piece), P)  # (Q, d, P + 1 + d)
         whole = own.new_zeros(problem.grid.segments, *own.shape[1:]).index_add_(0, piece[:, 0], own)
         self.following = _following(whole, P)
@@ -64,22 +62,23 @@ class HeldOut:
         if not problem.jointed:
             self.equations[:, list(range(P) if fitted is None else fitted), P] = 0.0
         # [J, r] with the states following, of the fit to all samples.
-        self.fitted_rows = rows[..., : P + 1] - rows[..., P + 1 :] @ self.following[segment]
+        self.fitted_rows = rows[..., : P + 1] - _gathered(rows[..., P + 1 :], self.following, segment)
         # The start of a piece that is left out follows the rest of its segment or, if the segment lies inside the block
         # and so has one piece, the piece.
         out = piece[:, 1] >= 0
         s, block = piece[out].T
+        pieces = runs_of(block)
         gone, kept = (torch.bincount(piece[:, 0])[s] == 1)[:, None, None], whole[s] - own[out]
         starts = _following(torch.where(gone, own[out], kept), P)
         before, after = whole[s][..., :P], torch.where(gone, 0.0, kept[..., :P])
         for k in range(len(self.equations) - 1):
-            mine, at = block == k, self.block == k
+            mine, at = pieces[k], self.runs[k]
             eliminated = _products(before[mine], self.following[s[mine]]) - _products(after[mine], starts[mine])
             self.equations[k] += eliminated - _summed(weighted[at], P)
         # [J, r], each sample for the fit without its block.
         self.rows = rows[..., : P + 1].clone()
         at, place = self.block >= 0, out.cumsum(0) - 1
-        self.rows[at] -= rows[at][..., P + 1 :] @ starts[place[of[at]]]
+        self.rows[at] -= _gathered(rows[at][..., P + 1 :], starts, place[of[at]])
 
     def residuals(self, sets: Sequence[Sequence[int]]) -> Tensor:
         """Held-out residuals over the balance, (C, N, n), for C sets of numbers; NaN if a set has no solution.
@@ -89,7 +88,7 @@ class HeldOut:
         P = self.rows.shape[-1] - 1
         out = self.rows[..., P].repeat(len(sets), 1, 1)
         for k, by in enumerate(self._steps(self.equations[:-1], sets)):
-            own = (self.block == k).nonzero()[:, 0]
+            own = self.runs[k]
             out[:, own] += (self.rows[own][..., :P] @ by.T).permute(2, 0, 1)
         return out * self.sigma
 
@@ -204,6 +203,28 @@ def blocks(data: Trajectories) -> Tensor:
         parts.append(part)
         first += each
     return torch.cat(parts)
+
+
+def _rows_of(problem: ShootingProblem, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives by numbers, residuals, and derivatives by starts, (N, n, P + 1 + d), over σ; and weights (N, n)."""
+    r, P = problem.misfit(path) / problem.sigma, problem.P
+    slopes = problem.slopes_at_samples(theta, path) / problem.deviations[:, None]
+    by = problem.weight * problem.root_weights(problem.weight * r)
+    return torch.cat([slopes[..., :P], r[..., None], slopes[..., P:]], -1), by
+
+
+def _gathered(by_start: Tensor, moved: Tensor, of: Tensor) -> Tensor:
+    """The products of by_start (N, n, d) and moved[of] (N, d, W), (N, n, W), in parts of bounded memory."""
+    parts = zip(by_start.split(SAMPLES_AT_ONCE), of.split(SAMPLES_AT_ONCE), strict=True)
+    return torch.cat([x @ moved[own] for x, own in parts])
+
+
+def runs_of(block: Tensor) -> list[slice]:
+    """Where each block k ≥ 0 stands among values (N,) that are −1 or blocks in order; an empty slice if it does not."""
+    there, counts = torch.unique_consecutive(block, return_counts=True)
+    ends = counts.cumsum(0).tolist()
+    found = {k: slice(end - count, end) for k, end, count in zip(there.tolist(), ends, counts.tolist(), strict=True)}
+    return [found.get(k, slice(0)) for k in range(int(block.max()) + 1)]
 
 
 def _by_start(rows: Tensor, of: Tensor, count: int, P: int) -> Tensor:

@@ -42,7 +42,6 @@ from herglotz.models import ContactLagrangian, refuse_own
 from herglotz.models.terms import LinearDamping, Phase
 from herglotz.stepping.explicit import FieldOf
 from herglotz.threads import one_thread
-from herglotz.training.arrowhead import dense
 from herglotz.training.cross_validation import foretold_errors
 from herglotz.training.dictionary import keys_of
 from herglotz.training.functions import Band, bands, prior_spreads, replaced
@@ -53,7 +52,7 @@ from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import inverse_of
 from herglotz.training.run import Run
-from herglotz.training.uncertainty import Laplace, inflation_of, quantile
+from herglotz.training.uncertainty import Laplace, Starts, inflation_of, quantile
 
 # Relative variation below which a function is constant: rounding of float32.
 MAX_VARIATION_OF_CONSTANT = 1e-6
@@ -295,8 +294,8 @@ def function_posterior(posterior: Laplace) -> FunctionPosterior:
     every = bands(posterior.problem.data, posterior.base, fine=True)
     model = _with_waves(posterior.run.model, every)
     found = None if model is None else _linear(posterior, model, every)
-    P, own = len(posterior.theta), inverse_of(posterior.information.cpu())
-    return found or FunctionPosterior(posterior.run.model, posterior.theta, own[:P, :P], posterior.inflation)
+    own = inverse_of(posterior.information.cpu())
+    return found or FunctionPosterior(posterior.run.model, posterior.theta, own, posterior.inflation)
 
 
 def mass_at(model: ContactLagrangian, q: Tensor, h: float) -> Tensor:
@@ -398,32 +397,34 @@ def _linear(posterior: Laplace, model: ContactLagrangian, every: list[Band]) -> 
     """The posterior of a model with all waves, linearised at the fit; None if a step fails there."""
     theta, problem = ParameterVector(model).get(), _problem(posterior, model, 2)
     P, d, start = problem.P, problem.d, posterior.path.x[:, 0, : problem.d]
-    both = (x.normal_equations(problem.pack(theta, start)) for x in (_problem(posterior, model, 1), problem))
-    coarse, (cost, A, b) = ([dense(x).double().cpu() for x in equations] for equations in both)
-    if not bool(coarse[0].isfinite() & cost.isfinite()):
+    x = problem.pack(theta, start)
+    coarse, _, its_b = _problem(posterior, model, 1).normal_equations(x)
+    cost, A, b = problem.normal_equations(x)
+    if not bool(coarse.isfinite() & cost.isfinite()):
         return None
     more = 1 / (2**model.config.order - 1)
-    cost, b = (x + more * (x - y) for x, y in ((cost, coarse[0]), (b, coarse[2])))
-    states = inverse_of(A[P:, P:])
-    onto = A[:P, P:] @ states
+    cost, b = cost + more * (cost - coarse), (b + more * (b - its_b)).double()
+    by_theta, by_start = b[:P], b[P:].reshape(-1, d)
+    starts = Starts.of(A)
+    own = (starts.inverse @ by_start[..., None])[..., 0]
     q, h = posterior.problem.data.q, posterior.run.h
     some = q[:: -(-len(q) // SAMPLES)]
     mass = by_numbers(model, lambda m: mass_at(m, some, h)[0, 0].mean().log(), theta)
-    c, count = float(2 * cost - b[P:] @ states @ b[P:]), q.numel() - len(states)
+    c, count = float(2 * cost - (by_start * own).sum()), q.numel() - by_start.numel()
+    information = starts.information(A).cpu()
     linear = _Linear(
-        A[:P, :P] - onto @ A[P:, :P], b[:P] - onto @ b[P:], c, count, mass.double().cpu(),
-        posterior.problem.freedom is not None, *_prior(posterior, model, every),
+        information, (by_theta + torch.einsum("sdp,sd->p", starts.follow, by_start)).cpu(), c, count,
+        mass.double().cpu(), posterior.problem.freedom is not None, *_prior(posterior, model, every),
     )  # fmt: skip
     _, moved, weight, variance = max(map(linear.likeliest, FALLS), key=lambda found: found[0])
-    starts = start - (states @ (b[P:] + A[P:, :P] @ moved)).reshape(-1, d).to(start)
-    theta = theta + moved.to(theta)
-    path = problem.solve(problem.pack(theta, starts))
-    if path is None:
+    moved_start = start - (own - starts.follow @ moved.to(own)).to(start)
+    theta, weight = theta + moved.to(theta), variance * weight
+    cost, A, _ = problem.normal_equations(problem.pack(theta, moved_start))
+    if (path := problem.path) is None or not bool(cost.isfinite()):
         return None
-    A[:P, :P] += variance * weight
-    errors = foretold_errors(problem, path, theta, A.to(theta.device))
-    factor = inflation_of(errors, variance**0.5)
-    return FunctionPosterior(model, theta, inverse_of(A)[:P, :P] * variance, factor)
+    A = replace(A, corner=A.corner + weight.to(A.corner))
+    factor = inflation_of(foretold_errors(problem, path, theta, A), variance**0.5)
+    return FunctionPosterior(model, theta, inverse_of(information + weight) * variance, factor)
 
 
 def _problem(posterior: Laplace, model: ContactLagrangian, parts: int) -> ShootingProblem:

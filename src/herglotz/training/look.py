@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -39,8 +40,8 @@ from herglotz.training.structure import (
 )
 from herglotz.training.task import NOISY, Task, drag_starts_the_fit
 
-# Most numbers in q: states, derivatives and held-out residuals take 15 kB of memory each (measured).
-MOST = 300_000
+# Memory for each number in q: states, derivatives and held-out residuals (measured: 2.5 to 5.6 kB).
+BYTES_PER_NUMBER = 4000
 # Iterations of the short one-step fits: the probe measures the noise, and other fits start from the rest.
 PROBE = 40
 # The baseline explains exact data if its error is below this multiple of the σ of exact data.
@@ -141,7 +142,7 @@ def _seen(
     zeros, drifts = (zeros, drifts) if plan is None else (plan.zeros, plan.drifts)
     recorded, (data, arrival, why) = data, _read(measured(data, zeros, drifts=drifts), settings)
     train, unseen = split(data, settings)
-    _check_size(train)
+    _check_memory(train)
     dropped = dropped_samples(train, settings)
     kept, drag = train.keep(~dropped), drag_starts_the_fit(settings)
     outliers = settings.robust == "on" or bool(dropped.any())
@@ -203,19 +204,26 @@ def dropped_samples(train: Trajectories, settings: FitConfig) -> Tensor:
     return torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
 
 
-def _check_size(data: Trajectories) -> None:
-    """Refuse more than `MOST` numbers in q, for which there is no memory.
+def _check_memory(data: Trajectories) -> None:
+    """Refuse data whose fit takes more memory than there is.
 
-    InputError names how many samples there are, how many can be, and which thinning leaves as many.
+    InputError says how much a fit takes, and which thinning leaves data that can be fitted.
     """
-    allowed = MOST // data.dof
-    if data.samples <= allowed:
+    needed, memory = BYTES_PER_NUMBER * data.q.numel(), physical_memory()
+    if needed <= memory:
         return
-    every = math.ceil(data.samples / allowed)
     raise InputError(
-        f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinates, for 5 GB of memory; "
-        f"thin them (--every {every}, Trajectories.thinned) or take fewer"
+        f"a fit to {data.samples} samples takes about {needed / 1e9:.3g} GB of memory, and this machine has "
+        f"{memory / 1e9:.3g}; thin them (--every {math.ceil(needed / memory)}, Trajectories.thinned) or take fewer"
     )
+
+
+def physical_memory() -> float:
+    """Memory of this machine in bytes; inf where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf
 
 
 def _with_terms(

@@ -46,10 +46,12 @@ def prune(
 
 
 def inverse_of(A: Tensor) -> Tensor:
-    """A⁻¹ of a matrix that may have null directions, along which it is very large; a pseudo-inverse would be 0 there.
+    """A⁻¹ of matrices (..., k, k) with possible null directions, where it is very large; a pseudo-inverse would be 0.
 
     A is scaled to a unit diagonal, so that units do not decide which directions are null.
     """
-    size = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
-    values, vectors = torch.linalg.eigh(A / size[:, None] / size)
-    return (vectors / values.clamp_min(NULL * float(values[-1]))) @ vectors.T / size[:, None] / size
+    diagonal = A.diagonal(dim1=-2, dim2=-1)
+    size = torch.where(diagonal > 0, diagonal, 1.0).sqrt()
+    values, vectors = torch.linalg.eigh(A / size[..., None] / size[..., None, :])
+    values = values.maximum(NULL * values[..., -1:])
+    return (vectors / values[..., None, :]) @ vectors.mT / size[..., None] / size[..., None, :]

@@ -8,7 +8,7 @@ block of held-out time, because a block that alone determines some number has a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
@@ -21,7 +21,7 @@ from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError, refuse
 from herglotz.models import refuse_own
 from herglotz.threads import one_thread
-from herglotz.training.arrowhead import dense
+from herglotz.training.arrowhead import Arrowhead
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
 from herglotz.training.equation import HALVED
@@ -78,8 +78,30 @@ def quantile(level: float) -> float:
     return NormalDist().inv_cdf(0.5 + level / 2)
 
 
+@dataclass(frozen=True)
+class Starts:
+    """The start x of each trajectory in JᵀJ = A of a fit: its covariance at fixed θ, and its derivative by θ."""
+
+    inverse: Tensor  # (B, d, d) A_xx⁻¹
+    follow: Tensor  # (B, d, P) −A_xx⁻¹ A_xθ
+
+    @classmethod
+    def of(cls, A: Arrowhead) -> Starts:
+        """Those of a fit whose segments are whole trajectories."""
+        inverse = inverse_of(A.blocks.double())
+        return cls(inverse, -inverse @ A.border.double())
+
+    def information(self, A: Arrowhead) -> Tensor:
+        """The Schur complement A_θθ − A_θx A_xx⁻¹ A_xθ of the parameters, (P, P)."""
+        found = A.corner.double() + A.border.double().flatten(0, 1).T @ self.follow.flatten(0, 1)
+        return (found + found.T) / 2
+
+
 class Laplace:
-    """Posterior of a run's parameters and start states; made by `laplace`."""
+    """Posterior of a run's parameters and start states; made by `laplace`.
+
+    `covariance` (P, P) is that of the parameters, and `information` (P, P) is JᵀJ with the starts eliminated.
+    """
 
     def __init__(self, run: Run):
         self.run = run
@@ -102,11 +124,14 @@ class Laplace:
         self.prior = prior_of(run.model, self.base, departure)
         self.problem, self.path = self._solved(train, run.states.joined[list(data.offsets)], ~out, guess=states)
         self.theta = self.problem.parameters.get()
-        _, A, self._slope = self.problem.normal_equations(self.problem.unknowns(self.theta, self.path))
-        A = dense(A)
-        errors = held_out_errors(self.problem, self.path, self.theta, A)
+        x = self.problem.unknowns(self.theta, self.path)
+        cost, self.matrix, self._slope = self.problem.normal_equations(x)
+        if not all(bool(torch.isfinite(x).all()) for x in (cost, self.matrix.corner, self.matrix.blocks)):
+            raise InputError("the motion is so unstable that its derivatives overflow, so the run has no posterior")
+        errors = held_out_errors(self.problem, self.path, self.theta, self.matrix)
         self.inflation = inflation_of(errors, self.sigma)
-        self.information = A.double()
+        self.starts = Starts.of(self.matrix)
+        self.information = self.starts.information(self.matrix)
         self.covariance = inverse_of(self.information) * self.inflation**2
 
     @one_thread()
@@ -115,14 +140,12 @@ class Laplace:
 
         First order in the unknowns: dq_k = Z_k d(θ, start), with Z through every implicit step.
         """
-        data, own = self.run.data.unwrapped(), map(self.problem.places, range(len(self.run.data)))
-        return self._bands(data, self.path.x[:, 0], [self.covariance[i[:, None], i] for i in own])
+        return self._bands(self.run.data.unwrapped(), self.path.x[:, 0], self.joint(self.starts))
 
     def predict(self, data: Trajectories, seen: int) -> Bands:
         """Bands of new trajectories: their first `seen` samples give the start states, a free run the rest.
 
-        The start x of each is fitted to those samples, θ being fixed. With JᵀJ of that fit in blocks, C the covariance
-        of θ, x has the derivative G = −A_xx⁻¹ A_xθ by θ, and (θ, x) the covariance [[C, C Gᵀ], [G C, G C Gᵀ + A_xx⁻¹]].
+        The start of each is fitted to those samples, θ being fixed; its covariance with θ is that of `joint`.
 
         The data have the coordinates, units and inputs of the run, and more than `seen` ≥ 3 samples per trajectory; in
         the first `seen` samples the bands are those of a fit. Raise InputError if a trajectory is shorter, or the model
@@ -139,19 +162,23 @@ class Laplace:
         found = fit_states(task, self.run.model, self.sigma)
         if found is None or found.problem.grid.segments > len(data):
             raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")
-        problem, P, d = found.problem, len(self.theta), self.problem.d
-        start = found.path.x[:, 0]
-        A = dense(problem.normal_equations(problem.unknowns(self.theta, found.path))[1])
-        C, joint = self.covariance[:P, :P], []
-        for own in torch.arange(P, len(A)).split(d):
-            inverse = torch.linalg.pinv(A[own[:, None], own[None, :]].double(), hermitian=True)
-            G = torch.cat([torch.eye(P).to(C), -inverse @ A[own, :P].double()])
+        _, A, _ = found.problem.normal_equations(found.problem.unknowns(self.theta, found.path))
+        return self._bands(data, found.path.x[:, 0], self.joint(Starts.of(A)))
+
+    def joint(self, starts: Starts) -> Iterator[Tensor]:
+        """The covariance (P + d, P + d) of the parameters and of the start of each trajectory.
+
+        With the covariance C of θ and the derivative G of a start x by θ, (θ, x) has the covariance
+        [[C, C Gᵀ], [G C, G C Gᵀ + A_xx⁻¹]].
+        """
+        C, P = self.covariance, len(self.theta)
+        for inverse, follow in zip(starts.inverse, starts.follow, strict=True):
+            G = torch.cat([torch.eye(P).to(C), follow])
             S = G @ C @ G.T
             S[P:, P:] += inverse * self.inflation**2
-            joint.append(S)
-        return self._bands(data, start, joint)
+            yield S
 
-    def _bands(self, data: Trajectories, start: Tensor, joint: list[Tensor]) -> Bands:
+    def _bands(self, data: Trajectories, start: Tensor, joint: Iterable[Tensor]) -> Bands:
         """Runs from `start`, (B, 2n+1), with a covariance of (θ, start) for each, (P + d, P + d)."""
         whole, path = self._solved(data, start)
         with torch.no_grad():
@@ -176,20 +203,21 @@ class Laplace:
         cost, _, slope = other.normal_equations(x)
         if not bool(torch.isfinite(cost)):
             return None
-        moved = x.double() - HALVED * (self.covariance / self.inflation**2 @ (slope - self._slope).double())
-        P = len(self.theta)
-        return (moved[:P].to(x), moved[P:].reshape(-1, d).to(x)) if bool(torch.isfinite(moved).all()) else None
+        moved, P = (slope - self._slope).double() * -HALVED, len(self.theta)
+        by_theta, by_start = moved[:P], moved[P:].reshape(-1, d)
+        step = inverse_of(self.information) @ (by_theta + torch.einsum("sdp,sd->p", self.starts.follow, by_start))
+        steps = self.starts.follow @ step + (self.starts.inverse @ by_start[..., None])[..., 0]
+        theta, start = self.theta.double() + step, x[P:].reshape(-1, d).double() + steps
+        return (theta.to(x), start.to(x)) if bool(theta.isfinite().all() & start.isfinite().all()) else None
 
     def standard_deviations(self) -> dict[str, Tensor]:
         """Standard deviation of every parameter, by name, in its own units."""
-        P = len(self.theta)
-        return self.problem.parameters.unflatten(self.covariance.diagonal()[:P].clamp_min(0).sqrt())
+        return self.problem.parameters.unflatten(self.covariance.diagonal().clamp_min(0).sqrt())
 
     def effective_parameters(self) -> float:
         """The effective number of parameters, P − tr(C A_prior), which the data determine (MacKay 1992)."""
-        P = len(self.theta)
         _, prior, _ = self.prior.normal_equations(self.theta)
-        return P - float((self.covariance[:P, :P] / self.inflation**2 * prior.double()).sum())
+        return len(self.theta) - float((self.covariance / self.inflation**2 * prior.double()).sum())
 
     def _solved(
         self, data: Trajectories, start: Tensor, used: Tensor | None = None, guess: Tensor | None = None
@@ -262,14 +290,14 @@ def traded(posterior: Laplace) -> list[Trade]:
     names = posterior.problem.parameters.numbers
     rows = torch.tensor([i for i, name in enumerate(names) if name.startswith(PHYSICAL)], dtype=torch.long)
     M = information_of(posterior, rows)
-    return combinations(M, posterior.information.diagonal()[rows], [names[i] for i in rows.tolist()])
+    return combinations(M, posterior.matrix.corner.diagonal().double()[rows], [names[i] for i in rows.tolist()])
 
 
 def information_of(posterior: Laplace, rows: Tensor) -> Tensor:
     """The information M (K, K) of the data on the parameters at the places `rows` (K,).
 
-    With A = JᵀJ of the fit, prior included, φ these parameters and r all other unknowns, M is the Schur complement
-    A_φφ − A_φr A_rr⁻¹ A_rφ minus the prior of φ.
+    With A = JᵀJ of the fit, prior included and starts eliminated, φ these parameters and r the others, M is the Schur
+    complement A_φφ − A_φr A_rr⁻¹ A_rφ minus the prior of φ.
     """
     A = posterior.information
     rest = torch.ones(len(A), dtype=torch.bool)
@@ -302,10 +330,10 @@ def joint_of(posterior: Laplace, least: float) -> Joint:
     """
     P, sigma = len(posterior.theta), posterior.sigma
     rounding = max(1.0, least / (sigma * posterior.inflation)) ** 2
-    alone = posterior.information.diagonal()[:P].clamp_min(1e-300).rsqrt() * max(1.0, least / sigma)
+    alone = posterior.matrix.corner.diagonal().double().clamp_min(1e-300).rsqrt() * max(1.0, least / sigma)
     lost = alone < torch.finfo(torch.float64).eps * posterior.theta.abs().to(alone)
     refuse({"rounding errors of the model's numbers change its motion by more than the misfit": bool(lost.any())})
-    every = posterior.covariance[:P, :P] * rounding, alone, information_of(posterior, torch.arange(P))
+    every = posterior.covariance * rounding, alone, information_of(posterior, torch.arange(P))
     return Joint(*(x.cpu() for x in every))
 
 

@@ -10,7 +10,6 @@ from herglotz.models import ContactLagrangian, ModelConfig, OwnLagrangian
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import free_run
-from herglotz.training.cross_validation import _left_out
 from herglotz.training.free_run import continued, free_runs, near_data
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
@@ -117,11 +116,3 @@ def test_a_path_that_is_not_looked_at_again_is_solved(pendulum):
         assert stepped is not None
         y = stepped[0]
         assert float((y - path.x[:, 1:]).abs().max()) < 2 * tol * float(path.x.abs().max())
-
-
-@pytest.mark.parametrize("columns", [3, 12])
-def test_left_out_rows_by_either_matrix(columns):  # fails if one of the two forms is wrong
-    make = torch.Generator().manual_seed(0)
-    G, r = (0.2 * torch.randn(*shape, generator=make, dtype=torch.float64) for shape in ((6, columns), (6,)))
-    expected = torch.linalg.inv(torch.eye(6, dtype=torch.float64) - G @ G.T) @ r
-    torch.testing.assert_close(_left_out(G, r), expected)

@@ -90,7 +90,7 @@ def test_what_is_left_open_counts_until_a_start_is_half_lost():
     Z = torch.stack([2 * start, start, 0 * start], -1)[:, None]
     problem: Any = SimpleNamespace(P=1, data=runs.data, places=lambda _: torch.arange(3))
     A, inside = torch.eye(3, dtype=torch.float64), torch.ones(10, dtype=torch.bool)
-    found = foresight._summary(A, A, Z, problem, runs, {}, inside, 1.5)
+    found = foresight._summary(A[None, 1:, 1:], A, Z, problem, runs, {}, inside, 1.5)
     assert found.followed == pytest.approx(0.4)
     var = 5 * start.square()
     assert found.parameters == pytest.approx(float(var[3:6].mean().sqrt()))

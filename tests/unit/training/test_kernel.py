@@ -9,7 +9,8 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper, state_of
 from herglotz.training import flow
-from herglotz.training.arrowhead import Sums, dense
+from herglotz.training.arrowhead import RIDGE, Sums
+from herglotz.training.cross_validation import _left_out, data_rows
 from herglotz.training.dictionary import dictionary, keys_of
 from herglotz.training.flow import motion
 from herglotz.training.kernel import kernel_of
@@ -17,6 +18,7 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.waves import waves_of
+from tests.compared import dense
 
 PENDULUM = ModelConfig(angles=(True,), level="forced", stiffness=(0.0,), alike=True, potential_width=0, damping_width=0,
                        features=("cos(q1)", "sin(2q1)"), drag=("|v1| v1",))  # fmt: skip
@@ -171,6 +173,41 @@ def test_equations_are_solved_by_blocks():
     assert found is not None
     assert float((found - expected).abs().max()) <= 1e-8 * float(expected.abs().max())
     assert float((A @ b - dense(A) @ b).abs().max()) <= 1e-12 * float((dense(A) @ b).abs().max())
+
+
+@pytest.mark.parametrize(("length", "segments"), [(6, (0, 3)), (6, (1, 2)), (10**3, (0,))])
+def test_other_states_are_eliminated(length, segments):
+    # fails if a state that stays loses its coupling to a neighbour, or the information of a state that goes is lost
+    problem, x = problem_of(MODELS["order 2"], length=length)
+    A, P, d = problem.normal_equations(x)[1], problem.P, problem.d
+    whole = dense(A)
+    stay = torch.cat([torch.arange(P), *(P + d * k + torch.arange(d) for k in segments)])
+    gone = torch.ones(len(whole), dtype=torch.bool)
+    gone[stay] = False
+    solved = torch.linalg.solve(whole[gone][:, gone], whole[gone][:, stay])
+    expected = whole[stay][:, stay] - whole[stay][:, gone] @ solved
+    found = A.onto(segments)
+    assert found is not None
+    assert float((found - expected).abs().max()) <= 1e-8 * float(expected.abs().max())
+    assert replace(A, corner=A.corner / 0).onto(segments) is None
+
+
+def test_a_fold_is_left_out_of_joined_segments():
+    # fails if segments that lie inside a fold are not carried through it by their joints
+    problem, x = problem_of(MODELS["order 2"], length=3)
+    _, A, _ = problem.normal_equations(x)
+    theta, segment, P, d = problem.unpack(x)[0], problem.grid.segment, problem.P, problem.d
+    assert problem.path is not None
+    r, own = data_rows(problem, problem.path, theta)
+    J = own.new_zeros(len(r), P + d * problem.grid.segments)
+    J[:, :P] = own[:, 0, :P]
+    for i in range(d):
+        J[torch.arange(len(r)), P + d * segment + i] = own[:, 0, P + i]
+    fold = ((segment > 2) & (segment < 5))[:, None]
+    rows = fold[:, 0]
+    rest = dense(A) - J[rows].T @ J[rows] + RIDGE * torch.diag(A.diagonal())
+    expected = r[fold] + J[rows] @ torch.linalg.solve(rest, J[rows].T @ r[fold])
+    torch.testing.assert_close(_left_out(A, own, r, segment, fold), expected, rtol=1e-4, atol=0)
 
 
 def test_a_motion_that_has_no_step_costs_infinity():

@@ -17,6 +17,7 @@ from herglotz.training import Plan, fit, laplace, learned_functions
 from herglotz.training.cross_validation import FOLDS, data_rows, foretold_errors, held_out_errors
 from herglotz.training.learned_functions import FunctionPosterior, _Lines, function_posterior, mass_at
 from herglotz.training.parameter_vector import ParameterVector
+from tests.compared import dense
 
 INF = float("inf")
 PLAN = Plan(
@@ -73,9 +74,14 @@ def test_the_numbers_of_a_model_alone_say_too_little_of_its_functions(fitted):
 def test_what_blocks_are_missed_by_is_over_what_the_fit_foretells(fitted):
     # fails if a fit of many numbers, which knows little of a block that is left out, is called worse than its noise
     posterior = fitted[1]
-    of, theta, path, A = posterior.problem, posterior.theta, posterior.path, posterior.information
-    r, J = data_rows(of, path, theta)
-    H, each = J @ torch.linalg.inv(A) @ J.T, []
+    of, theta, path, A = posterior.problem, posterior.theta, posterior.path, posterior.matrix
+    r, own = data_rows(of, path, theta)
+    r, P, segment = r[:, 0], of.P, of.grid.segment
+    J = own.new_zeros(len(r), P + len(of.data) * of.d)
+    J[:, :P] = own[:, 0, :P]
+    for i in range(of.d):
+        J[torch.arange(len(r)), P + segment * of.d + i] = own[:, 0, P + i]
+    H, each = J @ torch.linalg.inv(dense(A)) @ J.T, []
     fold = torch.cat([torch.arange(k) * FOLDS // k for k in of.data.lengths])
     for k in range(FOLDS):
         rows = fold == k

@@ -325,7 +325,7 @@ def test_a_motion_that_rounding_errors_change_has_no_deviations():
     # fails if numbers of a motion that passes an upper equilibrium have 24 digits, and each "next to no effect"
     posterior: Any = SimpleNamespace(
         theta=torch.tensor([6.3], dtype=torch.float64), sigma=1e-3, inflation=1.0,
-        information=torch.tensor([[1e32]], dtype=torch.float64),
+        matrix=SimpleNamespace(corner=torch.tensor([[1e32]], dtype=torch.float64)),
     )  # fmt: skip
     with pytest.raises(InputError, match="rounding errors of the model's numbers"):
         joint_of(posterior, 0.0)

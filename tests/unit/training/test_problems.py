@@ -16,7 +16,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, levenberg_marquardt
-from herglotz.training.arrowhead import dense
+from herglotz.training.arrowhead import Arrowhead, eliminated
 from herglotz.training.cross_validation import data_rows, held_out_errors, left_out_errors, simplest_not_beaten
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
@@ -26,7 +26,7 @@ from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.solvers import lifted_newton
 from herglotz.training.solvers.lifted_newton import solve_path
 from herglotz.training.stages import Stages
-from tests.compared import assert_gradient
+from tests.compared import assert_gradient, dense
 
 
 def model_of(level, n=1, seed=0, **settings):
@@ -120,7 +120,10 @@ def two_modes(samples):
     q = 0.5 * t.cos() + 0.1 * (3 * t).sin()  # the second mode has no force in the model
     noise = 1e-5 * torch.randn(samples, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     data = Trajectories.of(t, q + noise, (samples,), units=("m",))
-    problem = ShootingProblem(model_of("linear"), data, segment_grid(data, samples, 1.0), sigma=0.1)
+    model = model_of("linear")
+    # Without a prior 35 numbers are open, and the error of a block depends on where rounding is cut off.
+    prior = prior_of(model, data)
+    problem = ShootingProblem(model, data, segment_grid(data, samples, 1.0), sigma=0.1, prior=prior)
     start = problem.states(data.q[:1], (data.q[1:2] - data.q[:1]) / (t[1] - t[0]))
     result = levenberg_marquardt(problem, problem.pack(problem.parameters.get(), start), max_iterations=40)
     path = problem.solve(result.x)
@@ -150,15 +153,16 @@ def test_rows_of_the_data_are_those_of_the_normal_equations(freedom):
     assert problem.path is not None
     r, J = data_rows(problem, problem.path, theta)
     assert float(problem.better.max()) > 2
-    A = dense(A)
-    torch.testing.assert_close(J.T @ J, A, rtol=1e-9, atol=1e-9 * float(A.abs().max()))
-    torch.testing.assert_close(J.T @ r, b, rtol=1e-9, atol=1e-9 * float(b.abs().max()))
+    rest, its_b = A.without(J, r, grid.segment)
+    A, rest = dense(A), dense(rest)
+    assert float(rest.abs().max()) <= 1e-9 * float(A.abs().max())
+    torch.testing.assert_close(its_b, b, rtol=1e-9, atol=1e-9 * float(b.abs().max()))
 
 
 @pytest.mark.parametrize("samples", [161, 81, 41])
 def test_known_starts_are_in_no_held_out_block(samples):
     # fails if weighted residuals are taken for lengths, or a start that was recorded is foretold from later samples:
-    # the first block of 0.6 m of motion missed 5e6 m, and decided all comparisons; measured now 0.21, 0.35 and 0.16 m
+    # the first block of 0.6 m of motion missed 5e6 m, and decided all comparisons; measured now 0.12, 0.14 and 0.11 m
     assert float(two_modes(samples)[-1][0]) < 0.6
 
 
@@ -168,20 +172,22 @@ def test_held_out_errors_are_in_units_of_q(monkeypatch, better, first, error):
     # (the measured pendulum: that chose a prior whose free run missed by 0.0144 rad in place of 0.0098), or if one that
     # is known far better is foretold
     data = Trajectories.of(torch.arange(20.0, dtype=torch.float64), torch.arange(20.0, dtype=torch.float64)[:, None])
-    r, known = torch.ones(20, dtype=torch.float64), torch.ones(20, 1, dtype=torch.float64)
+    r, known = torch.ones(2, 20, 1, dtype=torch.float64)
     r[0], known[0] = first, better
-    problem: Any = SimpleNamespace(data=data, sigma=3.0, better=known)
+    grid = SimpleNamespace(segment=torch.zeros(20, dtype=torch.long))
+    problem: Any = SimpleNamespace(data=data, sigma=3.0, better=known, grid=grid)
     no: Any = None
-    rows = lambda *_: (r, torch.zeros(20, 1, dtype=torch.float64))  # noqa: E731
+    rows = lambda *_: (r, torch.zeros(20, 1, 2, dtype=torch.float64))  # noqa: E731
     monkeypatch.setattr("herglotz.training.cross_validation.data_rows", rows)
-    found = held_out_errors(problem, no, no, torch.eye(1, dtype=torch.float64))
+    one = torch.ones(1, 1, 1, dtype=torch.float64)
+    found = held_out_errors(problem, no, no, Arrowhead(one[0], 0 * one, one, 0 * one, eliminated))
     assert found.tolist() == pytest.approx([3 * error, 3, 3, 3, 3])
 
 
 def test_a_block_that_stays_decides_nothing():
     # fails if a block without samples is infinitely bad: of trajectories of 15 samples the known start is the first one
     data = Trajectories.of(torch.arange(15.0), torch.arange(15.0)[:, None] ** 2, (15,))
-    r, stay = torch.arange(15.0), torch.arange(15) < 3
+    r, stay = torch.arange(15.0)[:, None], torch.arange(15)[:, None] < 3
     errors = left_out_errors(r, data, lambda rows: r[rows], stay)
     each = torch.stack([r[3 * k : 3 * k + 3].square().mean() for k in range(1, 5)])
     torch.testing.assert_close(errors[1:], each.sqrt())

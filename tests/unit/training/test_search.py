@@ -32,6 +32,7 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
 from herglotz.training.trials import Variant, masses, scores_of
 from tests import runge_kutta
+from tests.compared import dense
 
 NOISE = 0.003
 T = TypeVar("T")
@@ -380,7 +381,7 @@ def test_held_out_residuals_are_those_of_fits_without_the_blocks():
         x = problem.unknowns(whole.theta, whole.path)
         for _ in range(6):
             _, A, b = problem.normal_equations(x)
-            x = x - torch.linalg.solve(A.dense(), b)
+            x = x - torch.linalg.solve(dense(A), b)
         missed = problem.misfit(there(problem.solve(x)))[out]
         torch.testing.assert_close(found[out], missed, rtol=0.05, atol=2e-4)
 

@@ -24,6 +24,7 @@ from herglotz.training.problems.zeros import WithZeros
 from herglotz.training.sensor_zeros import CENTRE, drifts, in_words, means, zeros_of_one
 from herglotz.training.structure import kept_structure
 from herglotz.training.task import build_model
+from tests.compared import dense
 
 predict_module, sensor_zeros_module = (sys.modules[f.__module__] for f in (predict, zeros_of_one))
 structure_module = sys.modules[kept_structure.__module__]
@@ -73,7 +74,7 @@ def test_the_normal_equations_of_zeros_are_the_derivatives_of_the_cost(drifting)
     zero = problem.P + target.count - 1
     x[zero] = 0.03
     cost, matrix, b = target.normal_equations(x)
-    A = matrix.dense()
+    A = dense(matrix)
     step = torch.zeros_like(x)
     step[zero] = 1e-4
     up, down = target.cost(x + step), target.cost(x - step)

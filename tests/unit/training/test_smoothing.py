@@ -12,11 +12,11 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import ShootingProblem, levenberg_marquardt, smooth
-from herglotz.training.arrowhead import dense
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
 from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
 from herglotz.training.smoother import smoothing_start
+from tests.compared import dense
 
 NOISE = 0.05
 

@@ -9,6 +9,8 @@ from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, ensemble_bands, fit, laplace, uncertainty
+from herglotz.training.uncertainty import schur
+from tests.compared import dense
 
 NOISE, INF = 0.01, float("inf")
 SETTINGS = FitConfig(departures=(2e-3,), objective="trajectory")  # with networks, not with named terms
@@ -54,10 +56,20 @@ def test_bands_cover_the_true_position_too(posteriors):
 def test_the_band_of_the_start_is_what_sensitivities_say(posteriors):
     # fails if the covariance's blocks and the columns of the sensitivities are matched wrongly
     run, posterior, _ = posteriors[0]
-    bands, P, d = posterior.bands(), len(posterior.theta), posterior.problem.d
-    for b, first in enumerate(run.data.offsets):
-        own = posterior.covariance[P + b * d, P + b * d].sqrt()
-        torch.testing.assert_close(bands.std[first, 0], own, rtol=1e-8, atol=0)
+    bands, P = posterior.bands(), len(posterior.theta)
+    for first, joint in zip(run.data.offsets, posterior.joint(posterior.starts), strict=True):
+        torch.testing.assert_close(bands.std[first, 0], joint[P, P].sqrt(), rtol=1e-8, atol=0)
+
+
+def test_the_posterior_in_blocks_is_the_inverse_of_the_whole_matrix(posteriors):
+    # fails if the starts are eliminated wrongly, which a set of thousands of recordings needs
+    _, posterior, _ = posteriors[0]
+    P, A, d = len(posterior.theta), dense(posterior.matrix).double(), posterior.problem.d
+    whole = torch.linalg.inv(A) * posterior.inflation**2
+    for b, joint in enumerate(posterior.joint(posterior.starts)):
+        own = torch.cat([torch.arange(P), P + d * b + torch.arange(d)])
+        torch.testing.assert_close(joint, whole[own[:, None], own], rtol=1e-6, atol=1e-9 * float(joint.abs().max()))
+    torch.testing.assert_close(posterior.information, schur(A.flip(0, 1), P).flip(0, 1), rtol=1e-6, atol=0)
 
 
 def test_standard_deviation_of_the_damping_rate(posteriors):
