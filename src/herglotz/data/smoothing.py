@@ -26,7 +26,7 @@ SHORT_STEP = 0.02
 # Windows by which width and degree are chosen: more do not change the choice.
 MAX_WINDOWS = 2000
 # Windows that are computed at once, so that memory does not grow with their width.
-CHUNK = 2**14
+CHUNK = 2**15
 
 
 @dataclass(frozen=True)

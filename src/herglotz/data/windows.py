@@ -139,12 +139,19 @@ def powers(x: Tensor, degree: int) -> Tensor:
 def pseudo_inverses(x: Tensor, degree: int, rounded: float = ROUNDED) -> Tensor:
     """What turns values at times x (N, w), about 1 in size, into the coefficients of `powers`, (N, degree + 1, w).
 
-    Windows of even steps, whose times differ by less than `rounded`, share a matrix; (1, degree + 1, w) if all do.
+    Most windows of even steps have the same times, but for what is `rounded`, and share a matrix; (1, degree + 1, w) if
+    all do.
     """
-    _, of = torch.unique((x[:, 0] / rounded).round(), return_inverse=True)
-    first = of.new_full((int(of.max()) + 1,), len(x)).scatter_reduce(0, of, torch.arange(len(x)).to(of), "amin")
-    alone = ((x - x[first[of]]).abs().amax(1) > rounded).nonzero()[:, 0]
-    Q, R = torch.linalg.qr(powers(x[torch.cat([first, alone])], degree))
+    # The middle of all windows may be the end of a recording, whose window lies otherwise than most.
+    begun, counts = torch.unique((x[:, 0] / ROUNDED).round(), return_counts=True)
+    usual = x[(x[:, 0] / ROUNDED).round() == begun[counts.argmax()]]
+    middle = x[len(x) // 2]
+    middle = middle if abs(float(middle[0] - usual[0, 0])) <= rounded else usual[len(usual) // 2]
+    others = (x - middle).abs().amax(1) > rounded
+    Q, R = torch.linalg.qr(powers(torch.cat([middle[None], x[others]]), degree))
     inverses = torch.linalg.solve_triangular(R, Q.mT, upper=True)
-    of[alone] = torch.arange(len(first), len(inverses)).to(of)
-    return inverses if len(inverses) == 1 else inverses[of]
+    if len(inverses) == 1:
+        return inverses
+    every = inverses[:1].repeat(len(x), 1, 1)
+    every[others] = inverses[1:]
+    return every

@@ -23,8 +23,9 @@ from herglotz.training.pruning import inverse_of
 
 # (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None if T is not positive definite
 Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
-# Added to the diagonal of states that samples may not determine, relative to the diagonal.
-RIDGE = 1e-12
+# Added to a diagonal, relative to it, where samples may not determine some state. In chaotic motion starts tell all but
+# 1e-13 of the information on a number.
+RIDGE = 1e-14
 
 
 @dataclass(frozen=True)

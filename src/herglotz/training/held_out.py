@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from herglotz.data import Trajectories
-from herglotz.training.arrowhead import RIDGE
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
@@ -22,6 +21,8 @@ from herglotz.training.solvers.lifted_newton import Path
 BLOCKS = 10
 # Leading samples of a trajectory, at most a tenth of it, that are never left out, because they determine its start.
 STAY = 20
+# Added to curvatures with a unit diagonal, which may be singular.
+RIDGE = 1e-12
 # Samples whose products with large matrices are computed at once.
 SAMPLES_AT_ONCE = 2**14
 

@@ -8,7 +8,7 @@ import torch
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, ensemble_bands, fit, laplace, uncertainty
+from herglotz.training import FitConfig, ShootingProblem, ensemble_bands, fit, laplace, uncertainty
 from herglotz.training.uncertainty import schur
 from tests.compared import dense
 
@@ -70,6 +70,19 @@ def test_the_posterior_in_blocks_is_the_inverse_of_the_whole_matrix(posteriors):
         own = torch.cat([torch.arange(P), P + d * b + torch.arange(d)])
         torch.testing.assert_close(joint, whole[own[:, None], own], rtol=1e-6, atol=1e-9 * float(joint.abs().max()))
     torch.testing.assert_close(posterior.information, schur(A.flip(0, 1), P).flip(0, 1), rtol=1e-6, atol=0)
+
+
+def test_derivatives_that_overflow_leave_no_posterior(posteriors, monkeypatch):
+    # fails if a motion that turns over for an hour ends a fit with an internal error of linear algebra
+    plain = ShootingProblem.normal_equations
+
+    def overflowed(*given, **how):
+        cost, A, b = plain(*given, **how)
+        return cost, replace(A, blocks=A.blocks / 0), b
+
+    monkeypatch.setattr(ShootingProblem, "normal_equations", overflowed)
+    with pytest.raises(InputError, match="so unstable that its derivatives overflow"):
+        laplace(posteriors[0][0])
 
 
 def test_standard_deviation_of_the_damping_rate(posteriors):
