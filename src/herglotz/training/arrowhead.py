@@ -19,13 +19,10 @@ from torch import Tensor
 from herglotz.stepping.block_tridiagonal import Blocks, eliminate
 from herglotz.training.distributed import everywhere, of_first
 from herglotz.training.problems.grid import SegmentGrid
-from herglotz.training.pruning import inverse_of
+from herglotz.training.pruning import NULL, inverse_of
 
 # (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None if T is not positive definite
 Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
-# Added to a diagonal, relative to it, where samples may not determine some state. In chaotic motion starts tell all but
-# 1e-13 of the information on a number.
-RIDGE = 1e-14
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ class Arrowhead:
             border[segment], upper[segment], blocks[segment] = 0.0, 0.0, torch.eye(d).to(blocks)
         rest = Arrowhead(corner, border, blocks, upper, self.eliminate)
         damping = corner.new_zeros(len(corner) + S * d)
-        damping[len(corner) :] = RIDGE * rest.diagonal()[len(corner) :] + torch.finfo(corner.dtype).tiny ** 0.5
+        damping[len(corner) :] = NULL * rest.diagonal()[len(corner) :] + torch.finfo(corner.dtype).tiny ** 0.5
         found = rest._reduced(corner.new_zeros(S, d, 0), damping)
         return None if found is None or not bool(torch.isfinite(found[0]).all()) else found[0]
 

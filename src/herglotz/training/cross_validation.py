@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.training.arrowhead import RIDGE, Arrowhead
+from herglotz.training.arrowhead import Arrowhead
+from herglotz.training.held_out import RIDGE
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 

@@ -9,10 +9,11 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper, state_of
 from herglotz.training import flow
-from herglotz.training.arrowhead import RIDGE, Sums
+from herglotz.training.arrowhead import Sums
 from herglotz.training.cross_validation import _left_out, data_rows
 from herglotz.training.dictionary import dictionary, keys_of
 from herglotz.training.flow import motion
+from herglotz.training.held_out import RIDGE
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
