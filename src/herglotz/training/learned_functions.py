@@ -431,8 +431,7 @@ def _problem(posterior: Laplace, model: ContactLagrangian, parts: int) -> Shooti
     """Each trajectory as one segment, without a prior, with the model steps of the fit divided into `parts`."""
     of = posterior.problem
     grid = segment_grid(of.data, max(of.data.lengths), posterior.base.model_step / parts)
-    settings = {"sigma": of.sigma, "freedom": of.freedom, "used": of.used, "compiled": False}
-    problem = ShootingProblem(model, of.data, grid, **settings)
+    problem = ShootingProblem(model, of.data, grid, sigma=of.sigma, freedom=of.freedom, used=of.used)
     problem.guess_from(of, posterior.path)
     return problem
 
