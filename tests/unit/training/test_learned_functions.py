@@ -95,7 +95,7 @@ def test_what_blocks_are_missed_by_is_over_what_the_fit_foretells(fitted):
 def test_bands_are_computed_by_the_kernel(fitted, monkeypatch):
     # fails if torch steps through the recording with derivatives by all waves: the report on 250 000 samples took more
     # than 200 s and 2.8 GB, and takes 17 s and 0.8 GB
-    monkeypatch.setattr(ShootingProblem, "sensitivities", lambda *_, **how: pytest.fail("stepped by torch"))
+    monkeypatch.setattr(ShootingProblem, "sensitivities", lambda *_, **__: pytest.fail("stepped by torch"))
     assert learned_functions(fitted[1])[0].std is not None
 
 
