@@ -26,7 +26,7 @@ SHORT_STEP = 0.02
 # Windows by which width and degree are chosen: more do not change the choice.
 MAX_WINDOWS = 2000
 # Windows that are computed at once, so that memory does not grow with their width.
-CHUNK = 2**15
+WINDOWS_AT_ONCE = 2**15
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     width, degree = best
     start, sample, each = _starts(data, width), torch.arange(data.samples), torch.arange(width)
     halves, coefficients = [], []
-    for own, first in zip(sample.split(CHUNK), start.split(CHUNK), strict=True):
+    for own, first in zip(sample.split(WINDOWS_AT_ONCE), start.split(WINDOWS_AT_ONCE), strict=True):
         rows = first[:, None] + each
         half, x = _times(data, rows, own)
         halves.append(half)

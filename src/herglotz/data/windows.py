@@ -143,8 +143,9 @@ def pseudo_inverses(x: Tensor, degree: int, rounded: float = ROUNDED) -> Tensor:
     all do.
     """
     # The middle of all windows may be the end of a recording, whose window lies otherwise than most.
-    begun, counts = torch.unique((x[:, 0] / ROUNDED).round(), return_counts=True)
-    usual = x[(x[:, 0] / ROUNDED).round() == begun[counts.argmax()]]
+    begin = (x[:, 0] / ROUNDED).round()
+    begins, counts = torch.unique(begin, return_counts=True)
+    usual = x[begin == begins[counts.argmax()]]
     middle = x[len(x) // 2]
     middle = middle if abs(float(middle[0] - usual[0, 0])) <= rounded else usual[len(usual) // 2]
     others = (x - middle).abs().amax(1) > rounded

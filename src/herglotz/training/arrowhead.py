@@ -82,10 +82,13 @@ class Arrowhead:
 
         What no residual determines has a very large variance (`inverse_of`).
         """
-        P, (S, d) = len(self.corner), self.border.shape[:2]
-        zero = self.border.new_zeros(P + S * d, dtype=torch.float64)
-        found = self._reduced(zero.new_zeros(S, d, 0), zero)
-        return inverse_of(found[0]) if found is not None and bool(torch.isfinite(found[0]).all()) else None
+        found = self._information(torch.zeros_like(self.diagonal(), dtype=torch.float64))
+        return None if found is None else inverse_of(found)
+
+    def _information(self, damping: Tensor) -> Tensor | None:
+        """The Schur complement C − Bᵀ T⁻¹ B of the parameters, damped, (P, P); None if that is not finite."""
+        found = self._reduced(damping.new_zeros(*self.border.shape[:2], 0), damping)
+        return None if found is None or not bool(torch.isfinite(found[0]).all()) else found[0]
 
     def onto(self, segments: Sequence[int]) -> Tensor | None:
         """The Schur complement (P + k·d, P + k·d) on the parameters and the states of k segments, in float64.
@@ -109,8 +112,7 @@ class Arrowhead:
         rest = Arrowhead(corner, border, blocks, upper, self.eliminate)
         damping = corner.new_zeros(len(corner) + S * d)
         damping[len(corner) :] = NULL * rest.diagonal()[len(corner) :] + torch.finfo(corner.dtype).tiny ** 0.5
-        found = rest._reduced(corner.new_zeros(S, d, 0), damping)
-        return None if found is None or not bool(torch.isfinite(found[0]).all()) else found[0]
+        return rest._information(damping)
 
     def without(self, J: Tensor, r: Tensor, segment: Tensor) -> tuple[Arrowhead, Tensor]:
         """The matrix without the rows J (N, n, P + d) of some samples, and Jᵀr of these, in float64.

@@ -209,7 +209,7 @@ def _check_memory(data: Trajectories) -> None:
 
     InputError says how much a fit takes, and which thinning leaves data that can be fitted.
     """
-    needed, memory = BYTES_PER_NUMBER * data.q.numel(), physical_memory()
+    needed, memory = BYTES_PER_NUMBER * data.q.numel(), _physical_memory()
     if needed <= memory:
         return
     raise InputError(
@@ -218,7 +218,7 @@ def _check_memory(data: Trajectories) -> None:
     )
 
 
-def physical_memory() -> float:
+def _physical_memory() -> float:
     """Memory of this machine in bytes; inf where the system does not say."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
