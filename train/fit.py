@@ -44,10 +44,11 @@ def main() -> int:
         with process_group():
             out.mkdir(parents=True, exist_ok=True)
             run = fit(experiment.data(), replace(experiment.fit, **settings), out=out, resume=arguments.resume)
-            return _report(run, out) if is_first() else 0
+            first = is_first()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    return _report(run, out) if first else 0
 
 
 def _report(run: Run, out: Path) -> int:

@@ -1,8 +1,9 @@
 """Sums of normal equations and gradients over the processes of `torchrun`; a single process is not affected.
 
 Every process holds the data and runs the same optimiser. The work that grows with the data (Jacobians of chunks of
-triples or steps) is divided among the processes and the sums are all-reduced. The last bits of a process's own results
-depend on the alignment of its memory, so all values that decide the optimiser's path come from the first process.
+triples or steps, runs over segments) is divided among the processes and the sums are all-reduced. The last bits of a
+process's own results depend on the alignment of its memory, so all values that decide the optimiser's path come from
+the first process.
 """
 
 from __future__ import annotations
@@ -71,12 +72,20 @@ class LaneSums:
 
 
 def add_over_processes(*tensors: Tensor) -> None:
-    """Sum each tensor over the processes, in place, with bit-equal results everywhere."""
+    """Sum each tensor over the processes, in place, with bit-equal results everywhere; one message holds them all."""
     if world()[1] == 1:
         return
-    for x in tensors:
-        dist.all_reduce(x)
-        dist.broadcast(x, 0)
+    whole = torch.cat([x.flatten() for x in tensors])
+    dist.all_reduce(whole)
+    dist.broadcast(whole, 0)
+    for x, part in zip(tensors, whole.split([x.numel() for x in tensors]), strict=True):
+        x.copy_(part.view_as(x))
+
+
+def processors() -> int:
+    """Processors for the threads of this process: an equal share for each process of `torchrun` on this machine."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, count // (int(os.environ.get("LOCAL_WORLD_SIZE", world()[1])) if world()[1] > 1 else 1))
 
 
 def of_first(*tensors: Tensor) -> tuple[Tensor, ...]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from herglotz.models import ContactLagrangian
 from herglotz.training.arrowhead import Sums
+from herglotz.training.distributed import add_over_processes, processors, world
 from herglotz.training.kernel import Placed, kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
@@ -48,10 +49,11 @@ class Observed(NamedTuple):
 
 
 class CompiledFlow:
-    """Free runs over the segments of a grid by a kernel."""
+    """Free runs over the segments of a grid by a kernel; `divided` among the processes of `torchrun`, or in each."""
 
-    def __init__(self, placed: Placed, grid: SegmentGrid, u: Tensor | None, n: int):
+    def __init__(self, placed: Placed, grid: SegmentGrid, u: Tensor | None, n: int, *, divided: bool = False):
         self.placed, self.kernel, self.n = placed, placed.kernel, n
+        self.rank, self.processes = world() if divided else (0, 1)
         S, K = grid.h.shape
         there = torch.arange(K) < grid.end[:, None]
         at = torch.full((S * (K + 1),), -1)
@@ -73,8 +75,8 @@ class CompiledFlow:
     ) -> Tensor | None:
         """States at all nodes (S, K+1, 2n+1) from `starts` (S, 2n+1); None if a step has no solution.
 
-        The normal equations of the data are added to `sums`. The derivatives of the positions at the samples, times
-        their weights, are written to `rows` (N, n, P + d).
+        The normal equations of the data are added to `sums`, and the derivatives of the positions at the samples, times
+        their weights, to `rows` (N, n, P + d), both of no samples before.
         """
         whole = self.placed.rest.index_copy(0, self.placed.chosen, theta)
         ends, r = starts.contiguous().clone(), torch.zeros_like(of.y)
@@ -107,10 +109,17 @@ class CompiledFlow:
                     break
             return found
 
-        for results in self._run(run_job, self._jobs(0 if sums is None else F + d)):
+        jobs, failed = self._jobs(0 if sums is None else F + d)[self.rank :: self.processes], ends.new_zeros(1)
+        if sums is not None and self.processes > 1:
+            mine = torch.zeros(len(ends), dtype=torch.bool)
+            for job in jobs:
+                mine[job[0].first : job[-1].last] = True
+            sums.slopes[~mine] = 0.0
+        for results in self._run(run_job, jobs):
             for result in results:
                 if result is None:
-                    return None
+                    failed += 1
+                    break
                 piece, J = result
                 if sums is None or J is None:
                     continue
@@ -120,7 +129,11 @@ class CompiledFlow:
                 by_theta = J[:, :F]
                 sums.corner.addmm_(by_theta.T, by_theta)
                 sums.by_theta.addmv_(by_theta.T, r[part].flatten())
-        return states
+            if failed:
+                break
+        if self.processes > 1:
+            add_over_processes(failed, states, *(sums or ()), *(() if rows is None else (rows,)))
+        return None if failed else states
 
     @staticmethod
     def _run(run_job: Callable, jobs: list[list[Piece]]) -> Iterator[list]:
@@ -128,9 +141,7 @@ class CompiledFlow:
 
         Memory grows with the number of processors. Sums do not depend on this number, because their order is fixed.
         """
-        workers = min(
-            len(jobs), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        )
+        workers = min(len(jobs), processors())
         if workers < 2:
             yield from map(run_job, jobs)
             return
@@ -199,10 +210,10 @@ if hasattr(os, "register_at_fork"):
 def motion(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:
     """Free runs (S, K+1, 2n+1) from `start` (S, 2n+1) with steps h (S, K) and inputs u (S, K, m).
 
-    None if the model has no kernel, a start is not finite, or a step has no solution.
+    None if the model has no kernel, or a step has no solution.
     """
     placed, (S, K) = kernel_of(model), h.shape
-    if placed is None or not bool(torch.isfinite(start).all()):
+    if placed is None:
         return None
     none, end = torch.zeros(0, dtype=torch.long), torch.full((S,), K)
     grid = SegmentGrid(h, none, torch.zeros(S, dtype=torch.long), torch.zeros(S, dtype=torch.bool), end, end, h, K)

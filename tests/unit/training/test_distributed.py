@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from herglotz.training import distillation, distributed
+from herglotz.training import distillation, distributed, flow
 
 ROOT = Path(__file__).resolve().parents[3]
 WORK = """
@@ -18,7 +18,7 @@ from pathlib import Path
 from dataclasses import replace
 import torch
 from herglotz.data import simulate
-from herglotz.training import distillation, distributed
+from herglotz.training import distillation, distributed, flow
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, ResidualProblem, ShootingProblem, SmoothingProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
@@ -30,7 +30,7 @@ from herglotz.training.problems.prior import prior_of
 from tests.unoptimised import leave_out_optimisation
 
 leave_out_optimisation()
-distributed.MIN_ROWS = 8  # there are few rows, and each process shall have some
+distributed.MIN_ROWS = flow.SAMPLES_PER_JOB = 8  # there are few rows, and each process shall have some
 distillation.ITERATIONS = 3  # sums are shared from the first iteration on
 found = {}
 with process_group():
@@ -53,6 +53,11 @@ with process_group():
     for name, problem, x in (("trajectory", shooting, start), ("smoothing", smoothing, smoothing.start())):
         search = levenberg_marquardt(problem, x, max_iterations=3)
         found[name], found[name + " cost"] = search.x, torch.tensor(search.history, dtype=torch.float64)
+    assert shooting.compiled is not None and len(shooting.compiled._jobs(0)) > 1
+    for segment in (0, grid.segments - 1):  # the first process and the last one run these
+        lost = start.clone()
+        lost[shooting.places(segment)[-1]] = torch.nan
+        found[f"lost {segment}"] = torch.stack([shooting.cost(lost), shooting.normal_equations(lost)[0]])
     if is_first():
         torch.save(found, sys.argv[1])
 threads = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]  # Linux
@@ -63,7 +68,8 @@ if any("gloo" in name for name in threads):
 
 def worked(monkeypatch, out):
     """Parameters and costs of the fits, with `WORK` run by this process."""
-    # `WORK` sets both.
+    # `WORK` sets these.
+    monkeypatch.setattr(flow, "SAMPLES_PER_JOB", flow.SAMPLES_PER_JOB)
     monkeypatch.setattr(distributed, "MIN_ROWS", distributed.MIN_ROWS)
     monkeypatch.setattr(distillation, "ITERATIONS", distillation.ITERATIONS)
     monkeypatch.setattr(sys, "argv", ["work.py", str(out)])
@@ -91,11 +97,14 @@ def by_one_and_by_two(monkeypatch, tmp_path):
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this PyTorch has no torch.distributed")
 def test_two_processes_find_what_one_finds(tmp_path, monkeypatch):
-    # fails if a process's share is left out or counted twice (prior included), or processes take different decisions;
+    # fails if a process's share is left out or counted twice (prior included), a step that fails in one process is not
+    # known to the others, or processes take different decisions;
     # or if a process ends while threads of gloo still run: once, on a loaded machine, one aborted
     one, two = by_one_and_by_two(monkeypatch, tmp_path)
     assert one.keys() == two.keys()
-    assert len(one) == 8
+    assert len(one) == 10
+    print({k: v for k, v in one.items() if k.startswith("lost")})
+    assert all(bool(value.isinf().all()) for name, value in one.items() if name.startswith("lost"))
     for name, value in one.items():
         torch.testing.assert_close(two[name], value, rtol=1e-9, atol=1e-9, msg=lambda m, name=name: f"{name}: {m}")
 

@@ -219,6 +219,17 @@ def test_a_motion_that_has_no_step_costs_infinity():
     assert not bool(torch.isfinite(problem.normal_equations(x)[0]))
 
 
+@pytest.mark.parametrize("name", ["network", "joints", "held"])
+def test_a_motion_that_is_not_a_number_costs_infinity(name):
+    # fails if Newton's iteration takes a move that is NaN for one of size 0, and NaN for a solution
+    problem, x = problem_of(MODELS[name])
+    for at in problem.places(0)[problem.P :]:  # q and p of each coordinate
+        lost = x.clone()
+        lost[at] = float("nan")
+        assert problem.solve(lost) is None
+        assert float(problem.cost(lost)) == float("inf")
+
+
 def test_one_kernel_serves_every_subset_of_its_terms():
     # fails if a model of fewer terms is compiled again: a search would take seconds for each
     fewer = replace(JOINTS, features=(), coulomb=False)

@@ -11,10 +11,11 @@ enum { hz_MAX_ITERATIONS = 60 };
    would be rounding. */
 #define hz_LAST 1e-8
 
+/* The largest |x_i|; NaN if one is NaN. */
 static inline double hz_largest(const double x[hz_N]) {
   double most = 0;
   int i;
-  for (i = 0; i < hz_N; i++) most = fabs(x[i]) > most ? fabs(x[i]) : most;
+  for (i = 0; i < hz_N; i++) most = fabs(x[i]) > most || x[i] != x[i] ? fabs(x[i]) : most;
   return most;
 }
 

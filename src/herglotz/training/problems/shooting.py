@@ -25,7 +25,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.models.terms import FeatureKinetic, PositionKinetic
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.arrowhead import Arrowhead, Sums, eliminated
-from herglotz.training.distributed import everywhere, world
+from herglotz.training.distributed import everywhere
 from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
@@ -130,8 +130,8 @@ class ShootingProblem(StatesProblem):
         self.patient = True
         # Readings of the sensors at q = 0, (N, n), if `WithZeros` fits them.
         self.zeros = data.q.new_zeros(())
-        placed = kernel_of(model) if compiled and s is None and world()[1] == 1 else None
-        self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, self.n)
+        placed = kernel_of(model) if compiled and s is None else None
+        self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, self.n, divided=True)
 
     def _weigh(self) -> None:
         """Set the weights (N, n) of samples and the scales (d,) of joint defects, which follow from σ."""
