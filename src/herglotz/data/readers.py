@@ -21,7 +21,7 @@ from herglotz.data.column_roles import is_usual
 from herglotz.data.csv_columns import Names, Wanted, as_names
 from herglotz.data.csv_format import has_samples, read_csv, write_csv
 from herglotz.data.extra_formats import read_packed
-from herglotz.data.files import PathLike, read_bytes
+from herglotz.data.files import PathLike, read_bytes, refuse_weights
 from herglotz.data.gaps import complete, parted
 from herglotz.data.input_terms import input_terms_of, with_input_terms
 from herglotz.data.npz_format import read_npz, write_npz
@@ -339,6 +339,7 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
             "table in Python: fit(pandas.read_excel(...))"
         )
         refuse({spreadsheet: suffix in SPREADSHEETS})
+        refuse_weights(path)
         known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
         raise InputError(f"{path}: cannot read {suffix or 'a file without extension'}; known formats: {known}")
     # An absent or empty file, a folder or a pipe is refused here for all readers.

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from herglotz.codegen.c_compiler import build, compiler
-from herglotz.data.files import TEXT_SEAL, PathLike, check_seal, check_trusted, read_bytes, sealed_text
+from herglotz.data.files import TEXT_SEAL, PathLike, check_seal, check_trusted, read_bytes, refuse_weights, sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, c_source, described, read_metadata, runtime
 from herglotz.export.c_wrappers import header_in
@@ -50,6 +50,7 @@ def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedSteppe
     stepper has `init`, `step`, `rollout`, `linearise`, `outside_box`, `metadata`, `dof`, `dtype` and `h`. Raise
     InputError as in the reader of that format.
     """
+    refuse_weights(path)
     form = FORMATS[of_ending(Path(path).suffix) or "pt2"]
     return form.read(path, trust_code=trust_code) if form.runs_code else form.read(path)
 

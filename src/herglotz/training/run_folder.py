@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 import herglotz
-from herglotz.data.files import read_bytes, write_atomically
+from herglotz.data.files import read_bytes, refuse_weights, write_atomically
 from herglotz.data.npz_format import npz_bytes, trajectories_of
 from herglotz.errors import InputError, refuse
 from herglotz.formats import FORMATS
@@ -152,6 +152,7 @@ def load_run(folder: str | Path) -> Run:
     """
     folder = Path(folder)
     if folder.is_file():
+        refuse_weights(folder)
         raise InputError(f"{folder}: is a file, and no run; {_remedy_of_a_file(folder)}")
     if not (folder / "model.pt").is_file():
         what = "no model.pt in this folder" if folder.is_dir() else "no such folder"
@@ -192,8 +193,6 @@ def _remedy_of_a_file(path: Path) -> str:
     """What to do with a file that was given in place of the folder of a run."""
     if path.suffix.lower() in {form.ending for form in FORMATS.values()}:
         return f"a model that was exported is opened by herglotz.export.load_exported, and by herglotz verify {path}"
-    if path.suffix.lower() in (".pt", ".pth"):
-        return "torch.load reads what torch.save wrote, and net.load_state_dict takes the weights of a module"
     return f"fit data first: herglotz fit {path} --out RUN"
 
 

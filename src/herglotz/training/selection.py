@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories, as_trajectories
+from herglotz.data.anything import split_options
 from herglotz.data.units import common_unit
 from herglotz.errors import InputError, did_you_mean, refuse, tell
 from herglotz.models import LEVELS
@@ -138,7 +139,7 @@ def select(
     out: str | Path | None = None,
     progress: Progress = None,
     resume: bool = False,
-    **reading: Any,
+    **settings: Any,
 ) -> Selection:
     """Fit every level on the first part of each trajectory; score free runs over the rest.
 
@@ -163,8 +164,9 @@ def select(
         Folder for one checkpoint per fit, from which `resume` continues after an interruption.
     progress, resume
         As for `fit`.
-    **reading
-        Options of reading data other than trajectories (`herglotz.data.as_trajectories`).
+    **settings
+        Single settings of `FitConfig`, which replace those of `config` (`iterations=20`), and options of reading, as
+        for `fit`.
 
     Returns
     -------
@@ -174,9 +176,14 @@ def select(
     Raises
     ------
     InputError
-        If a level is unknown, nothing is held out, or no level has a finite held-out error.
+        If a level or a setting is unknown, nothing is held out, or no level has a finite held-out error.
     """
-    config = config or FitConfig()
+    reading, changes = split_options(settings)
+    refuse({
+        "model: select compares levels of our own models; fit(data, model=...) fits yours": "model" in changes,
+        "level: say which levels to compare, levels=['linear', 'affine']": "level" in changes,
+    })  # fmt: skip
+    config = (config or FitConfig()).changed(changes)
     check_levels(levels)
     refuse({
         f"seeds must be >= 1, got {seeds}": seeds < 1,
@@ -193,8 +200,7 @@ def select(
         folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-        settings = replace(config, level=level, seed=seed)
-        run = fit(data, settings, out=folder, progress=progress, resume=resume)
+        run = fit(data, replace(config, level=level, seed=seed), out=folder, progress=progress, resume=resume)
         done += 1
         if not silent:
             rms, left = run.metrics.get("extrapolation_rms"), (time.monotonic() - began) / done * (planned - done)

@@ -344,15 +344,29 @@ def test_a_run_of_a_module_draws_predicts_and_keeps_its_weights(fitted, tmp_path
     assert (motion.q == run.stepper.rollout(*run.states_at_end(), h=run.h, steps=5).q).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "words"), [("net.pt", "load_state_dict"), ("net.pt2", "load_exported"), ("motion.csv", "herglotz fit ")]
-)
+@pytest.mark.parametrize(("name", "words"), [("net.pt2", "load_exported"), ("motion.csv", "herglotz fit ")])
 def test_a_file_in_place_of_a_run_is_named(name, words, tmp_path, capsys):  # fails if `herglotz fit net.pt` is advised
     (tmp_path / name).touch()
     with pytest.raises(hz.InputError, match=f"is a file, and no run.*{words}"):
         hz.load_run(tmp_path / name)
     assert main(["report", str(tmp_path / name)]) == 2
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["fit {} --out run", "plot {}", "verify {}", "report {}", "predict {} {}"])
+def test_weights_are_no_recording_and_no_run(command, tmp_path, capsys, monkeypatch):
+    # fails if weights are told to be an unreadable recording, or a damaged file that herglotz wrote
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.pt").write_bytes(b"weights")
+    assert main(command.format("net.pt", "net.pt").split()) == 2
+    assert "net.pt: is a file of torch.save, and no recording, run or exported model; in Python" in _line(capsys)
+    (tmp_path / "manifest.json").touch()
+    assert main(command.format("net.pt", "net.pt").split()) == 2
+    assert "the model of a run goes by the folder of the run" in _line(capsys)
+
+
+def _line(capsys):
+    return " ".join(capsys.readouterr().err.split())
 
 
 def test_what_cannot_be_fitted_says_so():  # fails if the message names a setting that the user did not give

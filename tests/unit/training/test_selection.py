@@ -109,6 +109,10 @@ def test_forces_that_are_told_or_recorded_leave_the_forced_level():
     ({"levels": ("linear", "cubic")}, "cubic"),
     ({"seeds": 0}, "seeds must be >= 1"),
     ({"config": FitConfig(train_fraction=1.0)}, "holds nothing out"),
+    ({"train_fraction": 1.0}, "holds nothing out"),
+    ({"iteration": 3}, "unknown setting 'iteration' of a fit; did you mean iterations"),
+    ({"model": torch.nn.Linear(1, 1)}, "select compares levels of our own models"),
+    ({"level": "affine"}, "say which levels to compare"),
 ])  # fmt: skip
 def test_settings_are_checked(change, message):
     # fails if a wrong setting is found only after hours of fitting
