@@ -108,7 +108,7 @@ _WORDS = {
     "angle": "theta phi psi angle alpha beta gamma roll pitch yaw winkel angulo angolo θ φ ϕ ψ α β",
     "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle kraft drehmoment moment "
               "strom spannung couple courant tension fuerza corriente voltaje coppia corrente forza tensione grf "
-              "thrust schub",
+              "thrust schub empuje poussee spinta gas gaz",
     "torque": "torque torques tau drehmoment moment couple coppia",
     "attribute": "motor current input inputs control controls ctrl action actions stellgrosse stellgroesse "
                  "eingang eingangssignal entree entrada ingresso",

@@ -42,11 +42,17 @@ def input_terms_of(columns: Iterable[Sequence[str]]) -> tuple[str, ...]:
 def all_input_terms(data: Trajectories) -> tuple[str, ...]:
     """The squares, with and without sign, sizes and rates of all recorded inputs.
 
-    None if the recording has terms of inputs already.
+    An input of one sign is its own size. None if the recording has terms of inputs already.
     """
     if data.u is None or input_terms_of(data.columns):
         return ()
-    return tuple(form.format(name) for name, _ in data.input_labels for form in FORMS)
+    turns = ((data.u > 0).any(0) & (data.u < 0).any(0)).tolist()
+    return tuple(
+        form.format(name)
+        for (name, _), both in zip(data.input_labels, turns, strict=True)
+        for form in FORMS
+        if both or "|" not in form
+    )
 
 
 def with_input_terms(data: Trajectories, terms: Sequence[str]) -> Trajectories:

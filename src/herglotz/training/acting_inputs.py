@@ -75,8 +75,9 @@ def asked_terms(search: Search, trial: Trial, *, until_white: bool = False) -> t
     if found is None or not found.replaces(trial):
         return ()
     if any(map(saturation, taken_terms(found, every))):
-        # Both kinds look alike, and the level of either was a guess: each is tried alone, at its best level.
-        each = [_of_kind(search, kind, every, trial) for kind in SATURATIONS]
+        # Both kinds look alike, and as a square does where the input has one sign. The levels were guesses: each kind
+        # is tried alone, at its best level, and so are the terms without a level.
+        each = [_of_kind(search, kind, every, trial) for kind in (*SATURATIONS, "")]
         for of, other in each:
             if other is not None and search.better(found, other) is other:
                 every, found = of, other
@@ -111,7 +112,7 @@ def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:
     other, near = search.driven_by(terms), None
     if trial.near and (same := other.again(beside(trial, len(input_columns(terms))))) is not None:
         near = other.settled(other.finer(same))
-    if near is not None and near.at_the_noise:
+    if near is not None and near.lacks_nothing:
         return near
     fitter = other.fitter(Variant(search.order))
     return other.better(near, other.climbed(fitter, fitter.simple, {}))

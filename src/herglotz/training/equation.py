@@ -102,8 +102,9 @@ class Term:
         return replace(self, what=self.what.partition(")")[0] + ")", deviation=None).text(digits)
 
     def is_seen(self, digits: int = UNKNOWN) -> bool:
-        """Whether a digit other than 0 is printed; the wave of a function that prints none says nothing."""
-        return not self.function or any(x in "123456789" for x in self.wave(digits).split()[1].partition("e")[0])
+        """Whether a digit other than 0 is printed, of the number or of its deviation: 0e-161 says nothing."""
+        shown = self.wave(digits).split()[1] if self.function else self.size(digits)
+        return (self.value == 0 and not self.function) or any(x in "123456789" for x in shown.partition("e")[0])
 
 
 @dataclass(frozen=True, repr=False)

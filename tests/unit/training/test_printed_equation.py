@@ -408,6 +408,15 @@ def test_waves_of_which_no_digit_is_printed_are_left_out():
     assert "f2" not in text
 
 
+def test_a_number_of_which_no_digit_is_printed_is_left_out():
+    # fails if a mass that the data take to 0 is printed as "0e-161 phi′²", or if a term is left out whose deviation is
+    # printed: 0.00(3) x may be 0.03 x
+    masses = [Term("L", "phi′²", 2.8e-311, 0.0, "", 5.7e-161), Term("L", "r² phi′²", 0.49976, 2e-4, "", 7e-6)]
+    unknown = [Term("L", "x", 0.001, 0.031, "", 0.01), Term("L", "y", 0.0, None, "")]
+    text = str(Equation((*masses, *unknown), ("L",), "plain numbers", None))
+    assert text.splitlines()[0] == "L = 0.499760(±0.0002) r² phi′² + 0.00(3) x + 0 y"
+
+
 def test_the_screen_has_no_long_functions():
     # fails if a function of the plane fills the screen (250 waves: 300 lines), if a short one is left out, or if the
     # whole equation loses a wave
