@@ -50,7 +50,7 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.pruning import inverse_of
+from herglotz.training.pruning import inverse_of, of_unit_diagonal
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace, Starts, inflation_of, quantile
 
@@ -385,9 +385,9 @@ class _Linear:
             variance = variance if self.robust else rest / (self.count - float(told.sum()))
             if float((factor - 1).abs().max()) < TOLERANCE:
                 break
-        H, waves = self.A / variance + weight.diag() + fixed, self.of < F
-        size = H.diagonal().sqrt()
-        terms = torch.linalg.eigvalsh(H / size / size[:, None]).clamp_min(1e-300).log().sum() + 2 * size.log().sum()
+        H, size = of_unit_diagonal(self.A / variance + weight.diag() + fixed)
+        waves = self.of < F
+        terms = torch.linalg.eigvalsh(H).clamp_min(1e-300).log().sum() + 2 * size.log().sum()
         terms = terms - weight[waves].log().sum() + spent.sum() + rest / variance + self.count * math.log(variance)
         likelihood = -float(terms - (strength[:F].log() - strength[:F]).sum()) / 2
         return likelihood, step, weight.diag() + fixed, variance

@@ -45,13 +45,19 @@ def prune(
     return candidates[keep[candidates]], y / scale
 
 
+def of_unit_diagonal(A: Tensor) -> tuple[Tensor, Tensor]:
+    """Matrices (..., k, k) scaled to a unit diagonal, and the sizes (..., k); rows of 0 stay, with the size 1."""
+    diagonal = A.diagonal(dim1=-2, dim2=-1)
+    size = torch.where(diagonal > 0, diagonal, 1.0).sqrt()
+    return A / size[..., None] / size[..., None, :], size
+
+
 def inverse_of(A: Tensor) -> Tensor:
     """A⁻¹ of matrices (..., k, k) with possible null directions, where it is very large; a pseudo-inverse would be 0.
 
     A is scaled to a unit diagonal, so that units do not decide which directions are null.
     """
-    diagonal = A.diagonal(dim1=-2, dim2=-1)
-    size = torch.where(diagonal > 0, diagonal, 1.0).sqrt()
-    values, vectors = torch.linalg.eigh(A / size[..., None] / size[..., None, :])
+    scaled, size = of_unit_diagonal(A)
+    values, vectors = torch.linalg.eigh(scaled)
     values = values.maximum(NULL * values[..., -1:])
     return (vectors / values[..., None, :]) @ vectors.mT / size[..., None] / size[..., None, :]

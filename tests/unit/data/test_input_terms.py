@@ -59,10 +59,12 @@ def test_a_later_recording_has_the_same_terms(tmp_path):
 
 
 def test_arrays_have_terms_too(tmp_path):
-    # fails if terms need the names of a table, one is not offered, or a table that was written brings them twice
+    # fails if terms need the names of a table, one is not offered, a table that was written brings them twice, or an
+    # input of one sign has terms that are another one, or itself
     q = torch.cos(T).numpy()
-    plain = as_trajectories(q, time=T.numpy(), inputs=torch.sin(T).numpy())
-    assert sorted(all_input_terms(plain)) == ["u'", "u^2", "|u|", "|u| u"]
+    for u, more in ((torch.sin(T) - 0.5, ["|u|", "|u| u"]), (torch.sin(T), []), (-torch.sin(T), [])):
+        plain = as_trajectories(q, time=T.numpy(), inputs=u.numpy())
+        assert sorted(all_input_terms(plain)) == ["u'", "u^2", *more]
     data = as_trajectories(q, time=T.numpy(), inputs=torch.sin(T).numpy(), input_terms=["u^2"])
     assert data.input_labels == (("u", ""), ("u^2", ""))
     assert all_input_terms(data) == ()

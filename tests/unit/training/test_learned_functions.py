@@ -1,5 +1,6 @@
 """What a run has learned as functions: their gauge, and bands that hold a truth that no term of the model says."""
 
+import math
 import sys
 from dataclasses import replace
 from typing import Any
@@ -15,7 +16,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.plots import plot_learned
 from herglotz.training import Plan, ShootingProblem, fit, laplace, learned_functions
 from herglotz.training.cross_validation import FOLDS, data_rows, foretold_errors, held_out_errors
-from herglotz.training.learned_functions import FunctionPosterior, _Lines, function_posterior, mass_at
+from herglotz.training.learned_functions import FunctionPosterior, _Linear, _Lines, function_posterior, mass_at
 from herglotz.training.parameter_vector import ParameterVector
 from tests.compared import dense
 
@@ -207,3 +208,23 @@ def test_what_has_no_band_says_so(fitted):
     wide = by_kind(learned_functions(run, beyond=0.5))["force"]
     assert wide.std is None
     assert float(wide.x[-1] - wide.x[0]) == pytest.approx(2 * (force.high - force.low))
+
+
+def test_a_number_without_effect_leaves_the_strengths_alone():
+    # fails if a mass that the data took to 0, whose number moves nothing, ends the report on a spring pendulum in an
+    # internal error ("eigh failed to converge")
+    def strengths(A, of):
+        n, A = len(A), torch.tensor(A).double()
+        linear = _Linear(
+            torch.diag(A), (A > 0).double(), 1e3, 500, torch.zeros(n).double(), False,
+            torch.zeros(n).double(), torch.tensor([4.0 * (k == 0) for k in of]).double(), torch.tensor(of),
+            torch.ones(n).double(), 1,
+        )  # fmt: skip
+        return linear.likeliest(0)
+
+    likelihood, step, weight, variance = strengths([0.0, 1e6, 1e5], [1, 0, 0])
+    _, own, _, its = strengths([1e6, 1e5], [0, 0])
+    assert math.isfinite(likelihood)
+    assert variance == pytest.approx(its, rel=0.01)  # it counts as a number
+    torch.testing.assert_close(step[1:], own, rtol=0.01, atol=0)
+    assert weight[0, 0] == 0
