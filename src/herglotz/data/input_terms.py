@@ -100,7 +100,7 @@ def _unit(unit: str, form: str, time_unit: str) -> str:
     """The unit of a term of an input in this unit."""
     if saturation(form):
         return ""
-    if form == "|{0}|" or not unit:
+    if form == "|{0}|" or unit in ("", "1", "-"):
         return unit
     return f"{unit}/{time_unit}" if form == RATE else f"{unit}^2"
 

@@ -198,7 +198,8 @@ def sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str, 
                 return math.inf
             terms[place] = f"{start}{math.exp(x):.5g})"
             fit = search.driven_by(terms).again(found)
-            return math.inf if fit is None else fit.rms**2
+            # Shorter segments are missed by less at any level.
+            return math.inf if fit is None or fit.length < found.length else fit.rms**2
 
         missed(_least(missed, math.log(level), math.log(AROUND)))
     return tuple(terms)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from herglotz.data.input_terms import input_terms_of
 from herglotz.data.trajectories import GAP
 from herglotz.data.units import common_unit, size
 from herglotz.errors import InputError
@@ -183,7 +184,8 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
         terms.append(Term(x.left, x.what, value, deviation, x.unit, alone, function))
     data = run.data
     labels = (*zip(data.names, data.units, strict=True), *(data.input_labels if run.model.inputs else ()))
-    units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1")]
+    silent = {own for own in input_terms_of(data.columns) if not any(own in term.what for term in terms)}
+    units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1") and name not in silent]
     if data.degrees:
         units.append(f"{', '.join(data.degrees)} recorded in deg (1 rad = 57.3 deg)")
     units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []

@@ -116,6 +116,9 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     why, zeros, drifts, turning = {}, (), (), True
     while seen.found is not None and (reading := seen.found.reading):
         found = seen.found
+        if found.turning and data.u is not None:
+            # The inputs of the model that was found arrive as this look has found it.
+            data, why = replace(data, **seen.arrival._asdict()), seen.why | why
         data = replace(data, hold=found.hold) if found.hold else data
         data = with_input_terms(data, found.input_terms) if found.input_terms else data
         data = data if found.turning else on_a_line(data)

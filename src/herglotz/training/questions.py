@@ -109,16 +109,23 @@ class Questions:
         self._drive(terms, recorded[0], driven, found)
         tried = []
         if self.how_inputs_hold():
-            left = taken_terms(self.read.settled(self.best), terms)
+            plain = recorded[1].of(replace(recorded[1].data, hold=self.hold))
+            terms, read, settled = _at_best_levels(plain, self.read, self.read.settled(self.best), terms)
+            if terms != self.terms:
+                self._drive(terms, self.undriven, read, settled)
+            left = taken_terms(settled, terms)
             tried = [(self.hold, left)] if left != terms else []
         elif self.wanted.part.step_ratio == 1:
             left = tuple(term for term in terms if not term.endswith("'"))
             open_to = self.holds if left != terms or not found.at_the_noise else ()
             tried = [(hold, left) for hold in open_to if hold != self.read.data.hold]
         for hold, left in tried:
-            wanted, read = (x.of(replace(x.data, hold=hold)) for x in recorded)
-            read = read.driven_by(left)
-            if (found := read.run()) and self.read.better(self.best, found) is found:
+            wanted, plain = (x.of(replace(x.data, hold=hold)) for x in recorded)
+            read = plain.driven_by(left)
+            if (found := read.run()) is None:
+                continue
+            left, read, found = _at_best_levels(plain, read, found, left)
+            if self.read.better(self.best, found) is found:
                 self.hold = hold
                 self._drive(left, wanted, read, found)
         # Beside wrong forces of the inputs no zeros were clear.
@@ -174,13 +181,12 @@ class Questions:
     def _zeros_again(self, best: Trial, differ: tuple[Tensor, Tensor]) -> Trial:
         """The model with zeros fitted once more, and with the levels at which its inputs saturate beside these."""
         self.read, best, self.differ = self.wanted.zeros_again(self.read, best, differ)
-        if any(map(saturation, self.terms)):
-            plain = self.undriven.of(measured(self.undriven.data, self.differ[0].flatten().tolist()))
-            terms = sharpened(plain, best, self.terms)
-            driven = plain.driven_by(terms)
-            if (found := driven.again(best)) is not None and found.rms < best.rms:
-                self._drive(terms, self.undriven, driven, found)
-                self.read, best, self.differ = self.wanted.zeros_again(driven, found, self.differ)
+        plain = self.undriven.of(measured(self.undriven.data, self.differ[0].flatten().tolist()))
+        terms, driven, found = _at_best_levels(plain, self.read, best, self.terms)
+        if found is best:
+            return best
+        self._drive(terms, self.undriven, driven, found)
+        self.read, best, self.differ = self.wanted.zeros_again(driven, found, self.differ)
         return best
 
 
@@ -191,6 +197,24 @@ def _asked(read: Search, best: Trial) -> tuple[tuple[str, ...], Search, Trial] |
     driven = read.driven_by(terms)
     found = driven.run()
     return None if found is None or not found.replaces(best) else (terms, driven, found)
+
+
+def _at_best_levels(
+    plain: Search, driven: Search, best: Trial, terms: tuple[str, ...]
+) -> tuple[tuple[str, ...], Search, Trial]:
+    """Terms of the inputs, the search with them and its model, at the levels at which the model misses the data least.
+
+    The levels may have been found with another hold, or with other zeros of sensors. `plain` is the search without the
+    terms, `driven` that with them. All stay as they are if no levels are better.
+    """
+    if not any(map(saturation, terms)):
+        return terms, driven, best
+    sharp = sharpened(plain, best, terms)
+    other = plain.driven_by(sharp)
+    found = other.again(best)
+    if found is None or found.length < best.length or not found.rms < best.rms:
+        return terms, driven, best
+    return sharp, other, other.settled(found)
 
 
 def _may_be_better(line: Search, trial: Trial) -> bool:
