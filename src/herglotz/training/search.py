@@ -150,6 +150,14 @@ class Search:
         return trial and self.finer(trial.fitter.grow(self.finer(trial)))
 
     @cached_property
+    def simplest(self) -> Trial | None:
+        """The simplest model, about any middle, over whole trajectories; None if no path is found."""
+        fitter = self.fitter(Variant(self.order))
+        middles = {f"q{i + 1}" for i in range(self.data.dof)}.intersection(offer.name for offer in fitter.offers)
+        trial = fitter.fit(fitter.simple | middles, {}, fitter.lengths[0], None, 2 * ITERATIONS)
+        return trial and fitter.fit(trial.taken, trial.values, fitter.lengths[-1], trial, 2 * ITERATIONS)
+
+    @cached_property
     def every_term(self) -> Trial | None:
         """The model of the whole dictionary over the shortest segments."""
         return self._over_the_shortest(offer.name for offer in self.fitter(Variant(self.order)).offers)

@@ -149,14 +149,23 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
     """Drift rates (n,) of the zeros of the sensors, in units of q per time, and their standard deviations.
 
     `search` is a `herglotz.training.search.Search`. The model of the whole dictionary decides, because it lacks no
-    term for which a drift could make up. None if the model is at the noise without drifts, or not at the noise with
-    drifts.
+    term for which a drift could make up. Where its terms make up for a drift, as those of an undriven motion do, whose
+    middle moves as it decays, the simplest model decides. None if the model is at the noise without drifts, or not at
+    the noise with drifts.
     """
     if search.config.find_zeros is False:
         return None
-    without, t = search.full, since_start(search.data)
-    if without is None or not without.whole or without.at_the_noise:
-        return None
+    for of in (lambda: search.full, lambda: search.simplest):
+        without = of()
+        if without is not None and without.whole and not without.at_the_noise:
+            if (found := _drifts_beside(search, without)) is not None:
+                return found
+    return None
+
+
+def _drifts_beside(search: Any, without: Any) -> tuple[Tensor, Tensor] | None:
+    """The drifts with which the model `without` drifts is at the noise, and better by their price; else None."""
+    t = since_start(search.data)
     trial, rates, deviations = without, t.new_zeros(search.data.dof), t.new_zeros(search.data.dof)
     # Each fit moves only a part of a drift out of the terms that made up for it.
     for _ in range(DRIFT_FITS):

@@ -186,11 +186,12 @@ def search(
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
     asked, rates, why = Questions(wanted, holds), (), {}
     best = asked.best
-    drift = None if best is None or (asked.differ is None and best.at_the_noise) else drifts(wanted.part)
+    suffices = best is None or (asked.differ is None and best.at_the_noise and best.taken <= best.fitter.simple)
+    drift = None if suffices else drifts(wanted.part)
     if best is not None and drift is not None:
         found = tuple(drift[0].tolist())
         again = Questions(wanted.of(measured(data, drifts=found)), holds)
-        if again.best is not None and again.best.at_the_noise and again.best.fits_better(best, len(found)):
+        if again.best is not None and again.best.at_the_noise and _is_worth(again.best, best, len(found)):
             asked, rates, why["drifts"] = again, found, f"rates {sure(*drift)}"
     asked.how_inputs_act()
     # With positions on a line, whose inputs and sizes differ, `look` searches again.
@@ -218,6 +219,13 @@ def search(
 def _why_hold(found: str, other: str) -> str:
     """The reason of a hold that was found in the place of another."""
     return f"with hold {found} the data are missed by less, or met with fewer terms than with {other}"
+
+
+def _is_worth(drifting: Trial, best: Trial, rates: int) -> bool:
+    """True if a model with so many rates of drifts is better than one without; that of more numbers has to replace."""
+    if drifting.problem.P + rates < best.problem.P:
+        return not best.fits_better(drifting, -rates)
+    return drifting.fits_better(best, rates)
 
 
 def search_of_many(
