@@ -61,14 +61,12 @@ def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
     return float((A / size @ least_squares(A / size, y) - y).square().mean())
 
 
-def asked_terms(search: Search, trial: Trial, *, until_white: bool = False) -> tuple[str, ...]:
+def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
     """The terms of the inputs that a model takes if all are offered; () if the model is no better than the trial.
 
-    Each level counts as one more number of the model. A trial at the noise lacks no terms, and with `until_white` one
-    whose misfit is white, too.
+    Each level counts as one more number of the model. A trial at the noise whose misfit is white lacks no terms.
     """
-    enough = trial.lacks_nothing if until_white else trial.at_the_noise
-    every = () if enough or not search.config.find_input_terms else offered_terms(search.data)
+    every = () if trial.lacks_nothing or not search.config.find_input_terms else offered_terms(search.data)
     if not (every := _in_a_kernel(search, every)):
         return ()
     found = _with(search, every, trial)

@@ -192,7 +192,7 @@ class Questions:
 
 def _asked(read: Search, best: Trial) -> tuple[tuple[str, ...], Search, Trial] | None:
     """Terms by which the inputs act, the search with them, and its model if that replaces `best`; else None."""
-    if not (terms := asked_terms(read, best, until_white=read.data.dof <= 3)):
+    if not (terms := asked_terms(read, best)):
         return None
     driven = read.driven_by(terms)
     found = driven.run()

@@ -157,9 +157,9 @@ def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
         return None
     for of in (lambda: search.full, lambda: search.simplest):
         without = of()
-        if without is not None and without.whole and not without.at_the_noise:
-            if (found := _drifts_beside(search, without)) is not None:
-                return found
+        misses = without is not None and without.whole and not without.at_the_noise
+        if misses and (found := _drifts_beside(search, without)) is not None:
+            return found
     return None
 
 

@@ -257,7 +257,7 @@ def search_of_many(
         found = _pared_down(wanted)
     # A building on a shaken ground is met to about the noise without the force by the rate of the ground.
     if found is not None and data.u is not None:
-        terms = asked_terms(wanted.part, found, until_white=True)
+        terms = asked_terms(wanted.part, found)
     if terms:
         why["input_terms"] = WHY_INPUT_TERMS
         wanted = wanted.driven_by(terms)

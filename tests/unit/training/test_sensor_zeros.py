@@ -204,6 +204,21 @@ def test_a_sensor_that_drifts_is_found_out():
     assert drifts(unasked) is None
 
 
+def test_a_drift_for_which_terms_make_up_is_found_out():
+    # fails if drifts are not asked for where the whole dictionary is at the noise: |x|, |x′|, x⁴ and x⁵ of a motion
+    # that decays stand for a middle that moves, and were the law; or if a model of more numbers stays that is no better
+    t = torch.arange(0, 24, 0.03, dtype=torch.float64)
+    rate = (12 - 0.05**2) ** 0.5
+    q = 0.4 * torch.exp(-0.05 * t) * torch.cos(rate * t)
+    noise = 1e-3 * torch.randn(len(t), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    run = fit(Trajectories.of(t, q + noise + 0.5 + 4e-4 * t))
+    assert run.metrics["plan"]["drifts"] == (pytest.approx(4e-4, rel=0.1),)
+    assert set(run.metrics["plan"]["features"]) == {"q1^2", "q1"}
+    assert run.metrics["verdict"].startswith("fits to the noise")
+    (spring,) = (term.value for term in run.equation().terms if term.what == "q")
+    assert spring == pytest.approx(-12.0, rel=2e-3)
+
+
 @pytest.mark.parametrize(("noise", "better"), [(True, True), (False, True), (True, False)])
 def test_what_is_left_of_a_drift_is_added_to_it(monkeypatch, noise, better):
     # fails if a second fit replaces the rate of the first, or a drift is believed that leaves a misfit or is no better
@@ -221,7 +236,9 @@ def test_what_is_left_of_a_drift_is_added_to_it(monkeypatch, noise, better):
     data = Trajectories.of(torch.linspace(0, 3, 7, dtype=torch.float64), torch.zeros(7, dtype=torch.float64))
     again = model(noise, better)
     read = SimpleNamespace(again=lambda _: again)
-    search = SimpleNamespace(data=data, config=FitConfig(), full=model(at_the_noise=False), of=lambda _: read)
+    search = SimpleNamespace(
+        data=data, config=FitConfig(), full=model(at_the_noise=False), simplest=None, of=lambda _: read
+    )
     found = drifts(search)
     assert (found is not None) is (noise and better)
     if found is not None:
