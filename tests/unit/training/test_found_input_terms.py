@@ -157,6 +157,30 @@ def test_the_best_level_is_found_far_from_the_first_guess():
     assert len(asked) < 40
 
 
+def test_terms_without_a_level_are_tried_alone(monkeypatch):
+    # fails if a saturation, which looks like the square of an input of one sign, is never compared with it
+    every, tried = ("u^2", "sat(u/0.9)", "tanh(u/0.6)"), []
+
+    def alone(_, terms, __):
+        tried.append(terms)
+
+    monkeypatch.setattr(acting_inputs, "_with", alone)
+    search: Any = None
+    for kind in ("sat", ""):
+        acting_inputs._of_kind(search, kind, every, search)
+    assert tried == [("u^2", "sat(u/0.9)"), ("u^2",)]
+    asked = []
+    found: Any = SimpleNamespace(replaces=lambda _: True, gain=lambda *_: 1.0, lacks_nothing=False)
+    monkeypatch.setattr(acting_inputs, "_with", lambda *_: found)
+    monkeypatch.setattr(acting_inputs, "_of_kind", lambda _, kind, every, __: (asked.append(kind) or every, None))
+    monkeypatch.setattr(acting_inputs, "offered_terms", lambda _: every)
+    monkeypatch.setattr(acting_inputs, "_in_a_kernel", lambda _, terms: terms)
+    monkeypatch.setattr(acting_inputs, "taken_terms", lambda _, terms: terms[1:])
+    search = SimpleNamespace(data=None, config=FitConfig())
+    assert asked_terms(search, found) == every[1:]
+    assert asked == ["sat", "tanh", ""]
+
+
 def level_of(term):
     of = saturation(term)
     assert of is not None
@@ -168,7 +192,9 @@ def test_a_level_is_none_that_follows_shorter_segments_alone(monkeypatch):
     # of 2.5 V was taken for 3.2, and its saturation for four other terms, 13 times the noise
     def again(_):
         short = (level := level_of(search.terms[0])) > 3
-        return SimpleNamespace(length=40 if short else 999, rms=0.5 * abs(level - 2.5) + (0.01 if short else 0.1))
+        return (
+            SimpleNamespace(length=40, rms=0.01) if short else SimpleNamespace(length=999, rms=abs(level - 2.5) + 0.1)
+        )
 
     def driven_by(terms):
         search.terms = terms
