@@ -45,12 +45,21 @@ def offered_terms(data: Trajectories) -> tuple[str, ...]:
     a, row = found.a, found.triples.index + 1
     terms = []
     for j, (name, _) in enumerate(data.input_labels):
-        u, most = data.u[row, j], float(data.u[:, j].abs().max())
-        levels = [most * LOWEST ** (k / LEVELS) for k in range(1, LEVELS + 1)] if most > 0 else []
+        u, (least, most) = data.u[row, j], _range_of_levels(data.u[:, j])
+        levels = [most * (least / most) ** (k / LEVELS) for k in range(1, LEVELS + 1)] if most > 0 else []
         for kind, shape in SATURATIONS.items() if levels else ():
             left = [_left(found.columns, shape(u / level), a) for level in levels]
             terms.append(f"{kind}({name}/{levels[left.index(min(left))]:.4g})")
     return (*plain, *terms, *by_motion(data.angles, range(1, len(data.input_labels) + 1)))
+
+
+def _range_of_levels(u: Tensor) -> tuple[float, float]:
+    """The least and the largest level at which an input (N,) may saturate.
+
+    Below the smallest value of an input of one sign a saturation is a constant force.
+    """
+    size = u.abs()
+    return max(LOWEST * float(size.max()), float(size.min())), float(size.max())
 
 
 def _left(columns: Tensor, more: Tensor, a: Tensor) -> float:
@@ -189,10 +198,13 @@ def sharpened(search: Search, found: Trial, every: Sequence[str]) -> tuple[str, 
         place = terms.index(term)
         # Far above the largest input a saturation is the input itself, and far below it a sign.
         labels = [label for label, _ in search.data.input_labels]
-        most = float(search.data.u[:, labels.index(name)].abs().max()) if search.data.u is not None else 0.0
+        assert search.data.u is not None
+        least, most = _range_of_levels(search.data.u[:, labels.index(name)])
 
-        def missed(x: float, place: int = place, start: str = f"{kind}({name}/", most: float = most) -> float:
-            if not LOWEST * most <= math.exp(x) <= most / LOWEST:
+        def missed(
+            x: float, place: int = place, start: str = f"{kind}({name}/", least: float = least, most: float = most
+        ) -> float:
+            if not least <= math.exp(x) <= most / LOWEST:
                 return math.inf
             terms[place] = f"{start}{math.exp(x):.5g})"
             fit = search.driven_by(terms).again(found)

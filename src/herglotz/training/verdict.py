@@ -36,6 +36,7 @@ from herglotz.data.splits import enough, leading
 from herglotz.data.units import common_unit
 from herglotz.models import own_name
 from herglotz.stepping import Stepper, state_of
+from herglotz.training import trades
 from herglotz.training.errors_of_runs import APART, EXACT_ENOUGH, Errors
 from herglotz.training.feedback import (
     caveat_of_inputs,
@@ -186,7 +187,7 @@ def judged(
     beyond = partial(unseen_outlier, seen, everywhere)
     told = metrics | {
         "driven": train.u is not None, "level": task.config.level, "angles": _never_turned(train),
-        "columns": ways_of_columns(train), "own": own_name(model),
+        "columns": ways_of_columns(train), "own": own_name(model), "time_unit": train.time_unit,
     }  # fmt: skip
     held = partial(held_by_inputs, model, train, states, task.base.model_step)
     return {"verdict": in_words(errors, ahead, told, shown, words, caveat, beyond, held)} | kept_numbers
@@ -329,14 +330,20 @@ def in_words(
     # What is lost here is so by what is left open, which is no error of the model.
     by_chance = free > errors.lost
     fits = f"{_fits(replace(errors, free=None) if by_chance else errors)}: {errors}"
-    why = _why_by_chance(cast(Foresight, ahead)) if by_chance else ""
+    why = _why_by_chance(cast(Foresight, ahead), metrics) if by_chance else ""
     return ". ".join(filter(None, (fits, why, shown(True) if missed else caveat)))
 
 
-def _why_by_chance(ahead: Foresight) -> str:
+def _why_by_chance(ahead: Foresight, metrics: dict[str, Any]) -> str:
     if not math.isfinite(ahead.followed):
         return OF_WHAT_IS_OPEN
-    return f"{OF_WHAT_IS_OPEN}: after {ahead.followed:.3g} units of time the start alone loses it, whatever the law"
+    return f"{OF_WHAT_IS_OPEN}: after {_time(ahead.followed, metrics)} the start alone loses it, whatever the law"
+
+
+def _time(value: float, metrics: dict[str, Any]) -> str:
+    """A time with the unit of the data."""
+    unit = metrics.get("time_unit", "1")
+    return f"{value:.3g} {'units of time' if unit in ('', '1') else unit}"
 
 
 def _fits(errors: Errors) -> str:
@@ -370,10 +377,10 @@ def _unseen_motion(errors: Errors) -> str:
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any], shown: Callable[..., str]) -> str:
     """The verdict on a model that the data do not determine, with the recording that would help."""
-    over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.missed
+    over, missed = f"over the next {_time(ahead.horizon, metrics)}", errors.missed
     if not ahead.reached:
         return f"the model's own motion breaks off {over}; {errors}. {_remedy(errors, metrics, shown)}"
-    what, share = f"a force too small to be seen ({ahead.name})", ahead.hidden
+    what, share = f"a force too small to be seen ({trades.in_words(ahead.name)})", ahead.hidden
     if ahead.parameters >= ahead.hidden:
         what, share = "the uncertainty of the parameters", ahead.parameters
     changes = f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread"

@@ -99,6 +99,15 @@ def test_what_the_unseen_part_does_not_show_is_no_noise(unseen, fails):
     assert ("too far apart" in text) == fails
 
 
+@pytest.mark.parametrize(("unit", "time"), [("s", "2.71 s"), ("1", "2.71 units of time")])
+def test_what_is_left_open_is_said_in_words(unit, time):
+    # fails if the verdict names a parameter as the code does (friction.input_map[1]), or a time without its unit
+    ahead = replace(KNOWN, hidden=0.33, parameters=0.0, name="friction.input_map[1]", horizon=2.71)
+    text = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), ahead, GOOD | {"time_unit": unit})
+    assert "(the map from inputs to forces, entry 2)" in text
+    assert f"may change the motion over the next {time} by 33 % of its spread" in text
+
+
 def test_what_a_start_and_a_model_do_to_a_free_run_adds_up():
     # fails if a chaotic motion whose start explains nearly all of an error is refused: 3 × 0.03 of the start and 0.1
     # that a model may have
