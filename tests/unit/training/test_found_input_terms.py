@@ -149,6 +149,16 @@ def test_levels_of_both_saturations_are_offered():
         assert offered[kind][1:] == (pytest.approx(level, rel=0.15), "u")
 
 
+def test_a_level_lies_inside_the_range_of_an_input():
+    # fails if an input of one sign is offered a level below its smallest value: its saturation is a constant, and was
+    # the weight of a drone, tanh(throttle/0.12), which vanishes with the throttle
+    data = driven(lambda u, _: 3.0 - 0.4 * u, lambda s: sway(s) + 2.0, samples=60)
+    assert data.u is not None
+    levels = [of[1] for term in offered_terms(data) if (of := saturation(term))]
+    assert len(levels) == 2
+    assert min(levels) >= 0.999 * float(data.u.abs().min()) > 0.1 * float(data.u.abs().max())
+
+
 def test_the_best_level_is_found_far_from_the_first_guess():
     # fails if levels are tried near the guess alone, or near a wrong minimum of the first, wide parabola
     asked = []
