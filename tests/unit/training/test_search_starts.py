@@ -131,8 +131,11 @@ class Asked:
 
     def model(self, name, rms, noise=False):
         replaces = lambda _: not self.told.get("worse")  # noqa: E731
+        simple = SimpleNamespace(simple=frozenset({"cos(q1)"}))
         return SimpleNamespace(names=[name], rms=rms, whole=True, at=self.name, at_the_noise=noise, replaces=replaces,
-                               fits_better=lambda *_: not self.told.get("worse"))  # fmt: skip
+                               fits_better=lambda *_: not self.told.get("worse"), fitter=simple,
+                               taken=frozenset({name, *self.told.get("more", ())}),
+                               problem=SimpleNamespace(P=1))  # fmt: skip
 
     def of(self, data, name=None):
         assert self.data.source != DRIVEN or data.source == DRIVEN  # columns of inputs are not lost on the way
@@ -234,6 +237,7 @@ def test_drifts_stay_where_the_terms_that_are_found_without_them_meet_the_noise(
     assert rough.drifts == ()
     assert ("whole", "drifts") in seen
     assert ("whole", "drifts") not in asked()[1]  # at the noise, with no zeros
+    assert ("whole", "drifts") in asked(more=["|v1|"])[1]  # by terms that may make up for a drift
 
 
 def test_a_model_that_is_lost_on_the_way_is_not_the_end(asked):
