@@ -151,11 +151,13 @@ class Search:
 
     @cached_property
     def simplest(self) -> Trial | None:
-        """The simplest model, about any middle, over whole trajectories; None if no path is found."""
+        """The simplest model, about any middle, over whole trajectories; None if it misses the shortest segments."""
         fitter = self.fitter(Variant(self.order))
         middles = {f"q{i + 1}" for i in range(self.data.dof)}.intersection(offer.name for offer in fitter.offers)
         trial = fitter.fit(fitter.simple | middles, {}, fitter.lengths[0], None, 2 * ITERATIONS)
-        return trial and fitter.fit(trial.taken, trial.values, fitter.lengths[-1], trial, 2 * ITERATIONS)
+        if trial is None or not trial.segments_at_the_noise:
+            return None
+        return fitter.fit(trial.taken, trial.values, fitter.lengths[-1], trial, 2 * ITERATIONS)
 
     @cached_property
     def every_term(self) -> Trial | None:

@@ -145,17 +145,17 @@ def differing_zeros(
     return z, torch.where(told, deviations, beside)
 
 
-def drifts(search: Any) -> tuple[Tensor, Tensor] | None:
+def drifts(search: Any, *, met: bool = False) -> tuple[Tensor, Tensor] | None:
     """Drift rates (n,) of the zeros of the sensors, in units of q per time, and their standard deviations.
 
     `search` is a `herglotz.training.search.Search`. The model of the whole dictionary decides, because it lacks no
     term for which a drift could make up. Where its terms make up for a drift, as those of an undriven motion do, whose
     middle moves as it decays, the simplest model decides. None if the model is at the noise without drifts, or not at
-    the noise with drifts.
+    the noise with drifts. With `met`, a model without drifts is at the noise, and the simplest one alone is asked.
     """
     if search.config.find_zeros is False:
         return None
-    for of in (lambda: search.full, lambda: search.simplest):
+    for of in (lambda: None if met else search.full, lambda: search.simplest):
         without = of()
         misses = without is not None and without.whole and not without.at_the_noise
         if misses and (found := _drifts_beside(search, without)) is not None:

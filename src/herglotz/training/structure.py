@@ -186,8 +186,9 @@ def search(
     wanted = Search(data, own, replace(config, dtype="float64", device="cpu"), outliers=outliers)
     asked, rates, why = Questions(wanted, holds), (), {}
     best = asked.best
-    suffices = best is None or (asked.differ is None and best.at_the_noise and best.taken <= best.fitter.simple)
-    drift = None if suffices else drifts(wanted.part)
+    met = best is not None and asked.differ is None and best.at_the_noise
+    suffices = best is None or (met and best.taken <= best.fitter.simple)
+    drift = None if suffices else drifts(wanted.part, met=met)
     if best is not None and drift is not None:
         found = tuple(drift[0].tolist())
         again = Questions(wanted.of(measured(data, drifts=found)), holds)

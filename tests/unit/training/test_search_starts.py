@@ -205,7 +205,7 @@ def asked(monkeypatch):
         monkeypatch.setattr(questions, "with_functions", lambda search, best: search.with_functions(best))
         monkeypatch.setattr(questions.Questions, "better_on_a_line", lambda own: own.read.answer("line", False))
         monkeypatch.setattr(questions, "asked_terms", lambda search, best: search.input_terms(best))
-        monkeypatch.setattr(module, "drifts", lambda search: search.answer("drifts"))
+        monkeypatch.setattr(module, "drifts", lambda search, **_: search.answer("drifts"))
         return search(data, base, config, outliers=False, holds=["first", "smooth"]), seen
 
     return ask
