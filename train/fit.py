@@ -45,10 +45,10 @@ def main() -> int:
             out.mkdir(parents=True, exist_ok=True)
             run = fit(experiment.data(), replace(experiment.fit, **settings), out=out, resume=arguments.resume)
             first = is_first()
+        return _report(run, out) if first else 0
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return _report(run, out) if first else 0
 
 
 def _report(run: Run, out: Path) -> int:

@@ -207,12 +207,16 @@ def check_seal(content: bytes, path: PathLike, remedy: str = "export the model a
         raise InputError(f"{path}: its sha256 is not the one it was written with: it was damaged or changed; {remedy}")
 
 
+# The file that a folder of a run has beside model.pt.
+MANIFEST = "manifest.json"
+
+
 def refuse_weights(path: PathLike) -> None:
     """Raise InputError if a file is of the kind that `torch.save` writes: no recording, run or exported model is."""
     path = Path(path)
     if path.suffix.lower() in (".pt", ".pth"):
         remedy = "in Python, net.load_state_dict takes weights, and fit(data, model=net) gives a run to plot and verify"
-        if (path.parent / "manifest.json").is_file():
+        if (path.parent / MANIFEST).is_file():
             remedy = f"the model of a run goes by the folder of the run, {path.parent}"
         raise InputError(f"{path}: is a file of torch.save, and no recording, run or exported model; {remedy}")
 

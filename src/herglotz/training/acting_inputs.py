@@ -82,8 +82,8 @@ def asked_terms(search: Search, trial: Trial) -> tuple[str, ...]:
     if found is None or not found.replaces(trial):
         return ()
     if any(map(saturation, taken_terms(found, every))):
-        # Both kinds look alike, and as a square does where the input has one sign. The levels were guesses: each kind
-        # is tried alone, at its best level, and so are the terms without a level.
+        # Saturations of both kinds look alike, and like a square if an input has one sign. The levels were guesses:
+        # each kind is tried alone, at its best level, and so are the terms without a level.
         each = [_of_kind(search, kind, every, trial) for kind in (*SATURATIONS, "")]
         for of, other in each:
             if other is not None and search.better(found, other) is other:
@@ -113,7 +113,7 @@ def _numbers(search: Search, terms: Sequence[str]) -> int:
 def _with(search: Search, terms: Sequence[str], trial: Trial) -> Trial | None:
     """A model with these terms of the inputs among its offers.
 
-    The terms join a trial that is near the data. Where that is not at the noise, they also join the simplest model over
+    The terms join a trial that is near the data. Where that lacks something, they also join the simplest model over
     ever longer segments: a motion that is sensitive to its forces tells of them over short segments alone.
     """
     other, near = search.driven_by(terms), None

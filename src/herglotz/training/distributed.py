@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import importlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 
@@ -73,22 +73,11 @@ class LaneSums:
 
 def add_over_processes(*tensors: Tensor) -> None:
     """Sum each tensor over the processes, in place, with bit-equal results everywhere; one message holds them all."""
-    _summed(tensors, of_first=True)
-
-
-def gather_from_processes(*tensors: Tensor) -> None:
-    """Fill tensors whose entries are 0 in every process but one; one message holds them all."""
-    _summed(tensors, of_first=False)
-
-
-def _summed(tensors: Sequence[Tensor], *, of_first: bool) -> None:
-    """Sum each tensor over the processes, in place; `of_first`: with the last bits of the first process."""
     if world()[1] == 1:
         return
     whole = torch.cat([x.flatten() for x in tensors])
     dist.all_reduce(whole)
-    if of_first:
-        dist.broadcast(whole, 0)
+    dist.broadcast(whole, 0)
     for x, part in zip(tensors, whole.split([x.numel() for x in tensors]), strict=True):
         x.copy_(part.view_as(x))
 

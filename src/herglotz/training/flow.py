@@ -13,7 +13,7 @@ from torch import Tensor
 
 from herglotz.models import ContactLagrangian
 from herglotz.training.arrowhead import Sums
-from herglotz.training.distributed import add_over_processes, gather_from_processes, processors, world
+from herglotz.training.distributed import add_over_processes, processors, world
 from herglotz.training.kernel import Placed, kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
@@ -132,9 +132,7 @@ class CompiledFlow:
             if failed:
                 break
         if self.processes > 1:
-            add_over_processes(failed, *(() if sums is None else (sums.corner, sums.by_theta)))
-            own = () if sums is None else (sums.border, sums.blocks, sums.by_state, sums.slopes)
-            gather_from_processes(states, *own, *(() if rows is None else (rows,)))
+            add_over_processes(failed, states, *(sums or ()), *(() if rows is None else (rows,)))
         return None if failed else states
 
     @staticmethod

@@ -107,19 +107,7 @@ class Questions:
                 self.differ, self.hold = None, ""
         terms, driven, found = asked
         self._drive(terms, recorded[0], driven, found)
-        tried = []
-        if self.how_inputs_hold():
-            plain = recorded[1].of(replace(recorded[1].data, hold=self.hold))
-            terms, read, settled = _at_best_levels(plain, self.read, self.read.settled(self.best), terms)
-            if terms != self.terms:
-                self._drive(terms, self.undriven, read, settled)
-            left = taken_terms(settled, terms)
-            tried = [(self.hold, left)] if left != terms else []
-        elif self.wanted.part.step_ratio == 1:
-            left = tuple(term for term in terms if not term.endswith("'"))
-            open_to = self.holds if left != terms or not found.at_the_noise else ()
-            tried = [(hold, left) for hold in open_to if hold != self.read.data.hold]
-        for hold, left in tried:
+        for hold, left in self._fewer_terms(found, recorded[1]):
             wanted, plain = (x.of(replace(x.data, hold=hold)) for x in recorded)
             read = plain.driven_by(left)
             if (found := read.run()) is None:
@@ -131,6 +119,26 @@ class Questions:
         # Beside wrong forces of the inputs no zeros were clear.
         if self.differ is None and self.zeros():
             self.best = self.read.better(self.best, self.read.run())
+
+    def _fewer_terms(self, found: Trial, recorded: Search) -> list[tuple[str, tuple[str, ...]]]:
+        """Holds, each with the terms of the inputs that may be left with that hold; none if all terms stay.
+
+        `recorded` is the search of the part without the terms. If another hold is found, the levels at which inputs
+        saturate are sharpened for that hold first.
+        """
+        assert self.best is not None
+        if self.how_inputs_hold():
+            plain = recorded.of(replace(recorded.data, hold=self.hold))
+            terms, read, settled = _at_best_levels(plain, self.read, self.read.settled(self.best), self.terms)
+            if terms != self.terms:
+                self._drive(terms, self.undriven, read, settled)
+            left = taken_terms(settled, terms)
+            return [(self.hold, left)] if left != terms else []
+        if self.wanted.part.step_ratio > 1:
+            return []
+        left = tuple(term for term in self.terms if not term.endswith("'"))
+        open_to = self.holds if left != self.terms or not found.at_the_noise else ()
+        return [(hold, left) for hold in open_to if hold != self.read.data.hold]
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
         """Keep these terms of the inputs, the search of the part that has them, and its model."""

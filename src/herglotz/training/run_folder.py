@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 import herglotz
-from herglotz.data.files import read_bytes, refuse_weights, write_atomically
+from herglotz.data.files import MANIFEST, read_bytes, refuse_weights, write_atomically
 from herglotz.data.npz_format import npz_bytes, trajectories_of
 from herglotz.errors import InputError, refuse
 from herglotz.formats import FORMATS
@@ -31,7 +31,6 @@ from herglotz.training.run import Run
 # Version of the folder's format; a change that older versions cannot read increments it.
 FORMAT = 1
 FILES = ("model.pt", "config.json", "metrics.json", "fit.npz")
-MANIFEST = "manifest.json"
 # Costs for the reader of the folder; the package does not read this file.
 LOG = "history.csv"
 REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"

@@ -155,8 +155,8 @@ def drifts(search: Any, *, met: bool = False) -> tuple[Tensor, Tensor] | None:
     """
     if search.config.find_zeros is False:
         return None
-    for of in (lambda: None if met else search.full, lambda: search.simplest):
-        without = of()
+    for name in ("simplest",) if met else ("full", "simplest"):
+        without = getattr(search, name)
         misses = without is not None and without.whole and not without.at_the_noise
         if misses and (found := _drifts_beside(search, without)) is not None:
             return found

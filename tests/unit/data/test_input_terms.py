@@ -1,6 +1,7 @@
 """Inputs that act by their square, their size or their rate: columns of u that follow from recorded ones."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -56,6 +57,13 @@ def test_a_later_recording_has_the_same_terms(tmp_path):
     assert other.u is not None
     assert torch.allclose(other.u[:, 1], other.u[:, 0] ** 2)
     assert load(recording(tmp_path), like=first, input_terms=(), show=False).u.shape[1] == 1  # pyright: ignore
+
+
+@pytest.mark.parametrize(("unit", "squared"), [("V", "V^2"), ("-", "-"), ("1", "1"), ("", "")])
+def test_the_square_of_a_plain_number_has_no_unit(unit, squared):  # fails if it is "-^2"
+    plain = Trajectories.of(T, torch.cos(T), u=torch.sin(T))
+    named = replace(plain, columns=(("t", "time", "s"), ("q", "coordinate", "m"), ("u", "input", unit)))
+    assert dict(with_input_terms(named, ["u^2"]).input_labels) == {"u": unit, "u^2": squared}
 
 
 def test_arrays_have_terms_too(tmp_path):

@@ -245,6 +245,18 @@ def test_what_is_left_of_a_drift_is_added_to_it(monkeypatch, noise, better):
         assert found[0].tolist() == [pytest.approx(0.3)]  # (0.6 + 0.3) in three units of time
 
 
+def test_the_whole_dictionary_is_not_fitted_where_the_noise_is_met():
+    # fails if a fit of every term is made for a model that is at the noise: three seconds of a Kepler motion
+    class Met:
+        config, simplest = FitConfig(), None
+
+        @property
+        def full(self):
+            pytest.fail("fitted")
+
+    assert drifts(Met(), met=True) is None
+
+
 def test_readings_that_do_not_drift_are_left_alone(monkeypatch):
     # fails if every misfit of recordings is a drift, or drifts are asked for where the terms meet the noise: a cyclic
     # coordinate with friction takes one (a Furuta pendulum, 2.2 times the reference error instead of 0.98)
