@@ -191,7 +191,7 @@ def test_a_fit_is_told_how_long_segments_the_search_followed(duffing, monkeypatc
     asked.wanted.config = asked.wanted.part = search.config
     asked.how_inputs_act = asked.functions = asked.all_data = lambda: None
     monkeypatch.setattr(structure, "Questions", lambda *_: asked)
-    monkeypatch.setattr(structure, "drifts", lambda _: None)
+    monkeypatch.setattr(structure, "drifts", lambda *_, **__: None)
     said = structure.search(search.data, search.base, search.config, outliers=False)
     assert said.length == found.length == fitter.lengths[0]
 
