@@ -72,6 +72,9 @@ def rows(count: int = COUNT) -> list[Row]:
         Row("simulated/outliers", "simulated:outliers", (0,)),
         Row("simulated/disturbed", "simulated:disturbed", (0,)),
         Row("simulated/twenty", "simulated:twenty"),
+        Row("simulated/drive", "simulated:drive", (1.0, 0)),
+        Row("simulated/drive with a gear", "simulated:drive", (0.2, 0)),
+        Row("simulated/spring pendulum in mm", "simulated:spring_pendulum", (0,)),
     ]
     found += [
         Row(f"law {k} {word}", "drawn:law", (k, noise))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from benchmarks.harness import there
 from benchmarks.judging.job import Job, Trial
@@ -171,6 +172,71 @@ def selected(folder: Path) -> Job:
     """`herglotz select` of 400 samples with 1 % of noise."""
     data = simulate(scene("damped_pendulum"), trajectories=4, steps=99, h=0.1, noise=NOISE, seed=0)
     return replace(_job(folder, data, _unseen(0, 100, 0.1), NOISE), command="select", flags=())
+
+
+def drive_motion(ratio: float, u: Tensor, h: float) -> Tensor:
+    """Positions (N, 2) in rad of a motor and of its load, from rest, under a torque (N,) that is held over each step.
+
+    J₁ φ₁″ = g u − b₁ φ₁′ − ρ F and J₂ φ₂″ = F − b₂ φ₂′, with F = k (ρ φ₁ − φ₂) + d (ρ φ₁′ − φ₂′) and the ratio ρ of the
+    gear, by the exponential of the matrix of this linear motion.
+    """
+    J, k, d, b, g = (1.0, 4.0 / ratio**2), 15_000.0 / ratio**2, 10.0 / ratio**2, (2.0, 1.5 / ratio**2), 500.0
+    spring = torch.tensor([[-ratio * ratio, ratio], [ratio, -1.0]], dtype=torch.float64)
+    A = torch.zeros(5, 5, dtype=torch.float64)
+    A[0, 2] = A[1, 3] = 1.0
+    A[2:4, :2], A[2:4, 2:4], A[2, 4] = k * spring, d * spring - torch.diag(torch.tensor(b).double()), g
+    A[2:4] /= torch.tensor(J).double()[:, None]
+    step, x, path = torch.linalg.matrix_exp(h * A)[:4], torch.zeros(4, dtype=torch.float64), []
+    for torque in u:
+        path.append(x[:2])
+        x = step @ torch.cat([x, torque[None]])
+    return torch.stack(path)
+
+
+def drive(folder: Path, ratio: float, seed: int) -> Job:
+    """A motor and a load with encoders, 20 s at 1 kHz under a torque that jumps; two other torques are predicted."""
+    h, lines, made = 1e-3, (0.0005, 0.0005 * ratio), []
+    make = torch.Generator().manual_seed(seed)
+    for samples in (20_000, 3000, 3000):
+        levels = 4 * torch.rand(samples // 20, generator=make, dtype=torch.float64) - 2
+        held = torch.randint(20, 300, (samples // 20,), generator=make)
+        u = levels.repeat_interleave(held)[:samples]
+        t = h * torch.arange(samples, dtype=torch.float64)
+        named = {"names": ("motor", "load"), "units": ("rad", "rad"), "angles": (True, True)}
+        made.append(Trajectories.of(t, drive_motion(ratio, u, h), u=u, **named))
+    line = torch.tensor(lines, dtype=torch.float64)
+    train, *tests = made
+    job = _job(folder, replace(train, q=(train.q / line).round() * line), Trajectories.cat(tests))
+    # The error of an encoder is even over a line.
+    return replace(job, flags=(), scale=(line / 12**0.5).tolist())
+
+
+def spring_pendulum(folder: Path, seed: int) -> Job:
+    """A weight on a spring that swings, its length in mm, with 0.5 mm and 0.003 rad of noise: three recordings."""
+    from benchmarks.peers.rollouts import rk4
+
+    h, parts, g, k, rest, braked = 0.02, 20, 9.81, 40.0, 0.6, (0.15, 0.1)
+
+    def motion(x: Tensor) -> Tensor:  # (B, 4) r in m, φ, and their rates
+        r, phi, v, w = x.unbind(1)
+        a = r * w * w + g * phi.cos() - k * (r - rest) - braked[0] * v
+        return torch.stack([v, w, a, (-2 * v * w - g * phi.sin()) / r - braked[1] * w / r**2], 1)
+
+    make, made = torch.Generator().manual_seed(seed), []
+    for count, samples in ((3, 500), (10, 150)):
+        start = torch.rand(count, 2, generator=make, dtype=torch.float64) * torch.tensor([0.3, 1.6])
+        x = torch.cat([start + torch.tensor([0.7, -0.8]), torch.zeros(count, 2, dtype=torch.float64)], 1)
+        path = []
+        for _ in range(samples):
+            path.append(x[:, :2] * torch.tensor([1000.0, 1.0], dtype=torch.float64))
+            x = rk4(motion, x, h, parts)
+        t = (h * torch.arange(samples, dtype=torch.float64)).repeat(count)
+        named = {"names": ("r", "phi"), "units": ("mm", "rad"), "angles": (False, True)}
+        made.append(Trajectories.of(t, torch.stack(path, 1).reshape(-1, 2), (samples,) * count, **named))
+    train, test = made
+    noise = torch.tensor([0.5, 0.003], dtype=torch.float64)
+    noisy = train.q + noise * torch.randn(train.q.shape, generator=make, dtype=torch.float64)
+    return replace(_job(folder, replace(train, q=noisy), test), flags=(), scale=noise.tolist())
 
 
 def twenty(folder: Path) -> Job:

@@ -143,6 +143,6 @@ def test_of_many_short_recordings_some_are_searched():
     # error was raised, and 4000 recordings of 100 samples are 400 000 samples
     t = torch.arange(67, dtype=torch.float64).repeat(4000)
     noise = 1e-3 * torch.randn(len(t), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    part = part_of(Trajectories.of(t, (0.05 * t).sin() + noise, (67,) * 4000), 2000)
+    part = part_of(Trajectories.of(t, (0.05 * t).sin() + noise, (67,) * 4000), 2000)[0]
     assert min(part.lengths) >= 9
     assert 1000 < part.samples < 4000

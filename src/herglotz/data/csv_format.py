@@ -1,7 +1,7 @@
 """Trajectories as comma-separated text, `trajectory,t[s],q[rad],...`, also as spreadsheets and loggers write such text.
 
 The tables of spreadsheets, loggers and `numpy.savetxt` have other separators, decimal commas, or a header behind #:
-their rows are first written with commas between columns and with decimal points.
+their rows are first written with commas between columns, with decimal points, and with exponents behind E.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ LABVIEW, LABVIEW_TIME = "***End_of_Header***", "X_Value"
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
 # 1,250 is 1250 or 1.25; 0,250 is 0.25 alone.
 THOUSANDS_OR_DECIMALS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+# 1.5D+00, as Fortran writes numbers of double precision.
+DOUBLE = re.compile(r"(\d[.,]\d*|[.,]\d+)[dD](?=[+-]\d{2,3}(?!\w))")
 # Rows of the file, from 1: their text, and their cells.
 Lines = list[tuple[int, str]]
 Rows = list[tuple[int, Sequence[str]]]
@@ -72,7 +74,7 @@ def table_of(path: Path, lines: Sequence[str]) -> tuple[Rows, tuple[str, ...]]:
     numbers alone, with as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points
     in others, or commas that may separate thousands.
     """
-    written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
+    written = [(i, DOUBLE.sub(r"\1E", line)) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
     written, preamble = _without_preamble(path, written)
     lines_of, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
     lines_of, above = _without_titles(lines_of)
@@ -238,6 +240,7 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     `herglotz.data.csv_columns.Wanted`.
 
     **Text.** UTF-8. Commas, semicolons, tabs or spaces separate columns; unless commas do, decimals may have a comma.
+    Exponents may stand behind D, as Fortran writes them.
     The header's cells are `name`, `name[unit]`, `name (unit)`, or with a known unit `name(unit)`, `name/unit`,
     `name in unit`, `name_unit` as in `tip_um`, `speed_rpm`, `v_m_s`, or `angleDeg` (`herglotz.data.column_roles` says
     where the end of a name is an index). The header may stand behind #, as `numpy.savetxt` writes headers, and units

@@ -91,6 +91,19 @@ class InputPieces:
         left = times[row] + part * parts * width[:, 0]
         return cls(times, begins, last, left, width, value, slope / width, leads, constant)
 
+    def means(self, row: Tensor, begin: Tensor, width: Tensor) -> Tensor:
+        """Mean inputs (…, m) over the times from `begin` to `begin + width` after the samples `row`, all (…)."""
+        each = self.width * (self.value + self.width * self.slope / 2)
+        before = each.cumsum(0) - each
+
+        def impulse(t: Tensor) -> Tensor:
+            at = (torch.searchsorted(self.left, t, right=True) - 1).clamp_min(0)
+            x = (t - self.left[at])[..., None]
+            return before[at] + x * (self.value[at] + x * self.slope[at] / 2)
+
+        start = self.times[row] + begin
+        return (impulse(start + width) - impulse(start)) / width[..., None]
+
     def acting(self, delay: float, lag: float) -> Tensor:
         """The acting inputs, (N, m): means over the steps if the hold is "zero", else values at the samples."""
         lag = max(lag, torch.finfo(self.left.dtype).tiny)

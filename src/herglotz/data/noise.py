@@ -6,6 +6,8 @@ Gross errors are samples that no smooth motion explains, and readings of a senso
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import cast
 from weakref import WeakKeyDictionary
 
 import torch
@@ -134,19 +136,26 @@ def precisions(data: Trajectories) -> Tensor:
     return _residuals(data, DEGREES).amin(0)
 
 
-def part_of(data: Trajectories, most: int) -> Trajectories:
-    """About `most` samples: every second, fourth … sample as long as polynomials follow the motion between them.
+def part_of(data: Trajectories, most: int) -> tuple[Trajectories, Tensor]:
+    """About `most` samples, and their rows in the data: every second, fourth … sample as long as polynomials follow.
 
     The result is cut to the runs of samples that move most. Data with no more than `most` samples stay unchanged.
     Samples that lack positions are left out first: every m-th row may miss all rows of a slower sensor.
     """
-    few = data if data.samples < 2 * most else complete(data)
+    every = torch.arange(data.samples, device=data.t.device)
+    # The numbers of the rows take the place of s, which goes with its sample.
+    numbered = replace(data, s=every.to(data.t))
+    few = numbered if data.samples < 2 * most else complete(numbered)
     # Of many short recordings a few say more than some samples of each.
     least = 2 * max(most / len(data), SAMPLES)
     while few.samples >= 2 * most and min(few.lengths) >= least and not coarse(half := few.thinned(2)):
         few = half
     liveliest = few.liveliest(most)
-    return liveliest if liveliest.samples < few.samples / 2 else few
+    few = liveliest if liveliest.samples < few.samples / 2 else few
+    if few is numbered:
+        return data, every
+    rows = cast(Tensor, few.s).long()
+    return replace(few, s=None if data.s is None else data.s[rows]), rows
 
 
 # A sample is compared with the polynomial of degree 3 through four neighbours on either side.

@@ -43,21 +43,32 @@ def coupled_pairs(data: Trajectories) -> list[tuple[int, int]] | None:
 
 
 def proportions(data: Trajectories) -> dict[tuple[int, int], str]:
-    """The ratio ρ of coordinates i < j, counted from 1, of different units between which a force of ρ q_i − q_j acts.
+    """The ratio ρ of coordinates i < j, counted from 1, between which a force of ρ q_i − q_j acts.
 
-    A difference of coordinates of different units says nothing before one of them is multiplied by a ratio: of a belt,
-    the radius of its pulley. −a_i / a_j of the regression that leaves the smaller share of its acceleration is ρ. None
-    of angles, whose waves repeat.
+    Asked of coordinates of different units, whose difference says nothing before one of them is multiplied by a ratio:
+    of a belt, the radius of its pulley; and of shafts that turn once at least: no spring holds them to the frame, and a
+    gear may join them. −a_i / a_j of the regression that leaves the smaller share of its acceleration
+    is ρ. None of angles, whose waves repeat, and of shafts that turn together.
     """
-    if len(set(data.units)) == 1 or any(data.angles) or (rows := _regressions(data, dampers=True)) is None:
+    pairs, shafts = list(combinations(range(data.dof), 2)), _shafts(data)
+    asked = [(i, j) for i, j in pairs if data.units[i] != data.units[j] or (shafts[i] and shafts[j])]
+    if not asked or any(data.angles) or (rows := _regressions(data, dampers=True)) is None:
         return {}
     found = {}
-    for i, j in combinations(range(data.dof), 2):
+    for i, j in asked:
         own = [row for k, other in ((i, j), (j, i)) if other in (row := rows[k]).kept and float(row.x[i])]
         best = min(own, key=lambda row: row.left, default=None)
-        if best is not None and data.units[i] != data.units[j] and float(best.x[j]):
-            found[i + 1, j + 1] = _number(-float(best.x[i] / best.x[j]), 7)
+        if best is not None and float(best.x[j]):
+            ratio = -float(best.x[i] / best.x[j])
+            if data.units[i] != data.units[j] or _number(ratio, 3) != "1.":
+                found[i + 1, j + 1] = _number(ratio, 7)
     return found
+
+
+def _shafts(data: Trajectories) -> list[bool]:
+    """Whether each coordinate is measured in rad and goes through 2π or more."""
+    ranges = (data.q.amax(0) - data.q.amin(0)).tolist()
+    return [unit == "rad" and x >= 2 * math.pi for unit, x in zip(data.units, ranges, strict=True)]
 
 
 def sizes(data: Trajectories) -> dict[tuple[int, int], str]:

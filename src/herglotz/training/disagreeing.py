@@ -25,6 +25,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.noise import AT_THE_NOISE, TAIL, precision, relative_spread
+from herglotz.data.sensors import measured
 from herglotz.data.splits import cuts_of, held_out_whole, leading
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import differences, estimate_baseline
@@ -150,15 +151,25 @@ def _least_alike(seen: Look) -> int:
 def _bends(seen: Look, recording: int) -> bool:
     """Whether the model misses the data by more than the noise of the other recordings, and whether the whole
     dictionary follows these to it.
+
+    The dictionary has to follow the readings as they are, or less the zeros that were found: a bent model has zeros
+    that no sensor has.
     """
     others = seen.kept.select(_but(seen, recording)).to(torch.float64, "cpu")
     if _agree(seen, precision(others)):
         return False
-    base = estimate_baseline(others)
-    if others.dof > MOST:
-        search = search_between_coupled(others, base, seen.settings, outliers=False)
+    as_recorded = measured(seen.kept, [-zero for zero in seen.zeros]).select(_but(seen, recording))
+    readings = [as_recorded.to(torch.float64, "cpu"), *([others] if seen.zeros else [])]
+    return any(_met_by_the_dictionary(seen, own) for own in readings)
+
+
+def _met_by_the_dictionary(seen: Look, data: Trajectories) -> bool:
+    """Whether the whole dictionary follows these recordings to their noise."""
+    base = estimate_baseline(data)
+    if data.dof > MOST:
+        search = search_between_coupled(data, base, seen.settings, outliers=False)
     else:
-        search = Search(others, base, replace(seen.settings, features=(), dtype="float64", device="cpu"))
+        search = Search(data, base, replace(seen.settings, features=(), dtype="float64", device="cpu"))
     full = None if isinstance(search, str) else search.part.full
     return full is not None and full.at_the_noise
 

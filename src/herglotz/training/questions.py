@@ -11,7 +11,6 @@ Of a long recording a part answers these questions, and `all_data` fits the answ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from torch import Tensor
 
@@ -20,8 +19,10 @@ from herglotz.data.sensors import measured
 from herglotz.models.drag import input_columns
 from herglotz.training.acting_inputs import asked_terms, sharpened, taken_terms
 from herglotz.training.dictionary import WEIGHTS
+from herglotz.training.friction_search import with_sticking
 from herglotz.training.function_search import with_functions
 from herglotz.training.search import Search
+from herglotz.training.sensor_zeros import differ_between
 from herglotz.training.trials import Trial, Variant
 
 
@@ -37,7 +38,7 @@ class Questions:
 
     def __init__(self, wanted: Search, holds: Sequence[str]):
         # The hold of the data is among the candidates, because it is tried again after another hold was found.
-        self.unread, self.wanted, self.holds = wanted, wanted, (*holds, *([wanted.data.hold] if holds else []))
+        self.unread, self.wanted, self.holds = wanted, wanted, (*holds, *([wanted.hold] if holds else []))
         self.hold, self.terms, self.input_terms, self.undriven = "", (), (), wanted
         self.read: Search = wanted.part
         self.best: Trial | None = None
@@ -59,6 +60,18 @@ class Questions:
             self.best = self.read.better(self.best, self.read.run())
         if not asked and self.how_inputs_hold():
             self.best = self.read.better(self.best, self.read.run())
+        self._rather_as_recorded()
+
+    def _rather_as_recorded(self) -> None:
+        """Take the readings as they are, if all recordings have the same zeros and a model without is no worse.
+
+        One zero of all is the middle of a force. About it other terms of the dictionary may be many.
+        """
+        if self.best is None or self.differ is None or differ_between(*self.differ):
+            return
+        plain = self.unread.part.run()
+        if plain is not None and self.best.gain(plain, int((self.differ[1] > 0).sum())) <= 0:
+            self.read, self.best, self.differ = self.unread.part, plain, None
 
     def zeros(self) -> bool:
         """Find zeros of sensors that differ between recordings; True if the model is better with them."""
@@ -75,16 +88,13 @@ class Questions:
         return flexible is not None and flexible.foretells(best)
 
     def how_inputs_hold(self, *, by_residuals: bool = False) -> bool:
-        """Find another hold of the inputs (`Search.better_hold`); True if the model is better with it.
-
-        A part with longer steps has means of the inputs, which say little of a hold over one step.
-        """
-        if self.best is None or self.wanted.part.step_ratio > 1:
+        """Find another hold of the inputs (`Search.better_hold`); True if the model is better with it."""
+        if self.best is None:
             return False
         if not (hold := self.read.better_hold(self.best, self.holds, by_residuals=by_residuals)):
             return False
         each = self.wanted, self.read, self.undriven
-        self.wanted, self.read, self.undriven = (x.of(replace(x.data, hold=hold)) for x in each)
+        self.wanted, self.read, self.undriven = (x.held(hold) for x in each)
         self.hold, self.best = hold, self.read.again(self.best)
         return True
 
@@ -108,7 +118,7 @@ class Questions:
         terms, driven, found = asked
         self._drive(terms, recorded[0], driven, found)
         for hold, left in self._fewer_terms(found, recorded[1]):
-            wanted, plain = (x.of(replace(x.data, hold=hold)) for x in recorded)
+            wanted, plain = (x.held(hold) for x in recorded)
             read = plain.driven_by(left)
             if (found := read.run()) is None:
                 continue
@@ -128,17 +138,15 @@ class Questions:
         """
         assert self.best is not None
         if self.how_inputs_hold():
-            plain = recorded.of(replace(recorded.data, hold=self.hold))
+            plain = recorded.held(self.hold)
             terms, read, settled = _at_best_levels(plain, self.read, self.read.settled(self.best), self.terms)
             if terms != self.terms:
                 self._drive(terms, self.undriven, read, settled)
             left = taken_terms(settled, terms)
             return [(self.hold, left)] if left != terms else []
-        if self.wanted.part.step_ratio > 1:
-            return []
         left = tuple(term for term in self.terms if not term.endswith("'"))
         open_to = self.holds if left != self.terms or not found.at_the_noise else ()
-        return [(hold, left) for hold in open_to if hold != self.read.data.hold]
+        return [(hold, left) for hold in open_to if hold != self.read.hold]
 
     def _drive(self, terms: Sequence[str], wanted: Search, read: Search, found: Trial) -> None:
         """Keep these terms of the inputs, the search of the part that has them, and its model."""
@@ -170,18 +178,15 @@ class Questions:
         self.best = self.best and with_functions(self.read, self.best)
 
     def all_data(self) -> None:
-        """Fit the model of a part to all data, and ask these for zeros, more terms and, if not yet asked, the hold."""
+        """Fit the model of a part to all data, and ask these for zeros and more terms."""
         if self.wanted.part is self.wanted:
             if self.best is not None and self.differ is not None:
                 found = self._zeros_again(self.best, self.differ)
                 self.best = found if found is self.best else self.read.settled(found)
             return
-        longer, first = self.wanted.part.step_ratio > 1, self.read.first
+        first = self.read.first
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
-        if longer and self.best is not None and (hold := self.read.better_hold(self.best, self.holds)):
-            self.hold, self.wanted = hold, self.wanted.of(replace(self.wanted.data, hold=hold))
-            self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
-        # Means of inputs over longer steps are not what acted: of a part many terms may make up for the difference.
+        # What held-out time of a part asks for, that of all samples may not ask for.
         if first is not None and not (self.best and self.best.at_the_noise):
             other = self.read.again(first)
             self.best = self.read.better(self.best, other and self.read.settled(other))
@@ -233,8 +238,11 @@ def _may_be_better(line: Search, trial: Trial) -> bool:
     # has the same name for an angle.
     if trial.lacks_nothing and (len(turning) <= (line.data.dof == 1) or not line.meets_segments):
         return False
-    # The first model on a line must be no worse.
-    return not trial.whole or (line.first is not None and not trial.replaces(line.first))
+    # The first model on a line must be no worse, with dry friction of the same kind.
+    if not trial.whole or line.first is None:
+        return not trial.whole
+    first = with_sticking(line, line.first) if trial.fitter.variant.sticking else line.first
+    return not trial.replaces(first)
 
 
 def _is_better(other: Trial, trial: Trial, read: Search) -> bool:

@@ -14,6 +14,7 @@ from functools import cached_property
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.driving import InputPieces
 from herglotz.data.input_terms import with_input_terms
 from herglotz.data.noise import part_of
 from herglotz.data.sensors import measured
@@ -33,7 +34,7 @@ from herglotz.training.moves import Moves
 from herglotz.training.named_terms import NamedTerms, candidates, special, started
 from herglotz.training.offers import INPUTS
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import FIRST_SEGMENT
+from herglotz.training.problems.grid import FIRST_SEGMENT, Grids
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.sensor_zeros import clear, differing_zeros, means
 from herglotz.training.serial_chains import serial_chains
@@ -63,41 +64,69 @@ FITS_OF_A_KIND = 3
 Zeros = tuple[Tensor, Tensor]
 # A search of readings less the zeros of their sensors, its model, and the zeros.
 Zeroed = tuple["Search", Trial | None, Zeros | None]
+# Data, and the rows of a part of them.
+Recorded = tuple[Trajectories, Tensor]
 
 
 class Search:
     """A search over recordings; `part` is the search of a part of long recordings, otherwise the search itself.
 
-    A step of these data is `step_ratio` steps of the data to be fitted. Functions have the range of `range_data`, and
-    `ratios` are those of coordinates that move in proportion, by default as these data show them.
+    A step of these data is `step_ratio` steps of the data to be fitted; those of a part are some samples of `every`
+    data, which have the inputs between them. Functions have the range of `range_data`, and `ratios` are those of
+    coordinates that move in proportion, by default as these data show them.
     """
 
     def __init__(
         self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False,
-        ratios: Mapping[tuple[int, int], str] | None = None,
+        ratios: Mapping[tuple[int, int], str] | None = None, every: Recorded | None = None,
     ):  # fmt: skip
-        self.data, self.base, self.config, self.range_data = data, base, config, data
+        self.data, self.base, self.config, self.range_data, self.every = data, base, config, data, every
         self.ratios = proportions(data) if ratios is None else ratios
         self.freedom = FREEDOM if outliers else None
         self.order = 4 if is_precise(data) and data.dof == 1 else 2
         self.fitters: dict[Variant, Fitter] = {}
         self.fits, self.iterations, self.part, self.step_ratio = FITS_OF_A_KIND, ITERATIONS, self, 1.0
-        if (few := part_of(data, SAMPLES_OF_A_PART)) is not data:
-            self.part, self.fits, self.iterations = self.of(few), 1, ITERATIONS_ON_ALL
+        few, rows = part_of(data, SAMPLES_OF_A_PART)
+        if len(rows) < data.samples:
+            self.part, self.fits, self.iterations = self.of(few, (data, rows)), 1, ITERATIONS_ON_ALL
             ratio = few.typical_step / data.typical_step
             self.part.step_ratio, self.part.base = ratio, base.stepped(ratio)
 
-    def of(self, data: Trajectories) -> Search:
-        """The same search of other data."""
-        other = Search(data, self.base, self.config, outliers=self.freedom is not None, ratios=self.ratios)
+    def of(self, data: Trajectories, every: Recorded | None = None) -> Search:
+        """The same search of other data; of the same samples, unless `every` is given."""
+        every = every or self.every
+        other = Search(data, self.base, self.config, outliers=self.freedom is not None, ratios=self.ratios, every=every)
         other.order, other.range_data = self.order, self.range_data
         return other
+
+    @property
+    def hold(self) -> str:
+        """The hold of the inputs."""
+        return (self.data if self.every is None else self.every[0]).hold
+
+    def held(self, hold: str) -> Search:
+        """The same search with another hold of the inputs."""
+        if self.every is None:
+            return self.of(replace(self.data, hold=hold))
+        # The means of a part have no other hold.
+        recorded, rows = self.every
+        return self.of(replace(self.data), (replace(recorded, hold=hold), rows))
+
+    @cached_property
+    def grids(self) -> Grids:
+        """The grids of all fitters, with the inputs that were recorded in each model step."""
+        if self.every is None or (u := self.every[0].u) is None:
+            return Grids(self.data)
+        recorded, rows = self.every
+        return Grids(self.data, InputPieces.of(recorded.hold, recorded.t, u, recorded.lengths), rows)
 
     def fitter(self, variant: Variant) -> Fitter:
         """The fitter of a variant, made once."""
         if variant not in self.fitters:
             like = next(iter(self.fitters.values()), None)
-            self.fitters[variant] = Fitter(self.data, self.base, self.config, variant, self.freedom, like, self.ratios)
+            self.fitters[variant] = Fitter(
+                self.data, self.base, self.config, variant, self.freedom, like, self.ratios, self.grids
+            )
         return self.fitters[variant]
 
     @cached_property
@@ -192,8 +221,8 @@ class Search:
 
     @property
     def meets_segments(self) -> bool:
-        """True if the model of the whole dictionary meets the shortest segments to the noise."""
-        return self.every_term is not None and self.every_term.segments_at_the_noise
+        """True if the model of the whole dictionary, or that grown from the simplest, meets segments to the noise."""
+        return any(trial is not None and trial.segments_at_the_noise for trial in (self.every_term, self.begun))
 
     def fitter_of_functions(self, variant: Variant) -> Fitter | None:
         """The fitter of a variant with all functions; None with translations, or if a kernel cannot have so many."""
@@ -257,7 +286,7 @@ class Search:
         """
         waves = {f"cos{text.removesuffix('^2')}": text for text in windings(self.data.angles)}
         taken = found.taken & waves.keys()
-        if found.at_the_noise or not taken:
+        if not taken:
             return found
         fitter = self.fitter(replace(found.fitter.variant, windings=True))
         values, number = fitter.values_of(found), {key: name for name, key in fitter.keys.items()}
@@ -430,7 +459,8 @@ class Search:
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
         drag = tuple(force for force in self.config.drag if not parse_drag(force, self.data.angles).wave)
-        return Search(data, base, replace(self.config, drag=drag), outliers=self.freedom is not None)
+        config = replace(self.config, drag=drag)
+        return Search(data, base, config, outliers=self.freedom is not None, every=self.every)
 
     def zeros(
         self, trial: Trial, start: Tensor | None = None, taken: Tensor | None = None
@@ -478,8 +508,8 @@ class Search:
         By the score of held-out blocks or, if `by_residuals`, of the fits themselves (`fitted_score`).
         """
         best, found = trial, ""
-        for hold in [] if trial.lacks_nothing else [hold for hold in holds if hold != self.data.hold]:
-            other = self.of(replace(self.data, hold=hold)).again(trial)
+        for hold in [] if trial.lacks_nothing else [hold for hold in holds if hold != self.hold]:
+            other = self.held(hold).again(trial)
             if other is not None and (other.fits_better(best) if by_residuals else other.replaces(best)):
                 best, found = other, hold
         return found
@@ -487,9 +517,12 @@ class Search:
     def driven_by(self, terms: Sequence[str]) -> Search:
         """The search of data whose inputs also act by these terms: columns of u, and forces of the position."""
         forces = input_forces(terms)
-        data = with_input_terms(self.data, input_columns(terms))
+        columns = input_columns(terms)
+        data, every = with_input_terms(self.data, columns), self.every
+        if every is not None:
+            every = with_input_terms(every[0], columns), every[1]
         base = estimate_baseline(data, outliers=self.freedom is not None)
         config = replace(self.config, drag=(*self.config.drag, *forces))
-        other = Search(data, base, config, outliers=self.freedom is not None, ratios=self.ratios)
+        other = Search(data, base, config, outliers=self.freedom is not None, ratios=self.ratios, every=every)
         other.order = self.order
         return other

@@ -145,6 +145,11 @@ def differing_zeros(
     return z, torch.where(told, deviations, beside)
 
 
+def differ_between(z: Tensor, deviations: Tensor) -> bool:
+    """True if zeros (B, n) differ between recordings."""
+    return bool(clear(z - z[:1], deviations).any())
+
+
 def drifts(search: Any, *, met: bool = False) -> tuple[Tensor, Tensor] | None:
     """Drift rates (n,) of the zeros of the sensors, in units of q per time, and their standard deviations.
 

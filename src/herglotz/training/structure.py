@@ -251,10 +251,9 @@ def search_of_many(
     if isinstance(wanted, str):
         return without(wanted)
     found, hold, terms, why = _pared_down(wanted), "", (), {}
-    # A part with longer steps has means of the inputs, which say little of a hold over one step.
-    if found is not None and wanted.part.step_ratio == 1 and (hold := wanted.part.better_hold(found, holds)):
-        why["hold"] = _why_hold(hold, wanted.data.hold)
-        wanted = wanted.of(replace(wanted.data, hold=hold))
+    if found is not None and (hold := wanted.part.better_hold(found, holds)):
+        why["hold"] = _why_hold(hold, wanted.hold)
+        wanted = wanted.held(hold)
         found = _pared_down(wanted)
     # A building on a shaken ground is met to about the noise without the force by the rate of the ground.
     if found is not None and data.u is not None:

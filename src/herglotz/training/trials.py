@@ -62,7 +62,7 @@ ALIKE = 10.0
 # A rule of order 4 is worth its time if the noise is below this share of the spread of the data.
 ORDER_4_NOISE = 1e-3
 # Largest number of model steps in a recorded step, and in all trajectories.
-MAX_SUBSTEPS, MAX_STEPS = 64, 15_000
+MAX_SUBSTEPS, MAX_STEPS = 64, 64_000
 
 
 @dataclass(frozen=True)
@@ -319,7 +319,7 @@ class Fitter:
 
     def __init__(
         self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None,
-        like: Fitter | None = None, ratios: Mapping[tuple[int, int], str] | None = None,
+        like: Fitter | None = None, ratios: Mapping[tuple[int, int], str] | None = None, grids: Grids | None = None,
     ):  # fmt: skip
         self.data, self.variant, self.freedom = data, variant, freedom
         self.finest = max(1, min(MAX_SUBSTEPS, MAX_STEPS // data.samples))
@@ -353,7 +353,7 @@ class Fitter:
         lengths = segment_lengths(data)
         self.lengths = [*(length for length in SHORT_SEGMENTS if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
-        self.grids = Grids(data) if like is None else like.grids
+        self.grids = (grids or Grids(data)) if like is None else like.grids
         self.rounding = ALIKE * EXACT["float64"] * max(base.scale)
         # Misfit that the error of the finest steps explains, by the order of the rule.
         self.of_steps: dict[int, float] = {} if like is None else like.of_steps

@@ -96,7 +96,8 @@ def test_a_part_of_a_long_recording_has_what_a_slow_sensor_read():
     known[2001:3000:2, 1] = True  # half of it out of step
     data = with_missing(Trajectories.of(t, torch.stack([t.sin(), t.cos()], 1)), known, str)
     assert data.thinned(2).t.tolist() == t[known.all(1)][::2].tolist()
-    few = part_of(data, 1000)
+    few, rows = part_of(data, 1000)
+    assert torch.equal(data.t[rows], few.t)
     assert few.observed is None
     assert 900 < few.samples < 2000
 

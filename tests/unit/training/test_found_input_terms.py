@@ -349,7 +349,7 @@ class Asked:
     needed = False
 
     def __init__(self, data, terms=(), left=()):
-        self.data, self.terms, self.left, self.step_ratio = data, terms, left, 1
+        self.data, self.terms, self.left, self.hold = data, terms, left, data.hold
 
     @property
     def part(self):
@@ -357,6 +357,9 @@ class Asked:
 
     def of(self, data):
         return Asked(data, self.terms, self.left)
+
+    def held(self, hold):
+        return Asked(replace(self.data, hold=hold), self.terms, self.left)
 
     def driven_by(self, terms):
         return Asked(self.data, terms, self.left)

@@ -1,5 +1,7 @@
 """Long recordings of driven machines: the part a search begins with, segments, and errors of held-out time."""
 
+from typing import TypeVar
+
 import pytest
 import torch
 
@@ -13,6 +15,13 @@ from herglotz.training.cross_validation import held_out_errors
 from herglotz.training.problems.grid import segment_grid, segment_lengths
 from herglotz.training.search import Search
 from herglotz.training.trials import Variant
+
+T = TypeVar("T")
+
+
+def there(found: T | None) -> T:
+    assert found is not None
+    return found
 
 
 def line(lengths):
@@ -47,13 +56,57 @@ def test_a_part_of_fast_samples_is_every_mth_of_all():
     noise = 1e-3 * torch.randn(8000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for h, longer in ((0.02, 8), (0.4, 1)):  # 314 and 16 samples a turn
         t = h * torch.arange(8000, dtype=torch.float64)
-        part = part_of(Trajectories.of(t, t.sin() + noise), 1000)
+        part = part_of(Trajectories.of(t, t.sin() + noise), 1000)[0]
         assert part.typical_step == pytest.approx(longer * h)
         assert part.samples == 1000
     few = line([900] * 3)
-    assert part_of(few, 1400) is few
+    assert part_of(few, 1400)[0] is few
     many = line([90] * 100)
-    assert part_of(many, 1000).typical_step == pytest.approx(0.1)
+    assert part_of(many, 1000)[0].typical_step == pytest.approx(0.1)
+
+
+def long_drive(**more):
+    """Two recordings of 9000 samples of a slow motion with inputs that change at every sample."""
+    t = torch.cat([0.02 * torch.arange(9000, dtype=torch.float64)] * 2)
+    make = torch.Generator().manual_seed(0)
+    noise, u = (torch.randn(18_000, generator=make, dtype=torch.float64) for _ in range(2))
+    return Trajectories.of(t, t.sin() + 1e-3 * noise, (9000, 9000), u=u, **more)
+
+
+@pytest.mark.parametrize("hold", ["zero", "first"])
+def test_model_steps_of_a_part_have_the_inputs_that_were_recorded_in_them(hold):
+    # fails if every model step of a part has the mean of the long step that it lies in, if a hold of the inputs is that
+    # of these means, or if the rows of the second recording are those of the first
+    data = long_drive(hold=hold)
+    search = Search(data, estimate_baseline(data), FitConfig().resolved(data))
+    part, rows = there(search.part.every)
+    assert part is data
+    assert torch.equal(data.t[rows], search.part.data.t)
+    assert len(search.part.data) == 2
+    m = round(search.part.step_ratio)
+    assert m == 8
+    fitter = search.part.fitter(Variant(2, substeps=m))
+    grid, u = fitter.grids.of(20, fitter.base.model_step)
+    k = rows[grid.row] + (m * grid.part).long()
+    expected = there(data.u)[k] if hold == "zero" else (there(data.u)[k] + there(data.u)[k + 1]) / 2
+    assert torch.allclose(there(u), expected, rtol=1e-9, atol=1e-9)
+    coarse = search.part.fitter(Variant(2))
+    grid, u = coarse.grids.of(20, coarse.base.model_step)
+    at = rows[grid.row]
+    means = torch.stack([data.inputs_of_steps()[at + j] for j in range(m)]).mean(0)
+    assert torch.allclose(there(u), means, rtol=1e-9, atol=1e-9)
+
+
+def test_a_part_has_the_hold_of_the_recording_and_its_terms_of_inputs():
+    # fails if a part of long steps is not asked for another hold, or its u^2 are squares of means
+    data = long_drive(hold="zero")
+    search = Search(data, estimate_baseline(data), FitConfig(level="forced").resolved(data)).part
+    assert (search.hold, search.held("first").hold) == ("zero", "first")
+    assert search.held("first").data is not search.data  # whose fits are made anew
+    driven = search.driven_by(["u^2"])
+    fitter = driven.fitter(Variant(2, substeps=8))
+    u = there(fitter.grids.of(20, fitter.base.model_step)[1])
+    assert torch.allclose(u[..., 1], u[..., 0].square(), atol=1e-9)
 
 
 def test_model_steps_are_about_as_long_in_a_part_and_in_all():

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.driving import InputPieces
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 
@@ -61,10 +62,14 @@ class SegmentGrid:
 
 
 class Grids:
-    """Grids of a recording with the inputs of their model steps, (S, K, m), each made once."""
+    """Grids of a recording with the inputs of their model steps, (S, K, m), each made once.
 
-    def __init__(self, data: Trajectories):
-        self.data = data
+    If the samples are some of another recording, `within` has the inputs of that one, and `rows` (N,) where in it each
+    sample is: a model step takes the mean of the inputs that were recorded in it.
+    """
+
+    def __init__(self, data: Trajectories, within: InputPieces | None = None, rows: Tensor | None = None):
+        self.data, self.within, self.rows = data, within, rows
         self.made: dict[tuple[int, float], tuple[SegmentGrid, Tensor | None]] = {}
 
     def of(self, length: int, max_step: float) -> tuple[SegmentGrid, Tensor | None]:
@@ -72,8 +77,15 @@ class Grids:
         key = length, max_step
         if key not in self.made:
             grid = segment_grid(self.data, *key)
-            self.made[key] = grid, self.data.inputs_of_steps(grid.row, grid.part)
+            self.made[key] = grid, self._inputs(grid)
         return self.made[key]
+
+    def _inputs(self, grid: SegmentGrid) -> Tensor | None:
+        """The inputs of the model steps of a grid, (S, K, m)."""
+        if self.within is None or self.rows is None:
+            return self.data.inputs_of_steps(grid.row, grid.part)
+        step = self.data.t[grid.row + 1] - self.data.t[grid.row]
+        return self.within.means(self.rows[grid.row], grid.part * step - grid.h / 2, grid.h)
 
 
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:

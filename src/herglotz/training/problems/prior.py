@@ -55,11 +55,12 @@ class Prior:
     * The damping's network G(q̄, v) (affine level) has there an RMS of N(0, (τ r)²), r the typical rate of the motion.
     * Every network weight is N(its start, `weight`²), a weak prior against drift of undetermined weights. (Centred at 0
       it would switch the network off: with a last layer that starts at 0, only the prior acts on the first layer.)
-    * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
-      friction (the first mass is 1) are N(their start, `rate_spread`²), and with `wide_rates` the first three at least
-      N(start, start²): the damping rate of a falling body is many times the rate of its fall. Dry friction is
-      N(0, (`rate_spread` speed)²), its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their
-      start, 0.5²).
+    * The damping rate, the drag coefficients (per unit of position) and the rates of the full level's units are
+      N(their start, `rate_spread`²), and with `wide_rates` at least N(start, start²): the damping rate of a body that
+      falls is many times the rate of its fall. Viscous friction is N(start, (`rate_spread` m)²) and dry friction
+      N(0, (`rate_spread` m speed)²), with the mass m that makes the kinetic energy that of the first coordinate, whose
+      mass is 1: the mass of an angle beside a length in mm is in mm². The excess of dry friction at breakaway is
+      N(0, (0.01 F)²), and the logarithms of its widths are N(their start, 0.5²).
     * A `herglotz.models.Term` has its own spread, and the waves of functions have `spreads`, around 0.
     """
 
@@ -132,11 +133,14 @@ class Prior:
 
     def _own(self, model: ContactLagrangian, weight: float, rate_spread: float) -> tuple[Tensor, Tensor]:
         """Places and spreads of the parameters with an own prior N(start, spread²), (m,) each."""
+        speed = self.start.new_tensor(model.config.speed)
+        mass = (speed[0] / speed).square()
+        viscous, coulomb = self._index("friction.viscous"), self._index("friction.coulomb")
         spreads = [
             (self._index(*NETWORKS), weight),
             (self._index("damping.rate", "damping.drag", "action.rate"), rate_spread),
-            (self._index("friction.viscous"), rate_spread * (SPLIT if len(model.config.scale) == 1 else 1.0)),
-            (self._index("friction.coulomb"), rate_spread * max(model.config.speed)),
+            (viscous, rate_spread * (SPLIT if len(speed) == 1 else mass[self._coordinates(viscous)])),
+            (coulomb, rate_spread * (mass * speed)[self._coordinates(coulomb)]),
             (self._index("friction.breakaway"), BREAKAWAY * self.force),
             (self._index("friction.log"), WIDTH),
             *(
@@ -147,7 +151,12 @@ class Prior:
             *((torch.tensor([i]), spread) for i, spread in self.waves.items()),
         ]
         index = torch.cat([index for index, _ in spreads]).to(self.start.device)
-        return index, torch.cat([self.start.new_full((len(index),), spread) for index, spread in spreads])
+        return index, torch.cat([spread * torch.ones_like(self.start[index]) for index, spread in spreads])
+
+    def _coordinates(self, index: Tensor) -> list[int]:
+        """The coordinates, counted from 0, of numbers of which each coordinate has one."""
+        names = [self.parameters.numbers[i] for i in index.tolist()]
+        return [int(name.partition("[")[2].rstrip("]") or 0) for name in names]
 
     def _index(self, *prefixes: str) -> Tensor:
         return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
