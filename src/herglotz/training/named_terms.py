@@ -13,7 +13,7 @@ from herglotz.models.drag import AIR
 from herglotz.models.feature_potential import baseline_features, baseline_is_named
 from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.models.translations import differences, directions, unchanged
-from herglotz.training.baseline import JITTER, NEGLIGIBLE, Baseline
+from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary import KINKS, WEIGHTS, drag_of, features_of, in_proportion
 from herglotz.training.parameter_vector import ParameterVector
@@ -81,7 +81,6 @@ def candidates(
         return _unmoved(data, directions(translations, data.angles))
     angles = data.angles
     features = tuple(_of_one(data)) if len(angles) == 1 else features_of(angles)
-    features = tuple(text for text in features if not _is_constant_mass(text, data))
     # The length |v| of a velocity needs one unit.
     one_unit = len(set(data.units)) == 1
     gone = set() if one_unit else {AIR}
@@ -91,14 +90,6 @@ def candidates(
     drag = tuple(text for text in drag_of(angles) if text not in gone)
     features, drag = (in_proportion(texts, ratios or {}) for texts in (features, drag))
     return NamedTerms((*features, *special(data)), drag, dry=True)
-
-
-def _is_constant_mass(text: str, data: Trajectories) -> bool:
-    """True for a mass cos(k·q) that is 1 over the recorded motion, and thus the mass that every model has."""
-    first, *others = parse(text, data.angles)
-    if others or first.function != "cos" or not first.velocities or first.degree:
-        return False
-    return float((data.q @ data.q.new_tensor(first.form)).cos().std()) < NEGLIGIBLE
 
 
 def special(data: Trajectories) -> tuple[str, ...]:

@@ -600,7 +600,12 @@ def likeliest(trial: Trial, most: int) -> Trial:
 
 
 def compared_models(fitters: Iterable[Fitter], trial: Trial) -> list[dict[str, Any]]:
-    """The models that were scored over segments of the length of a trial, and the trial itself, by their size."""
+    """The models that were scored over segments of the length of a trial, and the trial itself, by their size.
+
+    None where held-out blocks do not tell the error of the trial.
+    """
+    if not math.isfinite(trial.score.rms):
+        return []
     rows: dict[frozenset[str], Compared] = {}
     for fitter in fitters:
         for row in fitter.compared:

@@ -50,3 +50,18 @@ def test_a_large_rate_is_as_free_as_it_is_large(rate, spread):
     assert float(narrow.spread[narrow.index == at]) == 1.0
     others = prior.spread[prior.index != at]
     torch.testing.assert_close(others, prior_of(1, "linear")[0].spread[prior.index != at])
+
+
+def test_friction_is_narrow_by_the_mass_of_its_coordinate():
+    # fails if the friction of an angle, whose mass is in mm² beside a length in mm, is held below 1e-5 of what it is
+    # (waves of the speed made up for it), or if that of one coordinate stands for another where others are frozen
+    speed = (1.0, 0.1, 10.0)
+    config = ModelConfig(angles=(False,) * 3, level="forced", stiffness=(1.0,) * 3, tilt=(0.0,) * 3, scale=(1.0,) * 3,
+                         speed=speed, rate=0.1, coulomb=True, potential_width=0)  # fmt: skip
+    model, ends = ContactLagrangian(config).double(), torch.ones(3, dtype=torch.float64)
+    prior = Prior(model, -ends, ends, departure=None, rate_spread=0.5)
+    spread = dict(zip(prior.index.tolist(), prior.spread.tolist(), strict=True))
+    viscous, coulomb = (prior.parameters.index(f"friction.{name}") for name in ("viscous", "coulomb"))
+    assert [spread[i] for i in viscous.tolist()] == pytest.approx([0.5 * mass for mass in (1.0, 100.0, 0.01)])
+    assert [spread[i] for i in coulomb.tolist()] == pytest.approx([0.5 * momentum for momentum in (1.0, 10.0, 0.1)])
+    assert prior._coordinates(viscous[1:2]) == [1]

@@ -134,6 +134,7 @@ class Asked:
         simple = SimpleNamespace(simple=frozenset({"cos(q1)"}))
         return SimpleNamespace(names=[name], rms=rms, whole=True, at=self.name, at_the_noise=noise, replaces=replaces,
                                fits_better=lambda *_: not self.told.get("worse"), fitter=simple,
+                               gain=lambda *_: self.told.get("gain", 1.0),
                                taken=frozenset({name, *self.told.get("more", ())}),
                                problem=SimpleNamespace(P=1))  # fmt: skip
 
@@ -303,6 +304,16 @@ def test_zeros_that_functions_make_unnecessary_are_none(asked):
     assert asked(zeros=zeros, flexible=True, worse_functions=True)[0].zeros == pytest.approx((0.0, 0.1))
 
 
+def test_zeros_that_are_the_same_in_all_recordings_are_the_middle_of_a_force(asked):
+    # fails if a law about a middle stays where the readings as they are have one that is no worse: the weight on a
+    # spring, about the length at rest, had masses of r φ′² and φ′² beside r² φ′²; or if zeros that differ leave so
+    deviations = torch.tensor([[0.01], [0.01]])
+    same, differing = torch.tensor([[0.6], [0.61]]), torch.tensor([[0.6], [0.7]])
+    assert asked(zeros=(same, deviations), gain=-1.0)[0].zeros == ()
+    assert asked(zeros=(same, deviations), gain=1.0)[0].zeros == pytest.approx((0.6, 0.61))
+    assert asked(zeros=(differing, deviations), gain=-1.0)[0].zeros == pytest.approx((0.6, 0.7))
+
+
 def test_zeros_are_asked_once_more_of_the_model_that_is_found(asked):
     # fails if zeros stay those of the whole dictionary
     zeros = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.0], [0.01]])
@@ -361,3 +372,19 @@ def test_a_line_is_searched_where_its_model_may_be_better(whole, worse, lacks, m
     asked.best = trial
     assert not asked.better_on_a_line()
     assert asked.read.searched == searched
+
+
+@pytest.mark.parametrize("sticking", [True, False])
+def test_a_line_has_dry_friction_of_the_same_kind(monkeypatch, sticking):
+    # fails if a model of angles whose friction holds is compared with one on a line whose friction does not: the spring
+    # of a door was 12.4 sin θ − 1.7 sin 2θ for 9 θ
+    asked: Any = object.__new__(questions.Questions)
+    asked.read = OnALine(meets=True)
+    held = SimpleNamespace(length=20, held=True)
+    monkeypatch.setattr(questions, "with_sticking", lambda *_: held)
+    trial: Any = SimpleNamespace(whole=True, lacks_nothing=False, taken=frozenset({"cos(q1)", "cos(2q1)"}))
+    trial.replaces = lambda other: other is not held
+    trial.fitter = SimpleNamespace(variant=SimpleNamespace(sticking=sticking))
+    asked.best = trial
+    assert not asked.better_on_a_line()
+    assert asked.read.searched == sticking
