@@ -42,6 +42,28 @@ def stepped_finely(t, u, hold, delay, lag, fine=2000):
     return torch.from_numpy(np.stack(values)), fine
 
 
+@pytest.mark.parametrize("hold", ["zero", "first", "smooth"])
+def test_means_within_steps_add_up(hold):
+    # fails if the mean of a part of a step is that of another part, if a linear input is constant in it, or if two
+    # recordings share an axis of time
+    make = torch.Generator().manual_seed(0)
+    u = torch.randn(40, 1, generator=make, dtype=torch.float64)
+    t = torch.cat([torch.arange(20, dtype=torch.float64).square() / 20, torch.arange(20, dtype=torch.float64)])
+    pieces, row = InputPieces.of(hold, t, u, (20, 20)), torch.tensor([3, 25])
+    h, then = t[row + 1] - t[row], t[row + 2] - t[row + 1]
+    whole = pieces.means(row, 0 * h, h)
+    if hold != "smooth":
+        middle = interpolated_input(hold, t, u, (20, 20), row, torch.full_like(h, 0.5))
+        assert torch.allclose(whole, middle, atol=1e-12)
+    parts = pieces.means(row, 0 * h, 0.3 * h) * 0.3 + pieces.means(row, 0.3 * h, 0.7 * h) * 0.7
+    assert torch.allclose(parts, whole, atol=1e-12)
+    weight = (h / (h + then))[:, None]
+    both = weight * whole + (1 - weight) * pieces.means(row + 1, 0 * then, then)
+    assert torch.allclose(pieces.means(row, 0 * h, h + then), both, atol=1e-12)
+    start = pieces.means(row, 0 * h, 1e-6 * h)
+    assert torch.allclose(start, interpolated_input(hold, t, u, (20, 20), row, 0 * h), atol=1e-4)
+
+
 @pytest.mark.parametrize("hold", ["zero", "first"])
 @pytest.mark.parametrize(("delay", "lag"), [(0.3, 0.2), (1.7, 0.9), (0.0, 0.5)])
 def test_inputs_act_late_and_lagged(hold, delay, lag):

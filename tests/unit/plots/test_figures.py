@@ -7,7 +7,8 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 
 import matplotlib as mpl
 import numpy as np
@@ -42,6 +43,7 @@ from herglotz.plots.motion import plot_prediction, trajectory_title
 from herglotz.plots.phase import _background
 from herglotz.stepping import State
 from herglotz.training import Bands, Run
+from herglotz.training.trials import Compared, compared_models
 
 KINDS = {
     "one": {},
@@ -107,6 +109,17 @@ def test_the_sizes_show_the_best_of_each_and_the_one_that_was_taken():
     assert "3 numbers" in title(figure)
     with pytest.raises(InputError, match="no search for terms"):
         plot_sizes(replace(run, metrics={}))
+
+
+def test_a_model_without_a_held_out_error_is_not_drawn_among_sizes():
+    # fails if a fit ends in an internal error because held-out blocks do not tell the error of the model it took
+    row = Compared(20, 3, 0.1, frozenset({"a"}))
+    fitter: Any = SimpleNamespace(compared=[row], offers=[SimpleNamespace(name="a")], loads=[])
+    for error in (0.2, math.inf, math.nan):
+        trial: Any = SimpleNamespace(
+            fitter=fitter, length=20, taken=frozenset(), problem=SimpleNamespace(P=2), score=SimpleNamespace(rms=error)
+        )
+        assert [found["numbers"] for found in compared_models([fitter], trial)] == ([2, 3] if error == 0.2 else [])
 
 
 def test_the_plan_has_a_box_for_every_reason():
