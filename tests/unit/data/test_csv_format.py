@@ -1,5 +1,6 @@
 """The csv format: roles of columns, messages, exact round trips, and no surprise on any input."""
 
+import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -69,6 +70,34 @@ def test_what_spreadsheets_write(tmp_path):  # fails if a BOM, CRLF, quotes, bla
     assert (data.names, data.units) == (("q",), ("rad",))
     assert data.q[:, 0].tolist() == [1.5, 2, 3]
     assert read(tmp_path, "t,q\r0,1\r1,2\r2,3\r").q[:, 0].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("t,q\n0.D+00,1.5D+00\n1.D+00,-2.5d-03\n2.D+00,.5D+02\n", [1.5, -2.5e-3, 50]),
+        ("t q\n0.0d+00 1.5d+00\n1.0d+00 -2.5D-03\n2.0d+00 5.0D-101\n", [1.5, -2.5e-3, 5e-101]),
+        ("t;q\n0,0D+00;1,5D+00\n1,0D+00;-2,5d-03\n2,0D+00;,5D+02\n", [1.5, -2.5e-3, 50]),
+    ],
+)
+def test_exponents_of_fortran(tmp_path, text, values):
+    # fails if d in lower case, a number without digits on one side of its point, or an exponent of three digits is not
+    # read, or if the sign of an exponent is lost
+    data = read(tmp_path, text)
+    assert (data.t.tolist(), data.q[:, 0].tolist()) == ([0, 1, 2], values)
+
+
+@pytest.mark.parametrize("cell", ["3D", "1D-02x", "1.5D-02x", "1.5D+1", "1.5D12", "2026-01-02D+00"])
+def test_words_with_d_stay_as_they_are(tmp_path, cell):
+    # fails if part of a word is taken for an exponent of Fortran, so that the message has another word than the file
+    with pytest.raises(InputError, match=rf"column 'q': '{re.escape(cell)}' is not a number"):
+        read(tmp_path, f"t,q\n0,1\n1,{cell}\n2,3\n")
+
+
+def test_names_with_d_stay_as_they_are(tmp_path):  # fails if a name, or the label of a trial, has an E for its D
+    data = read(tmp_path, "trial,t,x_3D,x_1.5D-02x\n" + "".join(f"run 2.5D-02b,{k},{k},{-k}\n" for k in range(3)))
+    assert data.names == ("x_3D", "x_1.5D-02x")
+    assert data.lengths == (3,)
 
 
 def test_blank_trajectory_column_is_one_trajectory(tmp_path):  # fails if a blank label is an error

@@ -93,7 +93,7 @@ def test_model_steps_of_a_part_have_the_inputs_that_were_recorded_in_them(hold):
     coarse = search.part.fitter(Variant(2))
     grid, u = coarse.grids.of(20, coarse.base.model_step)
     at = rows[grid.row]
-    means = torch.stack([data.inputs_of_steps()[at + j] for j in range(m)]).mean(0)
+    means = torch.stack([there(data.inputs_of_steps())[at + j] for j in range(m)]).mean(0)
     assert torch.allclose(there(u), means, rtol=1e-9, atol=1e-9)
 
 
