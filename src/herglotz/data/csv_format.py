@@ -38,7 +38,7 @@ THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")
 # 1,250 is 1250 or 1.25; 0,250 is 0.25 alone.
 THOUSANDS_OR_DECIMALS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 # 1.5D+00, as Fortran writes numbers of double precision.
-DOUBLE = re.compile(r"(\d[.,]\d*|[.,]\d+)[dD](?=[+-]\d{2,3}(?!\w))")
+DOUBLE = re.compile(r"(\d\.\d*|\.\d+)[dD](?=[+-]\d{2,3}(?!\w))")
 # Rows of the file, from 1: their text, and their cells.
 Lines = list[tuple[int, str]]
 Rows = list[tuple[int, Sequence[str]]]

@@ -101,9 +101,12 @@ def _on_a_clock(t: np.ndarray, count: float) -> tuple[np.ndarray, float, np.ndar
     for clock in (lambda: (np.arange(len(t)), every), lambda: numbers_of_rows(counts.round(), COUNT_TOLERANCE)):
         if (found := clock()) is not None:
             number, known = found
-            x, y = number - number[known].mean(), t - t[known].mean()
-            h = float(x[known] @ y[known] / (x[known] @ x[known]))
-            if bool((np.abs(h * x - y) <= count).all()):
+            # Sums of times near the largest number are infinite: no clock meets these.
+            with np.errstate(over="ignore", invalid="ignore"):
+                x, y = number - number[known].mean(), t - t[known].mean()
+                h = float(x[known] @ y[known] / (x[known] @ x[known]))
+                met = bool((np.abs(h * x - y) <= count).all())
+            if met:
                 return t[known].mean() + h * x, h, known
     return None
 

@@ -133,10 +133,10 @@ def test_what_spreadsheets_write(tmp_path, text):
     assert (data.names, data.t.tolist(), data.q[:, 0].tolist()) == (("x",), T.tolist(), X.tolist())
 
 
-@pytest.mark.parametrize(("separator", "point"), [(",", "."), ("  ", "."), (";", ",")])
-def test_what_fortran_writes(tmp_path, separator, point):
+@pytest.mark.parametrize("separator", [",", "  ", ";"])
+def test_what_fortran_writes(tmp_path, separator):
     # fails if numbers of double precision, with D before the exponent, are refused as no numbers
-    cells = [[f"{x:.6E}".replace("E", "D").replace(".", point) for x in row] for row in zip(T, X, strict=True)]
+    cells = [[f"{x:.6E}".replace("E", "D") for x in row] for row in zip(T, X, strict=True)]
     lines = [separator.join(row) for row in cells]
     data = load(written(tmp_path, separator.join(["t", "x"]) + "\n" + "\n".join(lines) + "\n"))
     assert data.t.tolist() == pytest.approx(T.tolist())
