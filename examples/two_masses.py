@@ -55,8 +55,8 @@ print(f"spring                {unit * number['(motor − load)']:.3f} N·m/rad  
 print(f"damper                {unit * number['(motor′ − load′)']:.4f} N·m·s/rad   (truth {damper:g})")
 
 # %% [markdown]
-# Behind a gear the spring is one of 0.2 motor − load, say. The fit finds this ratio where both shafts turn once at
-# least; of shafts that turn less, give the motor's angle at the load's side, `sensor_scales=(0.2, 1)`
+# Behind a gear the spring is one of 0.2 motor − load, say. Where both shafts turn once at least and the coupling is not
+# too stiff, the fit finds this ratio; else give the motor's angle at the load's side, `sensor_scales=(0.2, 1)`
 # (`--sensor-scales`).
 
 # %%
