@@ -71,7 +71,8 @@ class Questions:
             return
         plain = self.unread.part.run()
         if plain is not None and self.best.gain(plain, int((self.differ[1] > 0).sum())) <= 0:
-            self.read, self.best, self.differ = self.unread.part, plain, None
+            self.wanted = self.undriven = self.unread
+            self.read, self.best, self.differ, self.hold = self.unread.part, plain, None, ""
 
     def zeros(self) -> bool:
         """Find zeros of sensors that differ between recordings; True if the model is better with them."""
@@ -186,7 +187,7 @@ class Questions:
             return
         first = self.read.first
         self.read, self.best, self.differ = self.wanted.of_part(self.best, self.differ)
-        # What held-out time of a part asks for, that of all samples may not ask for.
+        # Held-out time of all samples may ask for fewer terms than that of a part.
         if first is not None and not (self.best and self.best.at_the_noise):
             other = self.read.again(first)
             self.best = self.read.better(self.best, other and self.read.settled(other))
@@ -239,8 +240,10 @@ def _may_be_better(line: Search, trial: Trial) -> bool:
     if trial.lacks_nothing and (len(turning) <= (line.data.dof == 1) or not line.meets_segments):
         return False
     # The first model on a line must be no worse, with dry friction of the same kind.
-    if not trial.whole or line.first is None:
-        return not trial.whole
+    if not trial.whole:
+        return True
+    if line.first is None:
+        return False
     first = with_sticking(line, line.first) if trial.fitter.variant.sticking else line.first
     return not trial.replaces(first)
 

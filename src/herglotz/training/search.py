@@ -118,15 +118,13 @@ class Search:
         if self.every is None or (u := self.every[0].u) is None:
             return Grids(self.data)
         recorded, rows = self.every
-        return Grids(self.data, InputPieces.of(recorded.hold, recorded.t, u, recorded.lengths), rows)
+        return Grids(self.data, (InputPieces.of(recorded.hold, recorded.t, u, recorded.lengths), rows))
 
     def fitter(self, variant: Variant) -> Fitter:
         """The fitter of a variant, made once."""
         if variant not in self.fitters:
             like = next(iter(self.fitters.values()), None)
-            self.fitters[variant] = Fitter(
-                self.data, self.base, self.config, variant, self.freedom, like, self.ratios, self.grids
-            )
+            self.fitters[variant] = Fitter(self.grids, self.base, self.config, variant, self.freedom, like, self.ratios)
         return self.fitters[variant]
 
     @cached_property
@@ -459,8 +457,7 @@ class Search:
         data = replace(self.data, angles=(False,) * self.data.dof)
         base = estimate_baseline(data, outliers=self.freedom is not None)
         drag = tuple(force for force in self.config.drag if not parse_drag(force, self.data.angles).wave)
-        config = replace(self.config, drag=drag)
-        return Search(data, base, config, outliers=self.freedom is not None, every=self.every)
+        return Search(data, base, replace(self.config, drag=drag), self.freedom is not None, every=self.every)
 
     def zeros(
         self, trial: Trial, start: Tensor | None = None, taken: Tensor | None = None

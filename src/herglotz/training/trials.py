@@ -318,10 +318,11 @@ class Fitter:
     """
 
     def __init__(
-        self, data: Trajectories, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None,
-        like: Fitter | None = None, ratios: Mapping[tuple[int, int], str] | None = None, grids: Grids | None = None,
+        self, grids: Grids, base: Baseline, config: FitConfig, variant: Variant, freedom: float | None,
+        like: Fitter | None = None, ratios: Mapping[tuple[int, int], str] | None = None,
     ):  # fmt: skip
-        self.data, self.variant, self.freedom = data, variant, freedom
+        data = grids.data
+        self.grids, self.data, self.variant, self.freedom = grids, data, variant, freedom
         self.finest = max(1, min(MAX_SUBSTEPS, MAX_STEPS // data.samples))
         bands = variant.functions
         self.terms = terms = _terms(data, config, variant, ratios)
@@ -353,7 +354,6 @@ class Fitter:
         lengths = segment_lengths(data)
         self.lengths = [*(length for length in SHORT_SEGMENTS if length < lengths[0]), *lengths]
         self.problems: dict[int, ShootingProblem] = {}
-        self.grids = (grids or Grids(data)) if like is None else like.grids
         self.rounding = ALIKE * EXACT["float64"] * max(base.scale)
         # Misfit that the error of the finest steps explains, by the order of the rule.
         self.of_steps: dict[int, float] = {} if like is None else like.of_steps

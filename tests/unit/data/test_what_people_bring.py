@@ -133,24 +133,6 @@ def test_what_spreadsheets_write(tmp_path, text):
     assert (data.names, data.t.tolist(), data.q[:, 0].tolist()) == (("x",), T.tolist(), X.tolist())
 
 
-@pytest.mark.parametrize("separator", [",", "  ", ";"])
-def test_what_fortran_writes(tmp_path, separator):
-    # fails if numbers of double precision, with D before the exponent, are refused as no numbers
-    cells = [[f"{x:.6E}".replace("E", "D") for x in row] for row in zip(T, X, strict=True)]
-    lines = [separator.join(row) for row in cells]
-    data = load(written(tmp_path, separator.join(["t", "x"]) + "\n" + "\n".join(lines) + "\n"))
-    assert data.t.tolist() == pytest.approx(T.tolist())
-    assert data.q[:, 0].tolist() == pytest.approx(X.tolist())
-
-
-def test_a_letter_behind_a_number_is_no_exponent(tmp_path):
-    # fails if 3D in a name is taken for the start of a number, or a cell 1D-2x for one
-    data = load(written(tmp_path, "# marker 3D-10, camera 2\nt,x_3D\n" + rows()))
-    assert data.q[:, 0].tolist() == X.tolist()
-    with pytest.raises(InputError, match="1D-02x"):
-        load(written(tmp_path, "t,x\n" + rows() + "9,1D-02x\n"))
-
-
 def test_a_last_column_without_a_name_is_not_lost(tmp_path):  # fails if numbers without a header are left out unsaid
     with pytest.raises(InputError, match="column 3: '' is not a header cell"):
         load(written(tmp_path, "t,x,\n" + rows(",", 5)))

@@ -281,12 +281,13 @@ def test_a_step_that_fails_loses_no_run(tmp_path):
 def test_no_recording_is_named_where_the_others_are_not_followed(monkeypatch):
     # fails if the first of several recordings in which a step fails is named
     data = _drops(0, 6, 13, bad=-1)
+    good = _good().model  # before its parts are replaced
     monkeypatch.setattr(disagreeing, "_missed_by", lambda *_: [torch.full((1, 1), torch.inf)] + [torch.ones(9, 1)] * 5)
     monkeypatch.setattr(disagreeing.SegmentStages, "fit", lambda *_: None)
     settings = FitConfig(train_fraction=1.0)
     task = Task(data, estimate_baseline(data), settings, Stages())
     seen: Any = SimpleNamespace(data=data, settings=settings, task=lambda _: task)
-    assert disagreeing.outlying(seen, _good().model, 0.0015) == ()
+    assert disagreeing.outlying(seen, good, 0.0015) == ()
 
 
 def test_a_recording_that_bends_a_plan_is_named():

@@ -312,6 +312,7 @@ def test_zeros_that_are_the_same_in_all_recordings_are_the_middle_of_a_force(ask
     assert asked(zeros=(same, deviations), gain=-1.0)[0].zeros == ()
     assert asked(zeros=(same, deviations), gain=1.0)[0].zeros == pytest.approx((0.6, 0.61))
     assert asked(zeros=(differing, deviations), gain=-1.0)[0].zeros == pytest.approx((0.6, 0.7))
+    assert asked(**{"zeros": (same, deviations), "hold of full": "smooth", "gain": -1.0})[0].hold == ""  # and its hold
 
 
 def test_zeros_are_asked_once_more_of_the_model_that_is_found(asked):

@@ -64,12 +64,12 @@ class SegmentGrid:
 class Grids:
     """Grids of a recording with the inputs of their model steps, (S, K, m), each made once.
 
-    If the samples are some of another recording, `within` has the inputs of that one, and `rows` (N,) where in it each
-    sample is: a model step takes the mean of the inputs that were recorded in it.
+    If the samples are some of another recording, `within` are the inputs of that one and the rows (N,) of these samples
+    in it: a model step takes the mean of the inputs that were recorded in it.
     """
 
-    def __init__(self, data: Trajectories, within: InputPieces | None = None, rows: Tensor | None = None):
-        self.data, self.within, self.rows = data, within, rows
+    def __init__(self, data: Trajectories, within: tuple[InputPieces, Tensor] | None = None):
+        self.data, self.within = data, within
         self.made: dict[tuple[int, float], tuple[SegmentGrid, Tensor | None]] = {}
 
     def of(self, length: int, max_step: float) -> tuple[SegmentGrid, Tensor | None]:
@@ -82,10 +82,11 @@ class Grids:
 
     def _inputs(self, grid: SegmentGrid) -> Tensor | None:
         """The inputs of the model steps of a grid, (S, K, m)."""
-        if self.within is None or self.rows is None:
+        if self.within is None:
             return self.data.inputs_of_steps(grid.row, grid.part)
+        pieces, rows = self.within
         step = self.data.t[grid.row + 1] - self.data.t[grid.row]
-        return self.within.means(self.rows[grid.row], grid.part * step - grid.h / 2, grid.h)
+        return pieces.means(rows[grid.row], grid.part * step - grid.h / 2, grid.h)
 
 
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
