@@ -55,6 +55,8 @@ def test_means_within_steps_add_up(hold):
     if hold != "smooth":
         middle = interpolated_input(hold, t, u, (20, 20), row, torch.full_like(h, 0.5))
         assert torch.allclose(whole, middle, atol=1e-12)
+        within = interpolated_input(hold, t, u, (20, 20), row, torch.full_like(h, 0.15))
+        assert torch.allclose(pieces.means(row, 0 * h, 0.3 * h), within, atol=1e-12)
     parts = pieces.means(row, 0 * h, 0.3 * h) * 0.3 + pieces.means(row, 0.3 * h, 0.7 * h) * 0.7
     assert torch.allclose(parts, whole, atol=1e-12)
     weight = (h / (h + then))[:, None]
